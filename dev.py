@@ -110,7 +110,7 @@ def versions(*pythons: str) -> int:
             programs = Path(scratch, "environment", PROGRAMS)
             subprocess.run([python, "-m", "venv", programs.parent], check=True)
             install = [programs / "python", "-m", "pip", "--disable-pip-version-check", "install", "--quiet"]
-            subprocess.run([*install, f"{ROOT}[tables,plots]"], check=True)
+            subprocess.run([*install, f"{ROOT}[tables]"], check=True)
             version = subprocess.check_output([programs / "python", "--version"], text=True).strip()
             for kernel in KERNELS:
                 said[version, kernel] = _readme(programs / "rpim-opt", Path(scratch, kernel))
@@ -124,7 +124,7 @@ def minima(python: str, *tests: str) -> int:
     extras = project["optional-dependencies"]
     wanted = [
         *project["dependencies"],
-        *(each for name in ("tables", "plots", "xacro", "studies") for each in extras[name]),
+        *(each for name in ("tables", "xacro", "studies") for each in extras[name]),
     ]
     wanted += [each for each in extras["dev"] if each.startswith(("hypothesis", "polars", "pytest"))]
     lowest = sorted({each.replace(">=", "==") for each in wanted})

@@ -673,12 +673,8 @@ def compare(
     """
     from rpim_opt.study.comparison import compare
     from rpim_opt.study.methods import USUAL
-    from rpim_opt.study.replicates import require_package
 
-    journal = None
-    if out is not None:
-        journal = out / "replicates.sqlite"
-        require_package("matplotlib", "out")
+    journal = None if out is None else out / "replicates.sqlite"
     words, numbers = console.listed_words, console.listed_numbers
     found = compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),

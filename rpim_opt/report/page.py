@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import base64
-from collections.abc import Iterable, Mapping, Sequence
-from functools import cache
+import io
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
+from xml.etree import ElementTree
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import refused, write_text
-from rpim_opt.report.chart import Chart, Picture
-from rpim_opt.report.charts import checks_charts, mm
+from rpim_opt.report import plot
+from rpim_opt.report.summary import mm
 from rpim_opt.use.monitoring import Monitoring
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
@@ -33,18 +36,75 @@ class Table(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """A chart as SVG with its legend and its caption."""
+    """A chart as SVG with its caption."""
 
     svg: Markup
-    legend: Sequence[tuple[str, str]]
     caption: str
 
 
-def figure(chart: Chart | Picture, caption: str = "", *above: Markup) -> Figure:
-    """Return a figure, its caption ended by the chart's note; elements ``above`` are drawn on top of it."""
-    picture = chart if isinstance(chart, Picture) else Picture(chart)
-    text = " ".join(filter(None, [caption, picture.chart.note]))
-    return Figure(picture.svg(*above), picture.chart.legend, text)
+WIDTH = 420.0
+HEIGHT = 270.0
+"""Size of a chart [px]; the page scales it to its place."""
+SVG = "{http://www.w3.org/2000/svg}"
+ElementTree.register_namespace("", SVG[1:-1])
+ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
+INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
+STYLE = {
+    **dict.fromkeys(INKED, plot.COLORS["ink"]),
+    "axes.spines.right": False, "axes.spines.top": False, "axes.grid": True, "grid.color": "#dfe3e8",
+    "axes.axisbelow": True, "svg.fonttype": "none", "font.size": 12.5, "savefig.transparent": True,
+}  # fmt: skip
+
+
+def figure(draw: Callable[..., Any], title: str, caption: str = "", height: float = HEIGHT) -> Figure:
+    """Return a figure of what ``draw`` draws on matplotlib axes ``ax``; the title stands for it where none is shown."""
+    return Figure(chart(draw, title, height)[0], caption)
+
+
+def chart(draw: Callable[..., Any], title: str, height: float = HEIGHT) -> tuple[Markup, Any]:
+    """Return what is drawn as SVG for a page, and the axes; a unit of the SVG is one of their pixels.
+
+    The page's policy allows no style attributes: they become attributes of their own. The page's colours stand in the
+    place of the light ones, and marks have their ``hints`` as tooltips.
+    """
+    from matplotlib import rc_context
+    from matplotlib.figure import Figure as Drawing
+
+    stream = io.BytesIO()
+    with rc_context({**STYLE, "svg.hashsalt": title}):
+        drawing = Drawing(figsize=(WIDTH / 72, height / 72), dpi=72, layout="constrained")
+        ax = drawing.add_subplot()
+        draw(ax=ax)
+        hinted = [artist for artist in ax.get_children() if len(getattr(artist, "hints", ()))]
+        for k, artist in enumerate(hinted):
+            artist.set_gid(f"hints{k}")
+        drawing.savefig(stream, format="svg", dpi=200, metadata={"Date": None})
+    root = ElementTree.fromstring(stream.getvalue())
+    root.remove(root[0])  # metadata
+    root.remove(root[0])  # a style sheet
+    groups = {group.get("id"): group for group in root.iter(f"{SVG}g")}
+    for k, artist in enumerate(hinted):
+        group = groups[f"hints{k}"]
+        drawn = group.iter(f"{SVG}use") if group.find(f".//{SVG}use") is not None else group.iter(f"{SVG}path")
+        for mark, hint in zip(drawn, artist.hints, strict=True):
+            ElementTree.SubElement(mark, f"{SVG}title").text = hint
+    for element in root.iter():
+        if element.tag == f"{SVG}g":
+            element.attrib.pop("id", None)
+        for name, value in re.findall(r"([\w-]+): ([^;]+)", element.attrib.pop("style", "")):
+            if name == "font":  # as one attribute there is none
+                name, value = "font-size", re.findall(r"[\d.]+px", value)[0]
+            if name != "font-family":
+                element.set(name, value)
+        for name, value in element.items():
+            element.set(name, re.sub(r"(\.\d\d)\d+", r"\1", value))  # hundredths of a pixel
+    for name in ("width", "height"):
+        del root.attrib[name]
+    root.attrib |= {"role": "img", "aria-label": title}
+    text = ElementTree.tostring(root, encoding="unicode")
+    for role, color in {**plot.COLORS, "grid": STYLE["grid.color"]}.items():
+        text = text.replace(color, f"var(--{role})")
+    return Markup(text), ax
 
 
 def coded(text: str) -> Markup:
@@ -66,19 +126,17 @@ def _environment() -> Environment:
 
 def render(
     title: str, kind: str, heading: str, top: Iterable[Block], sections: Iterable[tuple[str, Iterable[Block]]],
-    script: str = "", data: Mapping[str, Any] | None = None, images: bool = False,
+    script: str = "", data: Mapping[str, Any] | None = None,
 ) -> str:  # fmt: skip
     """Return a page as HTML: all texts are escaped, its own style and script alone may run, nothing is loaded.
 
-    The script is a file of the templates that reads ``data``; ``images`` may stand in the page as data.
+    The script is a file of the templates that reads ``data``. Pictures may stand in the page as data.
     """
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
     code = (TEMPLATES / script).read_text(encoding="utf-8") if script else ""
-    policy = f"default-src 'none'; style-src {_digest(style)}"
+    policy = f"default-src 'none'; img-src data:; style-src {_digest(style)}"
     if script:
         policy += f"; script-src {_digest(code)}"
-    if images:
-        policy += "; img-src data:"
     return _environment().get_template("page.html").render(
         title=title, kind=kind, heading=heading, top=top, sections=sections, data=data,
         policy=policy, style=Markup(style), script=Markup(code),
@@ -110,11 +168,20 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     heading = title or "Checks"
     sections: list[tuple[str, list[Block]]] = [
         ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
-        ("Over time", [("figures", [figure(chart) for chart in checks_charts(found)])]),
+        ("Over time", [("figures", _over_time(found))]),
         ("Every check", [("table", _checks(found))]),
     ]
     text = render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections)
     write_text(Path(path), text)
+
+
+def _over_time(found: Monitoring) -> list[Figure]:
+    each = "Residual of every check and its limit"
+    together = "Cumulative sum of the checks and its limit"
+    return [
+        figure(partial(plot.checks, found), each, "Each check on its own."),
+        figure(partial(plot.cumulative_sum, found), together, "All checks together (CUSUM)."),
+    ]
 
 
 def _checks(found: Monitoring) -> Table:

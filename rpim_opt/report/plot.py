@@ -1,20 +1,31 @@
-"""Figures on matplotlib axes, for papers and notebooks: each draws on ``ax`` or on new axes, and returns them."""
+"""Figures of a calibration on matplotlib axes: each is drawn on ``ax`` or on new axes, and these are returned.
+
+The report's charts are the same figures. The tooltips that a page shows at marks are their attribute ``hints``.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import joined, percent
+from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
+from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.report import charts
-from rpim_opt.report.chart import Axis, Boxes, Chart, Dots, Line, Mark
+from rpim_opt.report.summary import mm
+
+if TYPE_CHECKING:
+    from rpim_opt.use.monitoring import Monitoring
 
 __all__ = [
     "error_axes", "error_histogram", "error_vectors", "errors", "l_curve", "parameters", "picard", "selection",
@@ -22,6 +33,15 @@ __all__ = [
 ]  # fmt: skip
 
 Axes = Any  # matplotlib's, which is imported by whoever makes the axes
+
+# --- errors ------------------------------------------------------------------------------------------------
+
+MODELS = {"before": "nominal", "after": "identified"}
+"""Model that errors before and after calibration are of."""
+MANY_ROWS = 100
+"""Above it each row is a small point without a name."""
+LINEAR_MM = 0.1
+"""Size up to which the axis of signed errors is linear."""
 
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
@@ -36,11 +56,38 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     >>> ax.get_ylabel(), len(ax.get_xticks())
     ('error [mm]', 16)
     """
-    return draw(charts.rows_chart(result, data or result.problem.data), ax)
+    ax = _axes(ax)
+    data = data or result.problem.data
+    lengths, labels = _lengths(result, data)
+    every = np.concatenate(list(lengths.values()))
+    low = max(0.5 * float(every.min()), 1e-4 * float(every.max()), 1e-7)
+    drawn = {when: np.maximum(each, low) for when, each in lengths.items()}
+    place = np.arange(1.0, len(labels) + 1)
+    few = len(labels) <= MANY_ROWS
+    if few:
+        ax.vlines(place, drawn["before"], drawn["after"], color=COLORS["before"])
+    for when, each in lengths.items():
+        hints = [f"{label}, {MODELS[when]}: {mm(e)} mm" for label, e in zip(labels, each, strict=True) if few]
+        _dots(ax, place, drawn[when], when, MODELS[when], hints, ms=5.0 if few else 2.0)
+    flagged: set[str] = set()
+    if data is result.problem.data:
+        flagged = {flag.label for flag in result.flagged}
+    at = [i for i, label in enumerate(labels) if label in flagged]
+    if at:
+        _dots(ax, place[at], drawn["after"][at], "mark", "flagged", [f"{labels[i]}: flagged" for i in at])
+    cut = int(np.sum(every < low))
+    note = f"\n{cut} errors below {low:.2g} mm are drawn at the lower edge." if cut else ""
+    ax.set(xlabel=f"row{note}", ylabel="error [mm]")
+    if few:
+        _name(ax, "x", labels)
+    _logarithmic(ax, "y")
+    return _with_legend(ax)
 
 
 def error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
     """Draw a histogram of the errors [mm] before and after calibration. Arguments as for `errors`.
+
+    It covers four decades at most; smaller errors are in the first bar.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -48,7 +95,25 @@ def error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes =
     >>> ax.get_xlabel(), ax.get_xscale()
     ('error [mm]', 'log')
     """
-    return draw(charts.histogram_chart(charts.lengths_of(result, data or result.problem.data)[0]), ax)
+    ax = _axes(ax)
+    lengths, _ = _lengths(result, data or result.problem.data)
+    every = np.concatenate(list(lengths.values()))
+    high = max(float(every.max(initial=0.0)), 1e-6) * 1.001
+    low = max(float(every.min(initial=high)), 1e-4 * high)
+    edges = np.geomspace(low, high, 25 if high > 1.01 * low else 2)
+    below = []
+    for when, each in lengths.items():
+        count = np.histogram(np.maximum(each, edges[0]), edges)[0]
+        bins = np.flatnonzero(count)
+        hints = [f"{MODELS[when]}: {count[k]} rows from {mm(edges[k])} to {mm(edges[k + 1])} mm" for k in bins]
+        sides = (edges[bins], edges[bins + 1], np.zeros(len(bins)), count[bins])
+        _boxes(ax, *sides, hints, color=COLORS[when], alpha=0.85, label=MODELS[when])
+        if (each < low).any():
+            below.append(f"{int(np.sum(each < low))} {MODELS[when]}")
+    note = f"\nThe first bar includes the rows below {low:.2g} mm: {joined(below)}." if below else ""
+    ax.set(xlabel=f"error [mm]{note}", ylabel="rows")
+    _logarithmic(ax, "x")
+    return _with_legend(ax)
 
 
 def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
@@ -60,7 +125,25 @@ def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None
     >>> [label.get_text() for label in ax.get_xticklabels()]
     ['x', 'y', 'z']
     """
-    return draw(charts.axes_chart(result, data or result.problem.data), ax)
+    ax = _axes(ax)
+    frame, what, vectors = signed_errors(result, data or result.problem.data)
+    ax.axhline(0, color=COLORS["before"], lw=1)
+    for (when, each), shift in zip(vectors.items(), (-0.1, 0.1), strict=True):
+        mean = each.mean(axis=0)
+        low, high = np.percentile(each, [2.5, 97.5], axis=0)
+        place = np.arange(1, 4) + shift
+        hints = [
+            f"{axis}, {MODELS[when]}: mean {m:+z.3f} mm, 95 % of the rows from {a:+z.3f} to {b:+z.3f} mm"
+            for axis, m, a, b in zip("xyz", mean, low, high, strict=True)
+        ]
+        ax.vlines(place, low, high, color=COLORS[when])
+        _dots(ax, place, mean, when, MODELS[when], hints)
+    ax.set_yscale("symlog", linthresh=LINEAR_MM)
+    ax.yaxis.set_major_formatter("{x:g}")
+    ax.yaxis.minorticks_off()
+    ax.set(xlabel=f"axis of {frame}", ylabel=f"{what} [mm]")
+    _name(ax, "x", "xyz")
+    return _with_legend(ax)
 
 
 def error_vectors(result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None) -> Axes:
@@ -78,21 +161,52 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
     vectors = result.error_vectors(data, nominal=nominal)
     finite = np.isfinite(vectors).all(axis=1)
     points, vectors = points[finite], vectors[finite]
-    times = charts.magnification(points, vectors)
+    times = magnification(points, vectors)
     when = "before" if nominal else "after"
-    width = 0.5 if len(points) > charts.MANY_ROWS else 1.5
     ax.scatter(*points.T, s=6, color="0.3")
+    width = 0.5 if len(points) > MANY_ROWS else 1.5
     ax.quiver(*points.T, *(times * vectors).T, color=COLORS[when], lw=width, arrow_length_ratio=0.2)
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
-    ax.set_title(f"{charts.MODELS[when]} errors, enlarged {times:,.0f} times", fontsize=9)
+    ax.set_title(f"{MODELS[when]} errors, enlarged {times:,.0f} times", fontsize=9)
     return ax
+
+
+def _lengths(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list[str]]:
+    """Return the errors [mm] before and after calibration, and the labels, of rows that measure a length."""
+    before = 1e3 * result.nominal_errors(data)
+    after = 1e3 * result.errors(data)
+    finite = np.isfinite(after)
+    labels = [data.label[i] for i in np.flatnonzero(finite)]
+    return {"before": before[finite], "after": after[finite]}, labels
+
+
+def signed_errors(result: Calibration, data: Dataset) -> tuple[str, str, dict[str, Array]]:
+    """Return whose axes positions are along, what the errors are, and these (N, 3) [mm] before and after."""
+    frame, what = "the instrument", "measured minus modelled"
+    if any(block.measurement.touching for block in data.blocks):  # there is no instrument
+        frame, what = "the robot's base", "mean of the point minus touch"
+    before = 1e3 * result.error_vectors(data, nominal=True)
+    after = 1e3 * result.error_vectors(data)
+    finite = np.isfinite(after).all(axis=1)
+    return frame, what, {"before": before[finite], "after": after[finite]}
+
+
+def magnification(points: Array, vectors: Array) -> float:
+    """Return the factor, 1, 2 or 5 times 10^k, by which the longest error is a sixth of the points' extent."""
+    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    exponent = np.log10(max(float(np.ptp(points, axis=0).max()), 1e-3) / 6 / max(longest, 1e-12))
+    decade = 10.0 ** np.floor(exponent)
+    return float(max(step for step in (1, 2, 5) if step * decade <= 10**exponent) * decade)
+
+
+# --- parameters --------------------------------------------------------------------------------------------
 
 
 def parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
     """Draw the deviations of the robot's own parameters of a dimension with their intervals and tolerances.
 
-    The dimension is ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm]. Intervals exist for
-    a squared penalty, or none.
+    The dimension is ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm]. Intervals exist
+    where the formulation has a covariance.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -100,10 +214,52 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     >>> ax.get_xlabel(), len(ax.get_yticks())
     ('deviation from nominal [deg]', 13)
     """
-    half = np.full(len(result.x), np.nan)
-    if result.linear_penalty:
+    free = result.problem.parameters.free
+    own = np.flatnonzero(~free.of_frames & (np.array(free.dimensions) == dimension))
+    ax = _axes(ax, len(own))
+    unit, si = display(dimension)
+    x = result.x[own] / si
+    spread = np.zeros(len(own))
+    with suppress(InputError):
         half = np.diff(Uncertainty(result, confidence).intervals())[:, 0] / 2
-    return draw(charts.deviations_chart(result, dimension, half, confidence), ax)
+        spread = np.nan_to_num(half[own] / si, posinf=0.0)
+    bound = active_tolerance(result)[own] / si
+    bounded = np.isfinite(bound)
+    place = np.arange(1.0, len(own) + 1)
+    names = [free.names[i] for i in own]
+    hints = [f"{name}: {d:+z.4f} ± {s:.4f} {unit}" for name, d, s in zip(names, x, spread, strict=True)]
+    ax.axvline(0, color=COLORS["before"], lw=1)
+    ax.hlines(place, x - spread, x + spread, color=COLORS["after"])
+    _dots(ax, x, place, "after", f"deviation, {percent(confidence)} interval", hints)
+    if bounded.any():
+        ends = np.concatenate([-bound[bounded], bound[bounded]])
+        at = np.tile(place[bounded], 2)
+        ax.vlines(ends, at - 0.35, at + 0.35, color=COLORS["mark"], label="tolerance")
+    # an interval that ends far out would hide all others: it is cut at the edge
+    reach = max(float(np.max(np.abs(x), initial=1e-9)), float(np.max(bound[bounded], initial=0.0)))
+    if len(x):
+        reach = max(reach, float(np.median(np.abs(x) + spread)))
+    reach *= 1.1
+    cut = "\nIntervals beyond the edge are cut." if (np.abs(x) + spread > reach).any() else ""
+    ax.set(xlim=(-reach, reach), xlabel=f"deviation from nominal [{unit}]{cut}")
+    _name(ax, "y", names)
+    return _with_legend(ax)
+
+
+def active_tolerance(result: Calibration) -> Array:
+    """Return the tolerances (n,) [SI] that constrain the formulation; infinite where it has none."""
+    tolerance = result.problem.parameters.free.tolerance
+    if any(each is within_tolerance for each in result.formulation.constraints):
+        return tolerance
+    return np.full(len(tolerance), np.inf)
+
+
+# --- the regularization weight -----------------------------------------------------------------------------
+
+VANISHED = 1e-4
+"""Penalties below this part of the median one are not drawn: a lasso has no deviation left there."""
+FAINT = 1e-4
+"""Coefficients of the data below this many standard deviations are not drawn."""
 
 
 def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
@@ -123,16 +279,38 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     """
     program = _program(of)
     marked = {name: choice.weight for name, choice in (selections or {}).items()}
-    if isinstance(of, Calibration) and of.selector not in marked:
-        marked = {of.selector: of.weight, **marked}
+    own = ""
+    if isinstance(of, Calibration):
+        own = of.selector
+        if own not in marked:
+            marked = {own: of.weight, **marked}
     path = program.path(weight_grid(program, 200 if program.closed_form else 40))
-    residual, solution = np.sqrt([[e.loss, e.penalty] for e in path]).T
-    chosen: dict[str, tuple[float, float]] = {}
+    curve = np.sqrt([[e.loss, e.penalty] for e in path])
+    chosen: dict[str, Array] = {}
     for name, weight in marked.items():
         (at,) = program.path([weight])
-        chosen[f"{name}, weight {weight:.2g}"] = (float(np.sqrt(at.loss)), float(np.sqrt(at.penalty)))
-    own = next(iter(chosen)) if isinstance(of, Calibration) else ""
-    return draw(charts.l_curve_chart(residual, solution, chosen, own), ax)
+        chosen[f"{name}, weight {weight:.2g}"] = np.sqrt([at.loss, at.penalty])
+        if name == own:
+            own = f"{name}, weight {weight:.2g}"
+    return draw_l_curve(curve, chosen, own, ax)
+
+
+def draw_l_curve(curve: Array, chosen: Mapping[str, Array], own: str, ax: Axes = None) -> Axes:
+    """Draw an L-curve (k, 2), roots of loss and penalty, and points of it by name, of which ``own`` is in use."""
+    ax = _axes(ax)
+    residual, solution = curve[curve[:, 1] > VANISHED * float(np.median(curve[:, 1]))].T
+    ax.plot(residual, solution, color=COLORS["ink"], lw=1.5)
+    others = [name for name in chosen if name != own]
+    for k, name in enumerate(others):
+        style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
+        (dot,) = ax.plot(*chosen[name].reshape(2, 1), color=f"C{k}", label=name, **style)
+        dot.hints = [name]
+    if own in chosen:
+        _dots(ax, *chosen[own].reshape(2, 1), "mark", f"chosen: {own}", [f"chosen: {own}"], ms=9.0)
+    ax.set(xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior scales]")
+    _logarithmic(ax, "x")
+    _logarithmic(ax, "y")
+    return _with_legend(ax)
 
 
 def _program(of: Program | Calibration) -> Program:
@@ -149,15 +327,14 @@ def selection(selection: Selection, ax: Axes = None) -> Axes:
     >>> ro.plot.selection(result.selection).get_ylabel()
     'score of reml'
     """
+    ax = _axes(ax)
     finite = np.isfinite(selection.score)
-    weights = selection.weights[finite]
-    score = selection.score[finite]
-    every = [*weights, selection.weight]
-    x = Axis("weight", (min(every), max(every)), log=True)
-    y = Axis(f"score of {selection.name}", (float(score.min()), float(score.max())))
+    ax.plot(selection.weights[finite], selection.score[finite], color=COLORS["ink"], lw=1.5)
     label = f"weight {selection.weight:.3g}"
-    choice = Line([selection.weight] * 2, list(y.limits), "mark", label, dashed=not selection.interior)
-    return draw(Chart("", x, y, [Line(weights, score, "ink"), choice]), ax)
+    ax.axvline(selection.weight, color=COLORS["mark"], ls="-" if selection.interior else "--", label=label)
+    ax.set(xlabel="weight", ylabel=f"score of {selection.name}")
+    _logarithmic(ax, "x")
+    return _with_legend(ax)
 
 
 def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
@@ -171,15 +348,17 @@ def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | N
     """
     chosen = compare(_program(of)) if selections is None else selections
     ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
+    ax = _axes(ax, len(ordered))
     weight = np.array([each.weight for _, each in ordered])
     interior = np.array([each.interior for _, each in ordered])
-    marks: list[Mark] = []
-    for which, label in ((interior, ""), (~interior, "at an edge")):
+    for which, label, style in ((interior, "", {}), (~interior, "at an edge", {"mfc": "none"})):
         at = np.flatnonzero(which)
         if len(at):
-            marks.append(Dots(weight[at], at + 1.0, "after", label, ["choice"] * len(at), hollow=bool(label)))
-    y = Axis("", names=[name for name, _ in ordered])
-    return draw(Chart("", Axis("weight", (weight.min(), weight.max()), log=True), y, marks), ax)
+            _dots(ax, weight[at], at + 1.0, "after", label, **style)
+    ax.set_xlabel("weight")
+    _logarithmic(ax, "x")
+    _name(ax, "y", [name for name, _ in ordered])
+    return _with_legend(ax)
 
 
 def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> Axes:
@@ -195,39 +374,141 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
     ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'root of the weight']
     """
+    ax = _axes(ax)
     if isinstance(of, Calibration):
         weight = weight or of.weight
-    return draw(charts.picard_chart(_program(of), weight), ax)
+    beta, s, _ = _program(of).model.svd
+    k = np.flatnonzero(s > 0)
+    data = np.abs(beta[k])
+    solution = data / s[k]
+    ax.plot(k + 1, s[k], color=COLORS["ink"], lw=1.5, label="singular value s")
+    ratios = [f"direction {i + 1}: coefficient {ratio:.3g}" for i, ratio in zip(k, solution, strict=True)]
+    _dots(ax, k + 1, solution, "other", "coefficient |u'b| / s", ratios, ms=3.5)
+    hints = [f"direction {i + 1}: data {abs(beta[i]):.3g}, s {s[i]:.3g}" for i in k]
+    _dots(ax, k + 1, data, "after", "data |u'b|", hints)
+    every = np.concatenate([s[k], data, [1.0]])
+    if weight > 0:
+        level = float(np.sqrt(weight))
+        ax.axhline(level, color=COLORS["mark"], ls="--", label="root of the weight")
+        every = np.append(every, level)
+    low, high = max(float(every.min()), FAINT), max(float(every.max()), float(solution.max(initial=0.0)))
+    ax.set(xlabel="singular direction", ylabel="size, whitened and scaled [1]", ylim=(0.7 * low, 1.4 * high))
+    _logarithmic(ax, "y")
+    return _with_legend(ax)
 
 
-# --- the renderer ------------------------------------------------------------------------------------------
+# --- uncertainty in the workspace --------------------------------------------------------------------------
 
-COLORS = {
-    "before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e", "zero": "#a3adb8",
-}  # fmt: skip
-SIZES = {"small": 3.5, "middle": 5.0, "large": 9.0}
+CELLS = 24
+"""Cells along the longer side."""
+SHADES = 5
+VIEWS = {"from above": (0, 1), "from the side": (0, 2)}
+"""Axes to the right and up."""
+
+
+def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | None, view: str, ax: Axes) -> None:
+    """Draw a map of the expanded uncertainties (N,) at positions (N, 3), all in mm, as a `VIEWS` sees it.
+
+    Each cell has the largest one of its positions; it is marked above the limit. The box (3, 2) is drawn as a frame.
+    """
+    low, high = float(bound.min()), float(bound.max())
+    levels = np.linspace(low, high, SHADES + 1)[1:]
+    decimals = 10.0 ** (int(np.ceil(-np.log10(max(high - low, 1e-3 * high)))) + 1)
+    levels = np.asarray(np.ceil(levels * decimals) / decimals, dtype=float)
+    across, up = VIEWS[view]
+    plane = at[:, [across, up]]
+    corner, size = _cells(plane)
+    corners, cell = np.unique(corner, axis=0, return_inverse=True)
+    worst = np.zeros(len(corners))
+    np.maximum.at(worst, cell.ravel(), bound)
+    shade = np.minimum(np.searchsorted(levels, worst), SHADES - 1)
+    above = worst > (np.inf if limit is None else limit)
+    for k, over in sorted(set(zip(shade.tolist(), above.tolist(), strict=True))):
+        which = (shade == k) & (above == over)
+        text = f"to {mm(levels[k])} mm, above the limit" if over else f"to {mm(min(levels[k], limit or np.inf))} mm"
+        style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "lw": 0, "label": text}
+        left, bottom = corners[which].T
+        hints = [f"{mm(value)} mm" for value in worst[which]]
+        _boxes(ax, left, left + size[0], bottom, bottom + size[1], hints, **style)
+    if box is not None:
+        (a, b), (c, d) = box[across], box[up]
+        ax.plot([a, b, b, a, a], [c, c, d, d, c], color=COLORS["ink"])
+    ax.set(xlabel=f"{'xyz'[across]} [mm]", ylabel=f"{'xyz'[up]} [mm]", aspect="equal")
+    _with_legend(ax)
+
+
+def _cells(points: Array) -> tuple[Array, Array]:
+    """Return the lower corners (N, 2) of the points' cells, and the cells' common size (2,)."""
+    extent = np.ptp(points, axis=0)
+    count = np.maximum(np.ceil(extent / (extent.max() / CELLS) - 1e-9), 1)
+    size = np.maximum(extent / count, 1e-9)
+    low = points.min(axis=0)
+    return low + np.minimum((points - low) // size, count - 1) * size, size
+
+
+# --- checks over time --------------------------------------------------------------------------------------
+
+TIMES = ((86400.0, "days"), (3600.0, "hours"))
+"""Units of an axis of time [s]."""
+
+
+def checks(found: Monitoring, ax: Axes) -> None:
+    """Draw every check against its limit."""
+    place = _times(found, ax)
+    ax.plot(place, found.allowed, color=COLORS["mark"], lw=1.5, label="limit, checks beyond it")
+    hints = [
+        f"{label}: {sigmas:.1f} standard deviations, {mm(1e3 * error)} mm"
+        for label, sigmas, error in zip(found.label, found.sigmas, found.error, strict=True)
+    ]
+    beyond = np.isin(np.arange(len(place)), found.beyond)
+    for which, role, label in ((~beyond, "after", "check"), (beyond, "mark", "")):
+        at = np.flatnonzero(which)
+        if len(at):
+            _dots(ax, place[at], found.sigmas[at], role, label, [hints[i] for i in at])
+    ax.set(ylabel="residual [standard deviations]")
+    ax.set_ylim(bottom=0)
+    _with_legend(ax)
+
+
+def cumulative_sum(found: Monitoring, ax: Axes) -> None:
+    """Draw the cumulative sum of the checks (CUSUM) against its limit."""
+    place = _times(found, ax)
+    ax.axhline(found.limit, color=COLORS["mark"], lw=1.5, label="limit, alarm")
+    ax.plot(place, found.sums, color=COLORS["after"], lw=1.5, label="sum")
+    if found.alarm is not None:
+        at = [found.alarm]
+        _dots(ax, place[at], found.sums[at], "mark", hints=[f"alarm at {found.label[found.alarm]}"])
+    ax.set(ylabel="cumulative sum")
+    ax.set_ylim(bottom=0)
+    _with_legend(ax)
+
+
+def _times(found: Monitoring, ax: Axes) -> Array:
+    """Return where checks are along x: their times, or their numbers; the axis is labelled so."""
+    if found.when is None or not np.ptp(found.when) > 0:
+        ax.set_xlabel("check")
+        return np.arange(1, len(found.label) + 1, dtype=float)
+    span = float(np.ptp(found.when))
+    unit, name = next(((size, name) for size, name in TIMES if span > 2 * size), (1.0, "seconds"))
+    ax.set_xlabel(f"{name} since the first check")
+    return (found.when - found.when[0]) / unit
+
+
+# --- marks and axes ----------------------------------------------------------------------------------------
+
+COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
+"""Colours by meaning, as in the page's style sheet, which has others in the dark."""
 SHAPES = "osD^v<>"
-FONT_X, FONT_Y, FONT_LEAST = 7.0, 10.0, 4.0
-"""Largest sizes of names along x and y [points], and the smallest that can be read."""
+MANY_DOTS = 1000
+"""Dots beyond which they are one picture in a vector graphic."""
+FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 4.0
+"""Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
 LINE_HEIGHT = 1.25
 """Distance of names over their size."""
 
 
-def draw(chart: Chart, ax: Axes = None) -> Axes:
-    """Draw a chart on axes, by default on new ones that are as high as its names need, and return them."""
-    ax = _axes(ax, len(chart.y.names))
-    _set_axis(ax, "x", chart.x)
-    _set_axis(ax, "y", chart.y)
-    for mark in chart.marks:
-        _draw(ax, mark)
-    if chart.note:
-        ax.set_xlabel(f"{ax.get_xlabel()}\n{chart.note}".strip())
-    if ax.get_legend_handles_labels()[0]:
-        ax.legend(frameon=False, loc="lower center", bbox_to_anchor=(0.5, 1.0), ncols=4, fontsize=8)
-    return ax
-
-
 def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
+    """Return the axes, or new ones that are as high as names of rows need."""
     if ax is not None:
         return ax
     from matplotlib import pyplot
@@ -237,39 +518,52 @@ def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
     return ax
 
 
-def _set_axis(ax: Axes, which: str, axis: Axis) -> None:
-    if axis.log:
-        ax.set(**{f"{which}scale": "log"})
-    if axis.linear_to:
-        getattr(ax, f"set_{which}scale")("symlog", linthresh=axis.linear_to)
-    if axis.log or axis.linear_to:
-        getattr(ax, f"{which}axis").set_major_formatter("{x:g}")  # 0.1 in the place of powers of ten
-    limits = axis.limits
-    if axis.names:
-        limits = limits[::-1] if which == "y" else limits
-        box = ax.get_window_extent()
-        length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
-        size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * len(axis.names))
-        if size >= FONT_LEAST:
-            turned = 90 if which == "x" and len(axis.names) > 3 else 0
-            ticks = range(1, len(axis.names) + 1)
-            getattr(ax, f"set_{which}ticks")(ticks, axis.names, fontsize=min(size, largest), rotation=turned)
-    ax.set(**{f"{which}lim": limits, f"{which}label": axis.label})
+def _dots(
+    ax: Axes, x: Any, y: Any, role: str, label: str = "", hints: Sequence[str] = (), ms: float = 5.0, **style: Any
+) -> None:
+    (dots,) = ax.plot(x, y, "o", color=COLORS[role], label=label, ms=ms, rasterized=len(x) > MANY_DOTS, **style)
+    dots.hints = hints
 
 
-def _draw(ax: Axes, mark: Mark) -> None:
-    color = COLORS[mark.role]
-    match mark:
-        case Line():
-            ax.plot(mark.x, mark.y, color=color, lw=1.5, ls="--" if mark.dashed else "-", label=mark.label)
-        case Dots(each=True):
-            for k, (x, y, hint) in enumerate(zip(mark.x, mark.y, mark.hints, strict=True)):
-                style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8}
-                ax.plot([x], [y], ls="none", color=f"C{k}", label=hint, **style)
-        case Dots():
-            fill = "none" if mark.hollow else color
-            size = SIZES[mark.size] if len(mark.hints) else 2.0
-            ax.plot(mark.x, mark.y, "o", color=color, mfc=fill, ms=size, label=mark.label)
-        case Boxes():
-            style = {"align": "edge", "color": color, "alpha": 0.85, "label": mark.label}
-            ax.bar(mark.left, mark.high - mark.low, mark.right - mark.left, mark.low, **style)
+def _boxes(ax: Axes, left: Array, right: Array, low: Array, high: Array, hints: Sequence[str], **style: Any) -> None:
+    for box, hint in zip(ax.bar(left, high - low, right - left, low, align="edge", **style), hints, strict=True):
+        box.hints = [hint]
+
+
+def _logarithmic(ax: Axes, which: str) -> None:
+    """Make an axis logarithmic, with ticks at 1, 2 and 5 where it has less than three powers of ten."""
+    from matplotlib.ticker import LogLocator
+
+    ax.set(**{f"{which}scale": "log"})
+    low, high = getattr(ax, f"get_{which}lim")()
+    axis = getattr(ax, f"{which}axis")
+    powers = np.floor(np.log10(high)) - np.ceil(np.log10(low)) + 1
+    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if powers < 3 else (1,)))
+    axis.set_major_formatter("{x:g}")
+    axis.minorticks_off()
+
+
+def _name(ax: Axes, which: str, names: Sequence[str]) -> None:
+    """Name the places 1, 2, ... along an axis, from top to bottom, where the names can be read."""
+    limits = (0.5, len(names) + 0.5)
+    box = ax.get_window_extent()
+    length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
+    size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * max(len(names), 1))
+    if size >= FONT_LEAST:
+        turned = 90 if which == "x" and len(names) > 3 else 0
+        ticks = range(1, len(names) + 1)
+        getattr(ax, f"set_{which}ticks")(
+            ticks, list(names), fontsize=min(size, largest * ax.xaxis.label.get_fontsize()), rotation=turned
+        )
+    ax.set(**{f"{which}lim": limits if which == "x" else limits[::-1]})
+
+
+def _with_legend(ax: Axes) -> Axes:
+    """Draw the legend above the axes in as many columns as there is width for, and return the axes."""
+    labels = ax.get_legend_handles_labels()[1]
+    if labels:
+        width = 72 * ax.figure.get_figwidth() / ax.xaxis.label.get_fontsize()
+        columns = max(1, int(width / (4 + 0.5 * max(map(len, labels)))))
+        place = {"loc": "lower center", "bbox_to_anchor": (0.5, 1.0), "borderaxespad": 0.1}
+        ax.legend(frameon=False, ncols=columns, fontsize="small", **place)
+    return ax

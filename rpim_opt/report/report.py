@@ -6,6 +6,7 @@ import contextlib
 from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -32,10 +33,9 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.design import combination, observe
 from rpim_opt.problem.workspace import in_base
-from rpim_opt.report import charts, summary
-from rpim_opt.report.chart import Picture, tag
-from rpim_opt.report.charts import mm
-from rpim_opt.report.page import Block, Figure, Table, figure, render
+from rpim_opt.report import plot, summary
+from rpim_opt.report.page import Block, Figure, Table, chart, figure, render
+from rpim_opt.report.summary import mm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
@@ -195,10 +195,11 @@ def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
 
 
 def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure]:
-    lengths, _ = charts.lengths_of(result, data)
+    rows = "Error of every row before and after calibration"
+    distribution = "Distribution of the errors before and after calibration"
     return [
-        figure(charts.rows_chart(result, data), f"Every {name} row."),
-        figure(charts.histogram_chart(lengths), f"Distribution of the {name} errors."),
+        figure(partial(plot.errors, result, data), rows, f"Every {name} row."),
+        figure(partial(plot.error_histogram, result, data), distribution, f"Distribution of the {name} errors."),
     ]
 
 
@@ -217,7 +218,15 @@ def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block
     yield "text", notes
     box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.machine, map_.q, map_.region.marker)
-    yield "figures", [figure(each) for each in charts.workspace_charts(at, 1e3 * map_.expanded, box, limit)]
+    frame = "" if box is None else " The frame is the box of the requirement."
+    drawn = []
+    for view, (across, up) in plot.VIEWS.items():
+        wide, tall = np.ptp(at[:, across]), np.ptp(at[:, up])
+        height = min(330.0 * tall / max(wide, 1e-9), 400.0) + 80
+        draw = partial(plot.uncertainty_map, at, 1e3 * map_.expanded, box, limit, view)
+        title = f"Largest expanded uncertainty of the position reached, {view}"
+        drawn.append(figure(draw, title, f"{view.capitalize()}.{frame}", height))
+    yield "figures", drawn
 
 
 # --- parameters --------------------------------------------------------------------------------------------
@@ -235,7 +244,7 @@ def _parameters(content: Content) -> Iterator[Block]:
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
         note = f"U = k u: expanded uncertainty ({k}, 95 %) from measurement noise and prior."
-    tolerance = charts.active_tolerance(result)
+    tolerance = plot.active_tolerance(result)
     held = {each.name for each in result.held}
     rows = []
     for i, row in enumerate(result.parameter_rows()):
@@ -253,11 +262,12 @@ def _parameters(content: Content) -> Iterator[Block]:
     yield "text", weight_lines(result)
     yield "text", [note, *turned_frames(result)]
     own = np.array(free.dimensions)[~free.of_frames]
-    drawn = [
-        figure(charts.deviations_chart(result, dimension, half), f"The robot's own {dimension} parameters.")
-        for dimension in ("length", "angle")
-        if dimension in own
-    ]
+    drawn = []
+    for dimension in ("length", "angle"):
+        if dimension in own:
+            draw = partial(plot.parameters, result, dimension)
+            title, caption = f"Deviations of the {dimension} parameters", f"The robot's own {dimension} parameters."
+            drawn.append(figure(draw, title, caption, 80.0 + 17 * np.count_nonzero(own == dimension)))
     yield "beside", [("table", Table("Identified parameters", head, rows)), ("figures", drawn)]
 
 
@@ -292,11 +302,11 @@ def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
     if len(summary.sets(result)) > 1:
         figures += _error_figures(result, "identification", result.problem.data)
     for name, data in summary.sets(result).items():
-        frame, what, vectors = charts.signed_errors(result, data)
+        frame, what, vectors = plot.signed_errors(result, data)
         if not len(vectors["after"]):
             continue
         caption = f"{name.capitalize()}: mean (dot) and central 95 % of the rows along the axes of {frame}."
-        figures.append(figure(charts.axes_chart(result, data), caption))
+        figures.append(figure(partial(plot.error_axes, result, data), "Errors along x, y and z", caption))
         for i, axis in enumerate("xyz"):
             means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
             rows.append([f"{name}, {axis}", *means])
@@ -344,7 +354,7 @@ def _lines(points: Array, vectors: Array) -> dict[str, Any]:
     length = np.linalg.norm(vectors, axis=1)
     longest = 3 * float(np.percentile(length, 90))
     cut = vectors * np.minimum(1.0, longest / np.maximum(length, 1e-12))[:, None]
-    times = charts.magnification(points, cut)
+    times = plot.magnification(points, cut)
     beyond = int(np.count_nonzero(length > longest))
     note = f"enlarged {times:,.0f} times"
     if beyond:
@@ -486,6 +496,7 @@ WHY = {"learned": "maximum of the marginal likelihood"}
 MANY_EQUATIONS = 600
 """Equations beyond which a loss that is no square is drawn by its quadratic model, which has a closed form: the two
 curves look the same, and a hundred robust fits of two thousand rows take minutes."""
+L_CURVE_HEIGHT = 330.0
 PICARD = "Picard's condition at the solution: the penalty damps directions below the line; data near 1 are noise."
 
 
@@ -496,7 +507,8 @@ def _regularization(content: Content) -> Iterator[Block]:
     has_path = formulation.penalty is not None and formulation.solvable and not result.record.earlier
     if has_path and result.weight > 0:
         yield from _weight(result, content.embedded)
-    yield "figures", [figure(charts.picard_chart(result.program, result.penalty_weight), PICARD)]
+    draw = partial(plot.picard, result.program, result.penalty_weight)
+    yield "figures", [figure(draw, "Singular values and coefficients of the data", PICARD)]
 
 
 def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
@@ -506,24 +518,26 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
     if not _slow(program):
         chosen = {**compare(program), **chosen}
     name, curve = _path(result, program, chosen)
-    weights, residual, solution = (np.array(curve[key]) for key in ("weight", "residual", "solution"))
+    weights = np.array(curve["weight"])
+    points = np.column_stack([curve["residual"], curve["solution"]])
     places = {
         rule: int(np.argmin(np.abs(np.log(weights / choice.weight))))
         for rule, choice in chosen.items()
         if choice.weight > 0
     }
     k = places[result.selector]
-    points = {rule: (residual[i], solution[i]) for rule, i in places.items()}
-    picture = Picture(charts.l_curve_chart(residual, solution, points, result.selector))
-    x, y = picture.x(residual), picture.y(solution)
+    marked = {rule: points[i] for rule, i in places.items()}
+    draw = partial(plot.draw_l_curve, points, marked, result.selector)
+    svg, ax = chart(draw, "L-curve: residual norm against norm of the deviations", L_CURVE_HEIGHT)
+    x, y = ax.transData.transform(np.maximum(points, np.finfo(float).tiny)).clip(0, 1e4).round(2).T
     takers: dict[str, list[str]] = {}
     for rule, i in places.items():
         takers.setdefault(str(i), []).append("the chosen weight" if rule == "given" else rule)
     names = {place: ", ".join(rules) for place, rules in takers.items()}
-    embedded["curve"] = {**curve, "of": name, "takers": names, "chosen": k, "x": x.tolist(), "y": y.tolist()}
-    cursor = tag("circle", id="cursor", r=9, class_="cursor", cx=f"{x[k]:g}", cy=f"{y[k]:g}")
+    drawn = {"x": x.tolist(), "y": (L_CURVE_HEIGHT - y).tolist()}
+    embedded["curve"] = {**curve, **drawn, "of": name, "takers": names, "chosen": k}
     caption = "Every point is the solution at one weight: small weights above left, large ones below right."
-    yield "weight", {"figure": figure(picture, caption + note, cursor), "last": len(weights) - 1, "chosen": k}
+    yield "weight", {"figure": Figure(svg, caption + note), "last": len(weights) - 1, "chosen": k}
     rows = []
     for rule, choice in sorted(chosen.items(), key=lambda item: item[1].weight):
         mean = mm(curve["error"][places[rule]]) if rule in places else ""

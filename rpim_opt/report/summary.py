@@ -16,7 +16,6 @@ from rpim_opt.calibration.words import camera_remarks, contact_remarks, known_po
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.data.record import Requirement
-from rpim_opt.report.charts import mm
 from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
 
@@ -29,6 +28,13 @@ COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
 Unit = Literal["mm", "mrad"]
 ANYWHERE = Requirement(limit=1.0)
 """The region of a result without requirement: joints within the measured ranges."""
+
+
+def mm(value: float) -> str:
+    """Return a length in mm with the digits that matter."""
+    if value < 10:
+        return f"{value:.3f}"
+    return f"{value:.2f}" if value < 100 else f"{value:.0f}"
 
 
 def sets(result: Calibration) -> dict[str, Dataset]:

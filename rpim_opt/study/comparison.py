@@ -287,7 +287,6 @@ class Comparison:
 
         Arguments and errors as for `summary`.
         """
-        require_package("matplotlib", "plot")
         from rpim_opt.study.figures import comparison_figure
 
         return comparison_figure(self.rows, self.summary(metric, against))
@@ -297,7 +296,6 @@ class Comparison:
 
         The folder is made; other arguments as for `summary`.
         """
-        require_package("matplotlib", "report")
         from rpim_opt.study.figures import write_page
 
         return write_page(Path(folder), self.rows, self.summary(metric, against), self.asked, self.made)

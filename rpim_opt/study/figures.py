@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import base64
 import io
 from collections import Counter
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarForm
 
 from rpim_opt.basics.files import refused, write_files
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.report.page import Block, Table, render
+from rpim_opt.report.page import HEIGHT, Block, Table, figure, render
 from rpim_opt.study.ranking import Rows, Standing, Summary, figures, number, profiles, without_figures
 
 ROW_INCHES = 0.25
@@ -73,15 +73,12 @@ def comparison_figure(rows: Rows, summary: Summary) -> Any:
     height = max(ROW_INCHES * len(summary.standings) + 1.5, 3.5)
     figure = Figure(figsize=(11, height), dpi=150, layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    _ratios(left, rows, summary)
-    _profiles(right, rows, summary)
-    for ax in (left, right):
-        _round_ticks(ax)
-        ax.grid(axis="x", alpha=0.25)
+    _ratios(rows, summary, left)
+    _profiles(rows, summary, right)
     return figure
 
 
-def _ratios(ax: Any, rows: Rows, summary: Summary) -> None:
+def _ratios(rows: Rows, summary: Summary, ax: Any) -> None:
     """Draw every replicate's ratio as a dot, and the mean with its interval."""
     of = figures(rows, summary.metric)
     other = of[summary.reference]
@@ -103,6 +100,7 @@ def _ratios(ax: Any, rows: Rows, summary: Summary) -> None:
     ax.set_xscale("log")
     ax.set_xlabel(f"{summary.metric} over that of {summary.reference}, same replicate")
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9, color="0.3")
+    _round_ticks(ax)
 
 
 def _inside(ratios: Any) -> Any:
@@ -119,7 +117,7 @@ def _mean(ax: Any, each: Standing, ratio: float, y: int, reference: bool) -> Non
     ax.plot(_inside([ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
 
 
-def _profiles(ax: Any, rows: Rows, summary: Summary) -> None:
+def _profiles(rows: Rows, summary: Summary, ax: Any) -> None:
     """Draw what share of replicates is within a ratio of the best method's figure."""
     of = profiles(rows, summary.metric)
 
@@ -147,10 +145,12 @@ def _profiles(ax: Any, rows: Rows, summary: Summary) -> None:
     if len(ranked) > len(named):
         title += f" (the best {NAMED_PROFILES}; grey: {len(ranked) - len(named)} others)"
     ax.set_title(title, fontsize=9, color="0.3")
+    _round_ticks(ax)
 
 
 def _round_ticks(ax: Any) -> None:
     """Mark ratios by numbers that people say."""
+    ax.grid(axis="x", alpha=0.25)
     low, high = ax.get_xlim()
     subs: Any = [k / 10 for k in range(10, 100)]
     if high / low > 3:
@@ -165,10 +165,13 @@ def _round_ticks(ax: Any) -> None:
 
 # --- the page --------------------------------------------------------------------------------------------------------
 
-CAPTION = (
-    "Left: every replicate's figure over the reference's on the same data, and the geometric mean with its interval "
-    "(green or red where that leaves 1 out). Right: the share of replicates on which a method is within a ratio of the "
-    "best one; a method without a figure counts as never."
+RATIOS = (
+    "Every replicate's figure over the reference's on the same data, and the geometric mean with its interval (green "
+    "or red where that leaves 1 out)."
+)
+PROFILES = (
+    "The share of replicates on which a method is within a ratio of the best one; a method without a figure counts as "
+    "never."
 )
 
 
@@ -176,27 +179,29 @@ def write_page(
     folder: Path, rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Mapping[str, str]
 ) -> Path:
     """Write the page, the replicates and the figure into a folder: all of them, or none; return the page's path."""
-    figure = comparison_figure(rows, summary)
-    vector = picture(figure, "comparison", "svg")
+    drawing = comparison_figure(rows, summary)
     names = list(rows[0])
     cells = [["" if row[name] is None else str(row[name]) for name in names] for row in rows]
     files = {
-        "index.html": _html(rows, summary, vector, axes, provenance).encode(),
+        "index.html": _html(rows, summary, axes, provenance).encode(),
         "replicates.csv": csv_text(names, cells).encode(),
-        "comparison.svg": vector,
-        "comparison.png": picture(figure, "comparison", "png"),
+        "comparison.svg": picture(drawing, "comparison", "svg"),
+        "comparison.png": picture(drawing, "comparison", "png"),
     }
     with refused(folder):
         write_files({folder / name: content for name, content in files.items()})
     return folder / "index.html"
 
 
-def _html(rows: Rows, summary: Summary, vector: bytes, axes: Mapping[str, str], provenance: Mapping[str, str]) -> str:
+def _html(rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Mapping[str, str]) -> str:
     problems = list(dict.fromkeys(row["problem"] for row in rows))
     where = ", ".join(problems) if len(problems) <= 3 else f"{len(problems)} problems"
     heading = f"{len({row['method'] for row in rows})} methods on {where}"
-    words = "ratios to the reference by method, and performance profiles"
-    source = f"data:image/svg+xml;base64,{base64.b64encode(vector).decode()}"
+    height = max(18.0 * len(summary.standings) + 90, HEIGHT)
+    drawn = [
+        figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height),
+        figure(partial(_profiles, rows, summary), "Performance profiles", PROFILES, height),
+    ]
     title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
     ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes[:3])]
     sections = [("Methods", ranking), ("By problem", [("table", _medians(rows, summary, problems))])]
@@ -206,10 +211,10 @@ def _html(rows: Rows, summary: Summary, vector: bytes, axes: Mapping[str, str], 
     sections.append(("How it was made", [("facts", [*axes.items(), *provenance.items()])]))
     top: list[Block] = [
         ("lead", {"text": headline(summary), "alarm": False}),
-        ("image", {"source": source, "words": words, "caption": CAPTION}),
+        ("figures", drawn),
     ]
     kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
-    return render(f"Comparison: {heading}", kind, heading, top, sections, images=True)
+    return render(f"Comparison: {heading}", kind, heading, top, sections)
 
 
 def headline(summary: Summary) -> str:

@@ -29,7 +29,7 @@ FILE = "study.py"
 MOST_FILES = 10_000
 MOST_BYTES = 4_000_000_000
 """Of the files beside a study, each of which is read before its replicates are resumed."""
-EXTRA = {"distributed", "joblib", "matplotlib", "pandas", "pyarrow"}
+EXTRA = {"distributed", "joblib", "pandas", "pyarrow"}
 """Packages of the extra ``studies``."""
 REPLICATES = "replicates"
 

@@ -16,8 +16,6 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex.program import Program
 from rpim_opt.report import report
-from rpim_opt.report.chart import Axis, Scale
-from rpim_opt.report.charts import histogram_chart
 from rpim_opt.report.report import page
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
@@ -107,10 +105,12 @@ def test_one_file_that_loads_nothing(arm) -> None:
         assert not {"src", "srcset", "style", "onclick", "onload"} & set(attributes)
         assert not str(attributes.get("href", "#")).startswith("http")
     assert not read.all("link")
-    assert "url(" not in text
+    assert "url(" not in re.sub(r"url\(#\w+\)", "", text)  # clip paths of the charts
     assert "@import" not in text
     (policy,) = [m["content"] for m in read.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
-    assert re.fullmatch(r"default-src 'none'; style-src 'sha256-\S+'; script-src 'sha256-\S+'", str(policy))
+    assert re.fullmatch(
+        r"default-src 'none'; img-src data:; style-src 'sha256-\S+'; script-src 'sha256-\S+'", str(policy)
+    )
     assert page(arm) == text
 
 
@@ -170,7 +170,7 @@ SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("cable", "joints
 @pytest.mark.parametrize("name", ["distance", "mixed", "plane", "pose", "rank_deficient", *SLOW])
 def test_every_measurement_has_a_report(name: str) -> None:
     read = Reader(page(result_of(name)))
-    curves = [path["d"] for path in read.all("path") if "line" in str(path["class"])]
+    curves = [path["d"] for path in read.all("path")]
     assert curves
     assert not any("nan" in str(d) or "inf" in str(d) for d in curves)
     assert ("Orientation error" in read.words) == (name == "pose")
@@ -202,15 +202,6 @@ def test_the_command(monkeypatch, capsys, tmp_path: Path) -> None:
     assert "cannot be written" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("ends", [(0, 1), (-3.7, 12.2), (0, 5), (1e-6, 1.1e-6), (-40.0, -39.0)])
-def test_ticks_are_round_and_few(ends) -> None:
-    ticks = Scale(Axis("x", ends)).ticks()
-    assert 3 <= len(ticks) <= 7
-    assert all(float(text) == pytest.approx(value, rel=1e-5, abs=1e-12) for value, text in ticks)
-    steps = np.diff([value for value, _ in ticks])
-    assert steps == pytest.approx(np.full(len(steps), steps[0]), rel=1e-6)
-
-
 # --- in a browser ------------------------------------------------------------------------------------------
 
 
@@ -235,11 +226,9 @@ def test_nothing_is_fetched_and_nothing_complains(opened: Browser) -> None:
     assert [url.split(":")[0] for url in opened.requests()] == ["file"]
     drawn = opened.run("[...document.querySelectorAll('svg path')].map(p => p.getTotalLength())")
     assert len(drawn) >= 19  # lines of ten charts, and those in space
-    outlines = opened.run(
-        "[...document.querySelectorAll('svg .line, #space path')].filter(p => !p.getAttribute('d')).length"
-    )
+    outlines = opened.run("[...document.querySelectorAll('svg path')].filter(p => !p.getAttribute('d')).length")
     assert outlines == 0
-    assert opened.run("document.querySelectorAll('svg .dot').length") >= 2 * (16 + 9)
+    assert opened.run("document.querySelectorAll('svg use title').length") >= 2 * (16 + 9)
 
 
 def test_the_slider_tells_of_every_weight(opened: Browser) -> None:
@@ -345,9 +334,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
     assert "The maximum U is at joints" in words
-    levels = [str(each["class"]) for each in read.all("rect") if str(each.get("class", "")).startswith("box level")]
-    assert len(levels) > 100
-    assert any("over" in level for level in levels) == (not verdict.startswith("Accepted"))
+    assert words.count("mm, above the limit") == (0 if verdict == "Accepted" else words.count("From above") * 2)
 
 
 def test_no_verdict_where_nothing_is_demanded(arm) -> None:
@@ -372,16 +359,3 @@ def test_only_tolerances_that_were_kept_are_shown() -> None:
     loose = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
     assert "tolerance" in Reader(page(kept)).words
     assert "tolerance" not in Reader(page(loose)).words
-
-
-def test_a_histogram_says_what_is_below_its_first_bar() -> None:
-    result = result_of("position")
-    errors = {"before": np.array([1.0, 2.0]), "after": np.array([1e-6, 0.1])}
-    assert histogram_chart(errors).note == "The first bar includes the rows below 0.0002 mm: 1 identified."
-    assert "The first bar" not in page(result)
-
-
-@pytest.mark.slow
-def test_a_scale_of_little_more_than_a_decade_has_more_than_one_tick() -> None:
-    for low, high in ((0.05, 2.0), (0.02, 0.9), (0.4, 30.0)):
-        assert len(Scale(Axis("", (low, high), log=True)).ticks()) >= 3

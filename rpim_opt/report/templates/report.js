@@ -6,7 +6,9 @@ const millimetres = (v) => (v < 10 ? v.toFixed(3) : v < 100 ? v.toFixed(2) : v.t
 
 function curve({ weight, residual, solution, error, of, takers, chosen, x, y }) {
   const slider = document.getElementById("weight"), says = document.getElementById("weight-says");
-  const cursor = document.getElementById("cursor"), svg = cursor.ownerSVGElement;
+  const svg = slider.closest(".figures").querySelector("svg");
+  const cursor = svg.appendChild(document.createElementNS(svg.namespaceURI, "circle"));
+  for (const [name, value] of Object.entries({ id: "cursor", class: "cursor", r: 9 })) cursor.setAttribute(name, value);
   const show = (k) => {
     slider.value = k;
     cursor.setAttribute("cx", x[k]);
