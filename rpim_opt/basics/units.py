@@ -231,15 +231,8 @@ IN_A_NAME = (
 )
 
 
-class Foreign(NamedTuple):
-    """A unit of ours, and how many of it a unit of others is."""
-
-    unit: str
-    size: float
-
-
-FOREIGN = {"in": Foreign("mm", 25.4), "cm": Foreign("mm", 10.0), "gon": Foreign("deg", 0.9)}
-"""Units that files of ours do not have: their numbers are converted."""
+FOREIGN = {"in": ("mm", 25.4), "cm": ("mm", 10.0), "gon": ("deg", 0.9)}
+"""Units that files of ours do not have: the unit of ours, and how many of it one is. Their numbers are converted."""
 
 
 def _spelled(text: str) -> str:
@@ -250,7 +243,7 @@ def _spelled(text: str) -> str:
 
 def dimension_of(unit: str) -> str:
     """Return the dimension of a unit."""
-    return UNITS[FOREIGN[unit].unit if unit in FOREIGN else unit].dimension
+    return UNITS[FOREIGN[unit][0] if unit in FOREIGN else unit].dimension
 
 
 def parse_units(text: str) -> dict[str, str]:

@@ -18,6 +18,9 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.parameter_names import session_prefix
 
+ROW_FIELDS = ("q", "y", "torque", "payload", "approach", "point", "session")
+"""What a block has of every row, besides its columns."""
+
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Block(Brief):
@@ -90,23 +93,10 @@ class Block(Brief):
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
         covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
-
-        def rows(values: Any | None) -> Any | None:
-            return None if values is None else values[index]
-
-        return replace(
-            self,
-            q=self.q[index],
-            y=self.y[index],
-            covariance=covariance,
-            row=row,
-            torque=rows(self.torque),
-            payload=rows(self.payload),
-            approach=rows(self.approach),
-            columns={name: values[index] for name, values in self.columns.items()},
-            point=rows(self.point),
-            session=rows(self.session),
-        )
+        columns = {name: values[index] for name, values in self.columns.items()}
+        stated = {name: getattr(self, name) for name in ROW_FIELDS}
+        rows = {name: values[index] for name, values in stated.items() if values is not None}
+        return replace(self, covariance=covariance, row=row, columns=columns, **rows)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

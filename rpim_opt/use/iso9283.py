@@ -310,5 +310,6 @@ def _size(name: str, dimension: str, unit: str, units: Mapping[str, str]) -> flo
     if not unit or dimension_of(unit) != dimension:
         raise InputError("the header", f"column '{name}' without a unit of {dimension}", "x_mm, or --units deg,mm")
     if unit in FOREIGN:
-        return FOREIGN[unit].size * UNITS[FOREIGN[unit].unit].si
+        ours, size = FOREIGN[unit]
+        return size * UNITS[ours].si
     return UNITS[unit].si

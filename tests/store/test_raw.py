@@ -340,8 +340,8 @@ def test_clocks_that_do_not_agree_are_one_sentence(monkeypatch, capsys, tmp_path
 def test_each_of_the_fewer_has_its_own_partner() -> None:
     """A row of the longer table serves the nearest alone; both ways round the pairs are the same."""
     few, many = np.array([0.0, 0.9, 1.15, 5.0]), np.arange(0.0, 10.0, 1.0)
-    pairs = partners(few, many, 0.2)
+    left, right, apart = partners(few, many, 0.2)
     turned = partners(many, few, 0.2)
-    assert list(zip(pairs.left.tolist(), pairs.right.tolist(), strict=True)) == [(0, 0), (1, 1), (3, 5)]
-    assert (turned.right.tolist(), turned.left.tolist()) == (pairs.left.tolist(), pairs.right.tolist())
-    np.testing.assert_allclose(turned.apart, -pairs.apart)
+    assert list(zip(left.tolist(), right.tolist(), strict=True)) == [(0, 0), (1, 1), (3, 5)]
+    assert (turned[1].tolist(), turned[0].tolist()) == (left.tolist(), right.tolist())
+    np.testing.assert_allclose(turned[2], -apart)

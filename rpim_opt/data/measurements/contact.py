@@ -166,7 +166,14 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     blocks = []
     labels: list[str] = []
     for i, each in enumerate(known):
-        _require_touched(each, touched)
+        where = each.measurement.name.replace("_", " ")
+        for name in each.between:
+            if name not in touched:
+                raise InputError(where, f"'{name}'", choices(name, touched))
+        planar = {touched[name].measurement.planar for name in each.between}
+        if len(planar) > 1 or (each.measurement is not known_distance and planar == {False}):
+            accepted = "two planes, or for a distance two points"
+            raise InputError(where, f"between '{each.between[0]}' and '{each.between[1]}'", accepted)
         blocks.append(_stating(each, touched, len(data) + i))
         label = " to ".join(each.between)
         if label in labels:  # planes may have both an angle and a distance
@@ -175,17 +182,6 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
     configuration = np.concatenate([data.configuration, alone])
     return Dataset((*data.blocks, *blocks), (*data.label, *labels), configuration).grouped_by_points()
-
-
-def _require_touched(known: Known, touched: Mapping[str, Block]) -> None:
-    where = known.measurement.name.replace("_", " ")
-    for name in known.between:
-        if name not in touched:
-            raise InputError(where, f"'{name}'", choices(name, touched))
-    planar = {touched[name].measurement.planar for name in known.between}
-    if len(planar) > 1 or (known.measurement is not known_distance and planar == {False}):
-        accepted = "two planes, or for a distance two points"
-        raise InputError(where, f"between '{known.between[0]}' and '{known.between[1]}'", accepted)
 
 
 def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:

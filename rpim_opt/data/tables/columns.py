@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from functools import lru_cache
 
 import numpy as np
 
@@ -122,7 +121,7 @@ def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callabl
 
 def labels(table: Columns, N: int) -> tuple[str, ...]:
     """Return the rows' labels, numbers from 1 by default; refuse names that are missing or there twice."""
-    label = _numbers(N)
+    label = tuple(map(str, range(1, N + 1)))
     if "label" in table:
         label = texts(table["label"], "label")
         require_unique(label, "label")
@@ -131,11 +130,6 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
             if not name:
                 raise InputError(f"row {label[i]}, column {column}", "''", "a name")
     return label
-
-
-@lru_cache(maxsize=8)
-def _numbers(N: int) -> tuple[str, ...]:
-    return tuple(map(str, range(1, N + 1)))  # tables in parts are as long as each other, and read again and again
 
 
 def require_unique(names: Sequence[str], column: str) -> None:

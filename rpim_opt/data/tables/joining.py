@@ -39,14 +39,6 @@ class Whole(NamedTuple):
     notes: tuple[str, ...]
 
 
-class Pairs(NamedTuple):
-    """Rows of one table with rows of another one, and by how much their times differ [s]."""
-
-    left: np.ndarray
-    right: np.ndarray
-    apart: Array
-
-
 def together(
     tables: Sequence[Understood], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
 ) -> Whole:
@@ -223,27 +215,28 @@ def _by_time(
     return left.tolist(), right.tolist(), [labels[i] for i in right], notes
 
 
-def partners(left: Array, right: Array, within: float) -> Pairs:
-    """Return which times (N,) and (M,) [s] belong together: each of the fewer with the nearest of the others.
+def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.ndarray, Array]:
+    """Return which times (N,) and (M,) [s] belong together, and by how much they differ (K,) [s].
 
-    Of several whose nearest is the same one, the nearest alone is its partner (of equal times, all).
+    Each of the fewer belongs to the nearest of the others; of several whose nearest is the same one, the nearest alone
+    (of equal times, all).
 
     >>> import numpy as np
     >>> from rpim_opt.data.tables.joining import partners
-    >>> pairs = partners(np.arange(0.0, 1.0, 0.01), np.array([0.104, 0.501, 7.0]), within=0.005)
-    >>> pairs.left.tolist(), pairs.right.tolist(), pairs.apart.round(3).tolist()
+    >>> left, right, apart = partners(np.arange(0.0, 1.0, 0.01), np.array([0.104, 0.501, 7.0]), within=0.005)
+    >>> left.tolist(), right.tolist(), apart.round(3).tolist()
     ([10, 50], [0, 1], [0.004, 0.001])
     """
     if len(left) < len(right):
-        turned = partners(right, left, within)
-        order = np.argsort(turned.right, kind="stable")
-        return Pairs(turned.right[order], turned.left[order], -turned.apart[order])
+        others, own, apart = partners(right, left, within)
+        order = np.argsort(own, kind="stable")
+        return own[order], others[order], -apart[order]
     _, partner = scipy.spatial.KDTree(left[:, None]).query(right[:, None])
     apart = right - left[partner]
     least = np.full(len(left), np.inf)
     np.minimum.at(least, partner, np.abs(apart))
     kept = np.flatnonzero((np.abs(apart) <= within) & (np.abs(apart) == least[partner]))
-    return Pairs(partner[kept], kept, apart[kept])
+    return partner[kept], kept, apart[kept]
 
 
 def _times(tables: Sequence[Understood], key: str) -> Array:

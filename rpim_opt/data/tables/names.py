@@ -27,59 +27,43 @@ Readings = dict[str, Reading]
 """What every column holds, by its name."""
 
 
-class Name(NamedTuple):
-    """A pattern of names, what they mean, and why."""
-
-    pattern: str
-    meaning: str
-    why: str = "a usual name"
-
-
-class Dialect(NamedTuple):
-    """Whose names these are, and the units that it counts in."""
-
-    pattern: str
-    angle: str
-    length: str
-    why: str
-
-
 _WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|coords?|coordinates?|cartesian|cart|tcp)_?)*"
 _JOINT = "q|j|jt|joint|axis|a|theta|θ|rax|achse|gelenk|axe|eje|giunto|关节|轴|軸"
 _SPREAD = r"(?:std|stdev|stddev|std_?dev|sigma|sd)"
-NAMES = (
-    Name(rf"(to_)?(?:{_JOINT})_?(\d+)(?:_?(?:pos|position|angle|value))?", r"\1q\2"),
-    Name(r"(?:joints?|axes|axis|achsen|gelenke)(?:_(?:angles?|positions?|values?|pos))?_(?:q|j|a|joint|axis)?_?(\d+)",
+NAMES: tuple[tuple[str, ...], ...] = (
+    (rf"(to_)?(?:{_JOINT})_?(\d+)(?:_?(?:pos|position|angle|value))?", r"\1q\2"),
+    (r"(?:joints?|axes|axis|achsen|gelenke)(?:_(?:angles?|positions?|values?|pos))?_(?:q|j|a|joint|axis)?_?(\d+)",
          r"q\1"),
-    Name(r"(?:field_)?position_?(\d+)", r"q\1", "ROS: JointState.position"),
-    Name(r"(\d+)_?(?:軸|轴|축)", r"q\1"),
-    Name(r"(to_)?(?:field_)?(?:tau|torque|effort)_?(\d+)", r"\1tau\2"),
-    Name(rf"{_WHERE}([xyz])(?:_?1|坐标)?", r"\1"),
-    Name(r"az(?:imuth|imut)?", "azimuth", "azimuth, counterclockwise from x about z"),
-    Name(r"hz|horizontal_?(?:angle|winkel)|hz_?(?:angle|winkel)", "hz", "horizontal angle, clockwise from x"),
-    Name(r"el(?:ev(?:ation)?)?(?:_angle)?", "elevation", "elevation above the horizontal plane"),
-    Name(r"v|zenith(?:_?(?:angle|distance))?|v_?(?:angle|winkel)|vertical_?(?:angle|winkel)|za", "zenith",
+    (r"(?:field_)?position_?(\d+)", r"q\1", "ROS: JointState.position"),
+    (r"(\d+)_?(?:軸|轴|축)", r"q\1"),
+    (r"(to_)?(?:field_)?(?:tau|torque|effort)_?(\d+)", r"\1tau\2"),
+    (rf"{_WHERE}([xyz])(?:_?1|坐标)?", r"\1"),
+    (r"az(?:imuth|imut)?", "azimuth", "azimuth, counterclockwise from x about z"),
+    (r"hz|horizontal_?(?:angle|winkel)|hz_?(?:angle|winkel)", "hz", "horizontal angle, clockwise from x"),
+    (r"el(?:ev(?:ation)?)?(?:_angle)?", "elevation", "elevation above the horizontal plane"),
+    (r"v|zenith(?:_?(?:angle|distance))?|v_?(?:angle|winkel)|vertical_?(?:angle|winkel)|za", "zenith",
          "angle from the vertical axis"),
-    Name(r"(?:(?:field|pose|transform)_)*(?:q|quat|quaternion|orientation|rotation|rot)_?([wxyz])", r"q\1"),
-    Name(r"roll", "rx"),
-    Name(r"pitch", "ry"),
-    Name(r"yaw", "rz"),
-    Name(r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
-    Name(r"u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
-    Name(rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
-    Name(r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
-    Name(r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"
+    (r"(?:(?:field|pose|transform)_)*(?:q|quat|quaternion|orientation|rotation|rot)_?([wxyz])", r"q\1"),
+    (r"roll", "rx"),
+    (r"pitch", "ry"),
+    (r"yaw", "rz"),
+    (r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
+    (r"u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
+    (rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
+    (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
+    (r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"
          r"|punkt_?nr|feature|nom_du_point|punto|pt|点名|点号|測定点|測点", "label"),
-    Name(r"configuration|config|pose|pose_id", "configuration"),
-    Name(r"marker|reflector|smr", "marker"),
-    Name(r"temp(?:erature|eratur)?", "temperature"),
-    Name(r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
+    (r"configuration|config|pose|pose_id", "configuration"),
+    (r"marker|reflector|smr", "marker"),
+    (r"temp(?:erature|eratur)?", "temperature"),
+    (r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
 )  # fmt: skip
-"""What else a column may be called, in lower case and with underscores: unambiguous names alone."""
-DIALECTS = (
-    Dialect(r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]", "rad", "m", "ROS: SI units (REP 103)"),
-    Dialect(r"(?:actual|target)_q_\d", "rad", "m", "Universal Robots' RTDE: SI units"),
-)
+"""What else a column may be called, in lower case and with underscores, what it means, and why unless that is usual."""
+DIALECTS = {
+    r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]": "ROS: SI units (REP 103)",
+    r"(?:actual|target)_q_\d": "Universal Robots' RTDE: SI units",
+}
+"""Patterns of names whose units are rad and m, and whose they are."""
 KINDS = {
     "derived": frozenset({"deviation", "dev", "delta", "diff", "difference", "error", "err", "residual", "velocity",
                           "vel", "speed", "acceleration"}),
@@ -110,9 +94,9 @@ VALUE = frozenset({"position", "pos", "angle", "value"})
 """What may stand behind the name of a joint for its value."""
 
 
-def dialect(name: str) -> Dialect | None:
-    """Return the dialect that a column's name belongs to, where that says its unit."""
-    return next((each for each in DIALECTS if re.fullmatch(each.pattern, name)), None)
+def in_si(name: str) -> str:
+    """Return why a column without a unit is in rad or m; nothing where its name does not say it."""
+    return next((why for pattern, why in DIALECTS.items() if re.fullmatch(pattern, name)), "")
 
 
 def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
@@ -131,11 +115,11 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     number, why = _joint_in(path, joints)
     if number:
         return Reading(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
-    for each in NAMES:
-        match = re.fullmatch(each.pattern, rest)
+    for pattern, meaning, *reason in NAMES:
+        match = re.fullmatch(pattern, rest)
         if match:
-            meaning = re.sub(r"(?<=[qu])0+(?=\d)", "", match.expand(each.meaning))
-            return Reading(meaning, "", each.why, kind)
+            known = re.sub(r"(?<=[qu])0+(?=\d)", "", match.expand(meaning))
+            return Reading(known, "", "".join(reason) or "a usual name", kind)
     # u(x) is a standard uncertainty, U(x) an expanded one of unknown coverage factor
     match = re.fullmatch(r"u[\s_(]*([xyzXYZ])\)?", stem.strip())
     if match:

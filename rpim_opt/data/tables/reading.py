@@ -105,7 +105,10 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     if kind.points == 2:
-        _require_two_points(q, markers, label)
+        for i, name in enumerate(label):
+            if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
+                found = "twice the same reflector in the same configuration"
+                raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
     if "configuration" in table:
         configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
     else:
@@ -153,14 +156,6 @@ def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
     """Return the texts of the first of the columns that is there, or N empty ones."""
     column = next((each for each in columns if each in table), None)
     return texts(table[column], column) if column else ("",) * N
-
-
-def _require_two_points(q: Array, markers: Sequence[Sequence[str]], label: Sequence[str]) -> None:
-    """Refuse a distance from a point to itself."""
-    for i, name in enumerate(label):
-        if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
-            found = "twice the same reflector in the same configuration"
-            raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
 
 
 def _by_joints(q: Array) -> np.ndarray:

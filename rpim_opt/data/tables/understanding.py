@@ -24,8 +24,8 @@ from rpim_opt.data.tables.names import (
     UR_JOINTS,
     Reading,
     Readings,
-    dialect,
     endings,
+    in_si,
     recognize,
     ur_joint,
 )
@@ -40,12 +40,14 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
-    "point": "touched or imaged point", "rx": "measured roll (extrinsic xyz)",
+    "point": "point that was touched or seen", "rx": "measured roll (extrinsic xyz)",
     "ry": "measured pitch (extrinsic xyz)", "rz": "measured yaw (extrinsic xyz)",
+    r"q(\d+)": r"joint \1", r"tau(\d+)": r"torque of joint \1", r"q([wxyz])": r"quaternion \1",
+    r"r(\d)(\d)": r"rotation matrix \1,\2", "u95": "U95 of all axes", "sigma": "standard deviation of all axes",
+    r"u95_(\w+)": r"U95 of \1", r"sigma_(\w+)": r"standard deviation of \1",
+    r"cov_([^_]+)_(\w+)": r"covariance of \1, \2",
 }  # fmt: skip
-NUMBERED = {r"q(\d+)": "joint {}", r"tau(\d+)": "torque of joint {}", r"q([wxyz])": "quaternion {}",
-            r"r(\d)(\d)": "rotation matrix {},{}"}  # fmt: skip
-SPREAD = {"u95": "U95", "sigma": "standard deviation", "cov": "covariance"}
+"""What our columns are, in words; the first pattern that fits counts."""
 
 
 class Meant(NamedTuple):
@@ -338,7 +340,7 @@ def _under_our_names(
     """Return the columns that are ours, by our names and in our units, and what every column means."""
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
-    unitless: dict[str, list[str]] = {}
+    unitless: dict[str, str] = {}
     for name, cells in table.items():
         found = read[name]
         if found.stem not in known and found.stem not in text_columns(kind):
@@ -350,12 +352,12 @@ def _under_our_names(
             accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"
             raise InputError("the header", f"column '{name}' ({meaning(found.stem)}) in {unit}", accepted)
         if unit in FOREIGN:
-            of = FOREIGN[unit]
-            cells = ["" if np.isnan(value) else repr(float(of.size * value)) for value in _values(cells, name)]
-            why += f"; {unit} is {of.size:g} {of.unit}"
-            unit = of.unit
+            ours, size = FOREIGN[unit]
+            cells = ["" if np.isnan(value) else repr(float(size * value)) for value in _values(cells, name)]
+            why += f"; {unit} is {size:g} {ours}"
+            unit = ours
         if not unit and dimensions:
-            unitless.setdefault(dimensions[0], []).append(name)
+            unitless[name] = dimensions[0]
         new = f"{found.stem}_{unit}" if unit else found.stem
         if new in columns:
             other = next(each.column for each in meant if each.name == new)
@@ -365,10 +367,9 @@ def _under_our_names(
         meant.append(Meant(name, said, new, unit, f"{found.why}; unit {why}" if why else found.why))
     if unitless:
         examples = {"angle": "deg", "length": "mm", "torque": "Nm", "mass": "kg"}
-        missing = ",".join(examples.get(dimension, dimension) for dimension in unitless)
-        lacking = ", ".join(name for names in unitless.values() for name in names)
+        missing = ",".join(examples.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
         accepted = f"--units with theirs, such as {missing}, or names that carry one, such as q1_deg and x_mm"
-        raise InputError("the header", f"columns without a unit ({lacking})", accepted)
+        raise InputError("the header", f"columns without a unit ({', '.join(unitless)})", accepted)
     return columns, meant
 
 
@@ -379,18 +380,10 @@ def meaning(stem: str) -> str:
     >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
     ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
     """
-    if stem in MEANINGS:
-        return MEANINGS[stem]
-    if stem.startswith("to_"):
+    if stem.startswith("to_") and stem not in MEANINGS:
         return f"second point: {meaning(stem.removeprefix('to_'))}"
-    for prefix, word in SPREAD.items():
-        if stem.startswith(prefix):
-            return f"{word} of {stem.removeprefix(prefix).strip('_').replace('_', ', ') or 'all axes'}"
-    for pattern, words in NUMBERED.items():
-        match = re.fullmatch(pattern, stem)
-        if match:
-            return words.format(*match.groups())
-    return f"measured {stem}"
+    matches = ((re.fullmatch(pattern, stem), words) for pattern, words in MEANINGS.items())
+    return next((match.expand(words) for match, words in matches if match), f"measured {stem}")
 
 
 def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[str, str]) -> tuple[str, str]:
@@ -407,9 +400,9 @@ def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[s
         return units[dimension], "--units"
     if dimension == "pixel":
         return "px", "the only unit"
-    of = dialect(name)
-    if of is not None and dimension in ("angle", "length"):
-        return getattr(of, dimension), of.why
+    why = in_si(name)
+    if why and dimension in ("angle", "length"):
+        return ("rad" if dimension == "angle" else "m"), why
     return "", ""
 
 
