@@ -84,17 +84,6 @@ def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
 
     A folder may come from somebody else: what it names elsewhere is neither read nor written, be it by an absolute
     path, by ``..`` or by a link. Errors have ``where`` and ``file`` as the place of the name.
-
-    >>> from pathlib import Path
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.basics.files import inside
-    >>> inside(Path("cell"), "tables/june.csv", "key identification").name
-    'june.csv'
-    >>> try:
-    ...     inside(Path("cell"), "../june.csv", "key identification")
-    ... except ro.InputError as error:
-    ...     print(error)
-    key identification: found '../june.csv', accepted: the name of a file in the folder.
     """
     path = folder / name
     accepted = "the name of a file in the folder"

@@ -21,8 +21,6 @@ MOSTLY = 0.8
 """A column is one of numbers if this part of its cells are."""
 LINES_OF_HEADER = 6
 DIMENSIONS = frozenset(unit.dimension for unit in UNITS.values())
-ALONE = "\0"
-"""In a header's line: a cell that belongs to no group."""
 MOST_NAMED = 5
 """Lines that are left out and named one by one."""
 SUMMARIES = frozenset({
@@ -285,13 +283,15 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         lacking = [""] * (width - len(signs))
         units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
     *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
-    for i, name in enumerate(names):  # one that is merged downwards stands higher up
-        higher = [line for line in grouping if line[i]]
-        if not name and higher and any(line[i + 1 : i + 2] != [""] for line in higher):
-            names[i] = higher[-1][i]
-            for line in grouping:
-                line[i] = ALONE
-    groups = [" ".join(filter(None, parts)) for parts in zip(*map(_unmerged, grouping), strict=True)] or [""] * width
+    groups = [""] * width
+    alone = {i for i in range(width) if not names[i] and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping)}
+    for i in alone:  # merged downwards: the name stands higher up
+        names[i] = next(row[i] for row in reversed(grouping) if row[i])
+    for row in grouping:
+        group = ""  # merged with what is right of it
+        for i, cell in enumerate(row):
+            group = "" if i in alone else cell or group
+            groups[i] = f"{groups[i]} {group}".strip()
     return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
 
 
@@ -326,16 +326,6 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
     return cells
 
 
-def _unmerged(line: Sequence[str]) -> list[str]:
-    """Return a line in which merged cells have the text of their first."""
-    cells: list[str] = []
-    last = ""
-    for cell in line:
-        last = "" if cell == ALONE else cell or last
-        cells.append(last)
-    return cells
-
-
 # --- columns and their numbers -------------------------------------------------------------------------------------
 
 
@@ -350,12 +340,11 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOpt
         name = str(head) if head.name else f"column {j + 1}"
         if name in columns:
             name = f"{name} #{j + 1}"
-        columns[name] = Column(name, head, cells)
-    for name, column in columns.items():
-        unit = "" if _is_numeric(column.cells) else _unit_of(column.cells)
+        unit = "" if _is_numeric(cells) else _unit_of(cells)
         if unit:
-            bare = [cell.removesuffix(unit).strip() for cell in column.cells]
-            columns[name] = Column(name, column.head._replace(unit=unit), bare)
+            cells = [cell.removesuffix(unit).strip() for cell in cells]
+            head = head._replace(unit=unit)
+        columns[name] = Column(name, head, cells)
     numeric = {name: column.cells for name, column in columns.items() if _is_numeric(column.cells)}
     mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), options.decimal)
     for name, cells in numeric.items():

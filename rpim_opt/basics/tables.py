@@ -173,17 +173,7 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
 
 
 def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
-    r"""Return the rows of a text or Excel file; the arguments are those of `TableOptions`.
-
-    The separator is the one that parts most numbers from each other in the first lines.
-
-    >>> from pathlib import Path
-    >>> from rpim_opt.basics.tables import read_grid
-    >>> _ = Path("points.txt").write_text("// Point X Y Z\nP1 1.5 2.5 3.5\nP2 4 5 6\n")
-    >>> grid = read_grid(Path("points.txt"))
-    >>> grid.rows[1], grid.notes
-    (['P1', '1.5', '2.5', '3.5'], ('cells are separated by space: it separates most numbers.',))
-    """
+    """Return the rows of a text or Excel file; the arguments are those of `TableOptions`."""
     known = (*TEXTS, *EXCEL, ".parquet")
     require_file(path, LARGEST_DATA, known)
     if path.suffix.lower() in EXCEL:
@@ -240,12 +230,7 @@ def _encoding(data: bytes) -> tuple[str, str]:
 
 
 def is_numeral(cell: str) -> bool:
-    """Return whether a cell is a number, with whatever decimal mark.
-
-    >>> from rpim_opt.basics.tables import is_numeral
-    >>> [is_numeral(cell) for cell in ("1.5", "-1,5", "1.234,5", "2e-3", "P1", "nan")]
-    [True, True, True, True, False, False]
-    """
+    """Return whether a cell is a number, with whatever decimal mark: ``-1,5``, ``1.234,5``, ``2e-3``."""
     return NUMERAL.fullmatch(cell) is not None
 
 

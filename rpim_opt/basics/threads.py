@@ -34,10 +34,6 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
 
     What the items are does not depend on the number of cores, and so neither does any digit of the answers. Inside a
     thread of its own it works one by one. A second in each of several threads counts as one second of its phase.
-
-    >>> from rpim_opt.basics.threads import on_all_cores
-    >>> on_all_cores(lambda k: k**2, range(4))
-    [0, 1, 4, 9]
     """
     waiting = list(items)
     workers = min(cores(), len(waiting))

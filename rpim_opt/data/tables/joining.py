@@ -255,12 +255,7 @@ def _times(tables: Sequence[Understood], key: str) -> Array:
 
 
 def time_column(names: Iterable[str]) -> str | None:
-    """Return the first column that is called a time; None where there is none.
-
-    >>> from rpim_opt.data.tables.joining import time_column
-    >>> [time_column(names) for names in (["q1", "Time [ms]"], ["header.stamp", "x"], ["x_mm"])]
-    ['Time [ms]', 'header.stamp', None]
-    """
+    """Return the first column that is called a time, ``Time [ms]``, ``header.stamp``; None where there is none."""
     return next((name for name in names if TIME.fullmatch(_split_time(name)[0].replace("_", " "))), None)
 
 

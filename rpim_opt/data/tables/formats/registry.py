@@ -32,12 +32,7 @@ class TableFormat(NamedTuple):
 
 
 def formats() -> list[TableFormat]:
-    """Return the formats of all modules here.
-
-    >>> from rpim_opt.data.tables.formats.registry import formats
-    >>> sorted(each.name for each in formats())[:2]
-    ['FANUC program', 'JSON']
-    """
+    """Return the formats of all modules here."""
     names = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.name != "registry"]
     return [each for name in names for each in import_module(f"{__package__}.{name}").FORMATS]
 
