@@ -154,8 +154,14 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
     moments = relax(Q)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
         moments = relax(Q, FINE)
-    refined = [_refined(L, start) for start in (*_rounded(moments), *candidates)]
-    best = min(refined, key=lambda R: _value(L, R))
+    lifts = [moments.matrix[:, 0]]  # the mean of the rotations that the moments stand for
+    if moments.rank_ratio > SPREAD:  # and some that are drawn from them
+        eigenvalues, vectors = np.linalg.eigh(moments.matrix)
+        normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
+        drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
+        lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
+    starts = [proper(lift[1:].reshape(-1, 3, 3)) for lift in lifts]
+    best = min((_refined(L, start) for start in (*starts, *candidates)), key=lambda R: _value(L, R))
     value = _value(L, best)
     x = lifted(best)
     C = rotation_constraints(len(best))
@@ -175,17 +181,6 @@ def lifted(rotations: Array) -> Array:
 
 def _value(L: Array, rotations: Array) -> float:
     return float(np.sum((L @ lifted(rotations)) ** 2))
-
-
-def _rounded(moments: Moments) -> list[Array]:
-    """Return rotations that the moment matrix stands for: their mean, and where it has several, some drawn from it."""
-    lifts = [moments.matrix[:, 0]]
-    if moments.rank_ratio > SPREAD:
-        eigenvalues, vectors = np.linalg.eigh(moments.matrix)
-        normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
-        drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
-        lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
-    return [proper(lift[1:].reshape(-1, 3, 3)) for lift in lifts]
 
 
 def _derivatives(L: Array, rotations: Array) -> tuple[Array, Array]:
