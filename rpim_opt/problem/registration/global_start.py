@@ -85,18 +85,13 @@ class JointMapping:
     mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
 
     @property
-    def missed(self) -> float:
-        """Probability that a basin which one start in 200 reaches was missed."""
-        return (1 - RARE_BASIN) ** self.starts
-
-    @property
     def sentence(self) -> str:
         """Say what was found, from what, and how certain it is."""
         text = (
             f"Joint mapping found from the data: {described(self.joint_types, self.sign, self.zero)} "
             f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
             f"{self.starts} random starts: an optimum that one start in {round(1 / RARE_BASIN)} reaches is missed "
-            f"with a probability of {self.missed:.1g})."
+            f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
         return " ".join([text, *self.ambiguities])
 
