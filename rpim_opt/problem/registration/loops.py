@@ -12,7 +12,6 @@ from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.registration.closed_forms import proper
 from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, smallest
 
@@ -56,8 +55,9 @@ class Loops:
 
     def triangle(self, weights: Array) -> Array:
         """Return T (n, n), upper, with |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2."""
-        rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, self.rows.shape[2])
-        return reduced_rows(np.vstack([rows, self.prior]))
+        n = self.rows.shape[2]
+        rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
+        return np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
 
     def squares(self, v: Array) -> Array:
         """Return |J_i v|^2 (N,)."""
