@@ -232,9 +232,9 @@ def clarabel_settings(other: dict[str, Any]) -> Any:
     """Return Clarabel's settings, some of them other ones."""
     settings = import_module("clarabel").DefaultSettings()
     settings.verbose, settings.max_threads = False, 1
-    settings.presolve_enable = settings.chordal_decomposition_enable = False
+    settings.presolve_enable = False
+    settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
     settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
-    settings.input_sparse_dropzeros = False
     tolerance = ACCEPTED if other else SOUGHT
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
@@ -313,7 +313,6 @@ class Small:
         self.penalty, self.rows, self.loss, self.sizes = penalty, rows, loss, sizes
         self.face = np.zeros(0, dtype=int)
         self.near = np.zeros(penalty.size)
-        self._solver: Any = None
 
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
@@ -367,34 +366,35 @@ class Small:
 
     @cached_property
     def _data(self) -> _Data:
-        return _Data(self)
+        return _Data(self.penalty, self.rows, self.loss, self.sizes)
 
     def _by_cones(
         self, squares: Squares | None, weight: float, A: Array | None, b: Array | None
     ) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
         clarabel = import_module("clarabel")  # a compiled module, without types
-        d, k, p = self._data, self.rows, self.penalty
+        data, p, k = self._data, self.penalty, self.rows
+        if squares is None:
+            squares = Squares(np.zeros((k, len(p.at))), np.zeros(k), np.zeros(len(p.at)))
         x0 = np.zeros(p.size)  # tolerances are relative to the size of the unknowns: those are changes of a near point
-        x0[p.at] = self._centre(squares, weight)
-        matrix, bound = d.rows(squares, A, b, x0)
-        P, q = d.objective(squares, weight, x0)
-        residual = np.abs(bound[:k]).max(initial=0.0)
-        scale = 1.0 / max(1.0, np.abs(q).max(), 1e-3 * weight, residual)  # tolerances are absolute below one
-        P.data *= scale
+        x0[p.at] = z0 = self._centre(squares, weight)
+        residual = squares.y - squares.R @ z0
+        q = [weight * (p.q + p.P @ x0), np.zeros(k)]
+        q[0][p.at] += squares.g
+        bounds, dense = [residual, p.b - p.A @ x0], [squares.R.ravel()]
+        if self.loss is not None and A is not None and b is not None:
+            q.append(self.loss.q)
+            bounds += [self.loss.b, data.link @ (b - A @ z0)]
+            dense.append(A.ravel())
+        cost = np.concatenate(q)
+        scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
+        P, matrix = data.filled(weight, np.concatenate(dense))
+        P.data *= scale  # tolerances are absolute below one
+        program = P, cost * scale, matrix, np.concatenate(bounds), data.cones
         status = ""
         for attempt in ATTEMPTS:
-            if self._solver is None or attempt:
-                settings = clarabel_settings(attempt)
-                settings.chordal_decomposition_enable = d.semidefinite  # a sparse matrix: 30 times faster at 34 rows
-                settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
-                self._solver = clarabel.DefaultSolver(P, q * scale, matrix, bound, d.cones, settings)
-            else:
-                self._solver.update(P=P.data, q=q * scale, A=matrix.data, b=bound)
-            found = self._solver.solve()
+            found = clarabel.DefaultSolver(*program, clarabel_settings(attempt)).solve()
             status = str(found.status)
-            if attempt or d.semidefinite:  # whose data cannot be replaced
-                self._solver = None
             if status in SOLVED:
                 break
             if status == "DualInfeasible" and self.loss is not None:  # too few rows of the loss
@@ -405,14 +405,13 @@ class Small:
         x[: p.size] += x0
         self.near = x[: p.size]
         own = slice(k, k + len(p.b))
-        rest = x[p.size + k :] if self.loss is not None else None
-        slope = z[d.link] if self.loss is not None else None
-        return Point(x[: p.size], z[own], int(found.iterations), rest, slope), s[own]
+        slope = abs(data.link.T) @ z[len(z) - data.link.shape[0] :]
+        return Point(x[: p.size], z[own], int(found.iterations), x[p.size + k :], slope), s[own]
 
-    def _centre(self, squares: Squares | None, weight: float) -> Array:
+    def _centre(self, squares: Squares, weight: float) -> Array:
         """Return a point (n,) near the minimum: the last one, or that of the squares with some weight on |z|^2."""
         last = self.near[self.penalty.at]
-        if squares is None or last.any():
+        if not self.rows or last.any():
             return last
         n = len(last)
         rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
@@ -420,90 +419,60 @@ class Small:
 
 
 class _Data:
-    """Clarabel's data of a small program, whose numbers are replaced and whose places stay."""
+    """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
 
-    def __init__(self, small: Small):
+    Rows: R z - s = y, those of the penalty and of the loss, and what links the loss's entries to the equations A z ~ b.
+    """
+
+    def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
         from scipy import sparse
 
         clarabel = import_module("clarabel")
-        p, k, loss, sizes = small.penalty, small.rows, small.loss, small.sizes
-        N = p.size
-        m = 0
+        n, m = len(p.at), 0 if loss is None else len(loss.at)
+        P = [sparse.csc_array((p.size, p.size)), 2.0 * sparse.eye_array(k, format="csr")]
+        self.cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
+        entries = sparse.eye_array(m, format="csr")
+        self.link: Any = sparse.eye_array(m, format="csr")  # A z - v = b
+        if sizes is not None:  # (v_k, r_k) in a second-order cone
+            first = np.cumsum(sizes + 1) - sizes - 1
+            count = int(sizes.sum())
+            every = -sparse.eye_array(count + m, format="csc")
+            entries, self.link = -every[:, first], every[:, np.setdiff1d(np.arange(count + m), first)]
         if loss is not None:
-            m = len(loss.at) if sizes is None else int(sizes.sum())
-        size = N + k + (0 if loss is None else loss.size)
-        # rows: R z - s = y | penalty and constraints | loss | link of the loss to the residuals
-        places = [_dense(np.arange(k), p.at), (np.arange(k), N + np.arange(k)), _sparse(p.A, k, 0)]
-        self._fixed = [-np.ones(k), sparse.coo_array(p.A).data]
-        cones = ([clarabel.ZeroConeT(k)] if k else []) + p.linear_cones
-        top = k + len(p.b)
-        self.link = np.zeros(0, dtype=int)
-        self._norms = sizes is not None
-        if loss is not None:
-            places.append(_sparse(loss.A, top, N + k))
-            self._fixed.append(sparse.coo_array(loss.A).data)
-            cones += loss.linear_cones
-            top += len(loss.b)
-            if sizes is None:
-                link = own = np.arange(m)
-                cones.append(clarabel.ZeroConeT(m))
-            else:  # (v_k, r_k) in a second-order cone
-                own = np.concatenate([[0], np.cumsum(sizes + 1)[:-1]])
-                link = np.setdiff1d(np.arange(m + len(sizes)), own)
-                cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
-            self.link = top + link
-            places += [_dense(self.link, p.at), (top + own, N + k + loss.at)]
-            self._fixed.append(-np.ones(len(own)))
-            top += m + (0 if sizes is None else len(sizes))
-        self.cones = cones
-        self.semidefinite = any("PSD" in str(cone) for cone in cones)
-        rows, columns = (np.concatenate([place[i] for place in places]).astype(int) for i in (0, 1))
-        self._order = np.lexsort((rows, columns))
-        ends = np.searchsorted(columns[self._order], np.arange(size + 1))
-        self._matrix = sparse.csc_matrix((np.zeros(len(rows)), rows[self._order], ends), shape=(top, size))
-        self._bound = np.zeros(top)
-        self._bound[k : k + len(p.b)] = p.b
-        if loss is not None:
-            self._bound[k + len(p.b) :][: len(loss.b)] = loss.b
-        self._k, self._at, self._A, self._b, self._full_P = k, p.at, p.A, p.b, p.P
-        left = sparse.csc_array((size - N, size - N))
-        penalty_P = sparse.block_diag([sparse.triu(p.P), left], format="csc")
-        own_P = [sparse.csc_array((N, N)), 2.0 * sparse.eye_array(k)]
-        if loss is not None:
-            own_P.append(sparse.triu(loss.P))
-        exact_P = sparse.block_diag(own_P, format="csc")
-        union = (abs(penalty_P) + abs(exact_P)).tocsc()
-        union.sort_indices()
-        self._P = sparse.csc_matrix(union)
-        self._P_parts = _at_places(union, penalty_P), _at_places(union, exact_P)
-        self._q_parts = np.zeros(size), np.zeros(size)
-        self._q_parts[0][:N] = p.q
-        if loss is not None:
-            self._q_parts[1][N + k :] = loss.q
+            P.append(sparse.triu(loss.P))
+            linked = [clarabel.ZeroConeT(m)]
+            if sizes is not None:
+                linked = [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
+            self.cones += [*loss.linear_cones, *linked]
 
-    def rows(self, squares: Squares | None, A: Array | None, b: Array | None, x0: Array) -> tuple[Any, Array]:
-        """Return matrix and bounds of all rows, for changes of x0 (N,)."""
-        k, z0 = self._k, x0[self._at]
-        bound = self._bound.copy()
-        bound[k : k + len(self._b)] -= self._A @ x0
-        values = [np.zeros(0) if squares is None else squares.R.ravel(), *self._fixed[:2]]
-        if squares is not None:
-            bound[:k] = squares.y - squares.R @ z0
-        if A is not None and b is not None:
-            sign = -1.0 if self._norms else 1.0
-            values += [self._fixed[2], sign * A.ravel(), self._fixed[3]]
-            bound[self.link] = sign * (b - A @ z0)
-        self._matrix.data = np.concatenate(values)[self._order]
-        return self._matrix, bound
+        def matrix(R: Array, A: Array) -> Any:
+            rows: list[list[Any]] = [[at_z(R), -sparse.eye_array(k, format="csr")], [sparse.csr_array(p.A), None]]
+            if loss is not None:
+                of_entries = sparse.csr_array((np.ones(m), (np.arange(m), loss.at)), (m, loss.size))
+                rows = [[*row, None] for row in rows]
+                rows += [[None, None, loss.A], [self.link @ at_z(A), None, -entries @ of_entries]]
+            return sparse.csc_matrix(sparse.block_array(rows))
 
-    def objective(self, squares: Squares | None, weight: float, x0: Array) -> tuple[Any, Array]:
-        """Return P and q, for changes of x0 (N,)."""
-        q = weight * self._q_parts[0] + self._q_parts[1]
-        q[: len(x0)] += weight * (self._full_P @ x0)
-        if squares is not None:
-            q[self._at] += squares.g
-        self._P.data = weight * self._P_parts[0] + self._P_parts[1]
-        return self._P, q
+        def at_z(M: Array) -> Any:
+            return sparse.csr_array((M.ravel(), np.tile(p.at, len(M)), n * np.arange(len(M) + 1)), (len(M), p.size))
+
+        # the numbers of R and A are where matrices differ that have others there
+        equations = self.link.shape[1]
+        self._matrix = matrix(np.ones((k, n)), np.ones((equations, n)))
+        counted = 2.0 + np.arange((k + equations) * n).reshape(-1, n)
+        other = matrix(counted[:k], counted[k:])
+        self._dense = np.flatnonzero(self._matrix.data != other.data)
+        self._sign = self._matrix.data[self._dense]
+        self._order = np.abs(other.data[self._dense]).astype(int) - 2
+        left = sparse.csc_array((self._matrix.shape[1] - p.size,) * 2)
+        self._P = sparse.block_diag([sparse.triu(sparse.csc_array(p.P)), left]), sparse.block_diag(P)
+
+    def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
+        """Return P at a weight, and the matrix with the numbers of R (k, n) and A (m, n), row by row."""
+        from scipy import sparse
+
+        self._matrix.data[self._dense] = self._sign * numbers[self._order]
+        return sparse.csc_matrix(weight * self._P[0] + self._P[1]), self._matrix
 
 
 def nearest(p: Canonical, z: Array) -> Array | None:
@@ -595,24 +564,3 @@ def _flat_minimum(
 def _transposed(T: Array, b: Array) -> Array:
     """Return the solution of T'x = b with an upper triangle T."""
     return solve_triangular(T.T, b, lower=True)
-
-
-def _dense(rows: np.ndarray, columns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    return np.repeat(rows, len(columns)), np.tile(columns, len(rows))
-
-
-def _sparse(M: Any, row: int, column: int) -> tuple[np.ndarray, np.ndarray]:
-    from scipy import sparse
-
-    M = sparse.coo_array(M)
-    return M.row + row, M.col + column
-
-
-def _at_places(pattern: Any, M: Any) -> Array:
-    """Return the numbers of M at the places of a pattern."""
-    from scipy import sparse
-
-    places = sparse.coo_array(pattern)
-    if not places.nnz:
-        return np.zeros(0)
-    return np.asarray(sparse.csr_array(M)[places.row, places.col]).ravel()
