@@ -54,7 +54,7 @@ class Estimate(Brief):
 
     ``duals`` are multipliers of the formulation's constraints, one array each, (n,) for a `Box`: by how much the
     objective would fall if the constraint were loosened by one unit of the scales. ``status`` is CVXPY's word;
-    zero ``iterations``: a formula, or an active set; ``slope`` (m,) is that of the loss where the solver tells it.
+    zero ``iterations``: a formula, or an active set.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -75,7 +75,6 @@ class Estimate(Brief):
     status: str = OPTIMAL
     iterations: int = 0
     seconds: float = 0.0
-    slope: Array | None = field(default=None, repr=False)
 
     def _short(self) -> str:
         return f"{self.status} at weight {self.weight:.4g}: loss {self.loss:.4g}, penalty {self.penalty:.4g}"
@@ -132,10 +131,6 @@ class Program(Brief):
         if self.formulation == formulation and again.structure.like(self.structure):
             return self.on(model)
         return again.beginning(z)
-
-    def without(self, out: np.ndarray) -> Program:
-        """Return the program without some equations, ``out`` (m,), which become rows of zeros."""
-        return self.apart(self.model.scaled(np.where(out, 0.0, 1.0)))
 
     def apart(self, model: LinearModel) -> Program:
         """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
@@ -309,9 +304,6 @@ class Program(Brief):
 
     def _distance(self, z: Array) -> float:
         """Return the distance of z (n,) from the constraints."""
-        if self.box is not None:
-            lower, upper = self.box
-            return float(np.max(np.maximum(lower - z, z - upper), initial=0.0))
         found = self._projected(z)
         return float("inf") if found is None else float(np.linalg.norm(found - z))
 
@@ -323,13 +315,13 @@ class Program(Brief):
 
     def nearest(self, z: Array) -> Array:
         """Return the point of the constraints of z that is nearest to z (n,); z itself where none is found."""
-        if self.box is not None:
-            return np.clip(z, *self.box)
         found = self._projected(z)
         return z if found is None or np.linalg.norm(found - z) <= TOUCHING else found
 
     def _projected(self, z: Array) -> Array | None:
         """Return the point of the constraints of z that is nearest to z (n,); None where the solver finds none."""
+        if self.box is not None:
+            return np.clip(z, *self.box)
         if not self.formulation.constraints or self.structure.met(z):
             return z
         return nearest(self.structure.canonical, z)
@@ -452,8 +444,8 @@ class Program(Brief):
         weight = self._weight(weight)
         if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
-        elif self.closed_form:
-            estimate = self._at(self._formula(weight, damping), weight)
+        elif self.closed_form and damping is None:
+            estimate = self._at(self._formula(weight), weight)
         elif self.structure.joint:
             estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False)
         else:
@@ -549,23 +541,16 @@ class Program(Brief):
             z = self.inside(z, np.zeros_like(z), weight)
         return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
 
-    def _formula(self, weight: float, damping: Damping | None) -> Array:
+    def _formula(self, weight: float) -> Array:
         """Return the unconstrained minimum (n,) of a quadratic program."""
-        form, n = self.penalty_form, self.structure.n
-        z = self.ridge.minima(np.array([weight]))[0] if damping is None else np.zeros(n)
-        if damping is None and (form is None or (form.diagonal and bool((form.L == 1).all()))):
+        form, R = self.penalty_form, self.squared.triangle
+        z = self.ridge.minima(np.array([weight]))[0]
+        if form is None or weight == 0 or (form.diagonal and bool((form.L == 1).all())):
             return z
-        R = self.squared.triangle
-        A, b = [R[:, :n]], [R[:, n]]
-        if form is not None and weight > 0:  # a penalty that hardly holds some directions costs the formula digits
-            A.append(np.sqrt(weight) * form.matrix)
-            b.append(np.sqrt(weight) * form.c)
-        if damping is not None:
-            A.append(np.diag(damping.size))
-            b.append(damping.size * damping.centre)
-        stacked = np.vstack(A)
-        rcond = RANK_TOLERANCE if damping is None else None
-        return z + np.linalg.lstsq(stacked, np.concatenate(b) - stacked @ z, rcond=rcond)[0]
+        # a penalty that hardly holds some directions costs the formula digits
+        A = np.vstack([R[:, :-1], np.sqrt(weight) * form.matrix])
+        b = np.concatenate([R[:, -1], np.sqrt(weight) * form.c])
+        return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
@@ -580,11 +565,7 @@ class Program(Brief):
         if weight == 0 and damping is None and not self.constrained:  # what the data do not see stays nominal
             _, s, V = self.model.svd
             z = z - V[s == 0].T @ (V[s == 0] @ z)
-        slope = found.slope
-        if slope is not None and self.structure.order is not None:
-            slope = np.empty_like(slope)
-            slope[self.structure.order] = found.slope
-        return replace(self._at(z, weight, self._duals(found), found.iterations), slope=slope)
+        return self._at(z, weight, self._duals(found), found.iterations)
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""

@@ -221,11 +221,6 @@ class Ridge:
             return self.null
         return np.hstack([self.null, self.B[:, ~self.seen]])
 
-    def hat_rows(self, A: Array) -> tuple[Array, Array]:
-        """Return Q (m, p') and Q0 (m, f) of the influence matrix Q diag(s^2 / (s^2 + weight)) Q' + Q0 Q0'; A (m, n)."""
-        seen = self.seen
-        return A @ self.B[:, seen] / self.s[seen], A @ self.free
-
 
 def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
     """Decompose a linear model and a squared penalty; without a penalty, directions of the null space stay nominal."""

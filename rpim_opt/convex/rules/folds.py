@@ -26,8 +26,6 @@ COARSE = 12
 """Weights with which a search for the least error begins, where each takes solving."""
 DROPPED = 1e-13
 """Pivots below this belong to what nothing else decides."""
-SILENT = 1e-6
-"""Part of the largest slope below which a configuration has no influence on an estimate."""
 MEMORY = 500_000_000
 """Bytes of equations that are kept for all folds together; of more, a fold is made when it is asked for."""
 MANY = 1_000_000
@@ -44,8 +42,7 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
     With constraints or another penalty the same with H = A dz/db, the derivative of the solution (approximate
     leave-one-out; Wang et al. 2018); some configurations are left out by solving, too, and the note says how exact it
-    is. With cones and few configurations all are solved; of a loss that is no sum over rows (minimax), those that have
-    an influence.
+    is. With cones and few configurations, and of a loss that is no sum over rows (minimax), all are solved.
 
     ``exact``: all are solved anyway. InputError for a single configuration, or a formulation without penalty.
 
@@ -181,8 +178,6 @@ def _left_out_error(program: Program) -> Score:
     if _approximates(program):
         predicted = _approximately(program)
         return lambda weights: _error(program, predicted(weights))
-    if program.loss_form is None and not np.isfinite(program.formulation.largest):
-        return lambda weights: _error(program, _of_influential(program, weights))
     return _error_of_folds(program, None)
 
 
@@ -304,22 +299,6 @@ def _how_exact(program: Program, weight: float) -> str:
     return text
 
 
-def _of_influential(program: Program, weights: Array) -> Array:
-    """Return norms (K, N) of left-out residuals: those of configurations without influence are what they are."""
-    groups = np.unique(program.model.group)
-    found = []
-    for weight in weights:
-        estimate = program.solve(float(weight))
-        norms = program.norms(estimate.z)
-        heard = np.arange(len(groups))
-        if estimate.slope is not None:
-            size = program.model.norms(estimate.slope)
-            heard = np.flatnonzero(size > SILENT * size.max(initial=0.0))
-        norms[heard] = Folds(program, list(groups[heard][:, None])).norms(np.array([weight]))[0]
-        found.append(norms)
-    return np.array(found)
-
-
 class Folds:
     """A program without each of some parts of its configurations, solved again."""
 
@@ -335,9 +314,9 @@ class Folds:
             self._kept = [self._without(rows) for rows in self._rows]
 
     def _without(self, rows: np.ndarray) -> Program:
-        out = np.zeros(len(self._whole.model.group), dtype=bool)
-        out[rows] = True
-        return self._whole.without(out)
+        kept = np.ones(len(self._whole.model.group))
+        kept[rows] = 0.0
+        return self._whole.apart(self._whole.model.scaled(kept))
 
     def norms(self, weights: Array) -> Array:
         """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""

@@ -92,9 +92,9 @@ def influence(squared: Squared) -> tuple[Array, Array, Array]:
     penalty's centre.
     """
     model, form = squared.model, squared.form
-    Q, Q_free = form.hat_rows(model.A)
-    s2 = np.concatenate([form.s[form.seen] ** 2, np.full(form.fixed, 1e300)])
-    return np.hstack([Q, Q_free]), s2, model.b - model.A @ form.offset
+    s = form.s[form.seen]
+    s2 = np.concatenate([s**2, np.full(form.fixed, 1e300)])
+    return model.A @ np.hstack([form.B[:, form.seen] / s, form.free]), s2, model.b - model.A @ form.offset
 
 
 @on_squares

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from importlib import import_module
@@ -513,7 +513,7 @@ def on_face(
         pivots = np.abs(np.diag(T))
         rank = int((pivots > 1e-11 * pivots.max(initial=0.0)).sum())
         Y, Z, T = Q[:, :rank], Q[:, rank:], T[:rank, :rank]
-        x = near + Y @ _transposed(T, (b - A @ near)[order[:rank]])
+        x = near + Y @ solve_triangular(T, (b - A @ near)[order[:rank]], trans="T")
         if rank < len(b) and np.abs(A @ x - b).max() > 1e-9 * (1 + np.abs(b).max()):
             return None
     if Z.shape[1]:
@@ -522,45 +522,21 @@ def on_face(
         pivots = np.abs(np.diag(L))
         if len(L) == Z.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
             for _ in range(3):
-                x = x - Z @ solve_triangular(L, _transposed(L, Z.T @ gradient(x)))
-        else:
-            found = _flat_minimum(squares, weight, p, x, Z, reduced, gradient)
-            if found is None:
+                x = x - Z @ solve_triangular(L, solve_triangular(L, Z.T @ gradient(x), trans="T"))
+        else:  # some directions have no curvature: the minimum next to x, unless there is a slope along them
+            largest = np.abs(squares.R).max()
+            _, values, V = np.linalg.svd(reduced, full_matrices=False)
+            curved = values > RANK_TOLERANCE * max(values.max(initial=0.0), 1e-3 * largest)
+            values, V, slope = values[curved], V[curved], Z.T @ gradient(x)
+            for _ in range(3):
+                x = x - Z @ (V.T @ (V @ slope / values**2))
+                slope = Z.T @ gradient(x)
+            rounding = 1e-14 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
+            pull = 2 * squares.R.T @ squares.y - squares.g
+            allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-14 * np.abs(pull).max(initial=0.0), rounding)
+            if not np.abs(slope - V.T @ (V @ slope)).max(initial=0.0) <= allowed:
                 return None
-            x = found
     multipliers = np.zeros(len(b))
     if rank:
         multipliers[order[:rank]] = solve_triangular(T, -Y.T @ gradient(x))
     return x, multipliers
-
-
-def _flat_minimum(
-    squares: Squares,
-    weight: float,
-    p: Canonical,
-    x: Array,
-    Z: Array,
-    reduced: Array,
-    gradient: Callable[[Array], Array],
-) -> Array | None:
-    """Return the minimum next to x (N,) along Z where some directions have no curvature; None where it is unbounded."""
-    largest = np.abs(squares.R).max()
-    _, values, V = np.linalg.svd(reduced, full_matrices=False)
-    V = V[values > RANK_TOLERANCE * max(values.max(initial=0.0), 1e-3 * largest)]
-    values = values[: len(V)]
-    slope = np.zeros(Z.shape[1])
-    for _ in range(3):  # refined
-        slope = Z.T @ gradient(x)
-        with np.errstate(all="ignore"):  # no curvature: there is no minimum to be had by a formula
-            x = x - Z @ (V.T @ (V @ slope / values**2))
-        if not np.isfinite(x).all():
-            return None
-    rounding = 1e-14 * largest * max(np.abs(squares.R @ x[p.at]).max(), np.abs(squares.y).max())
-    pull = 2 * squares.R.T @ squares.y - squares.g
-    allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-14 * np.abs(pull).max(initial=0.0), rounding)
-    return None if np.abs(slope - V.T @ (V @ slope)).max(initial=0.0) > allowed else x
-
-
-def _transposed(T: Array, b: Array) -> Array:
-    """Return the solution of T'x = b with an upper triangle T."""
-    return solve_triangular(T.T, b, lower=True)

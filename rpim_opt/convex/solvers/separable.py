@@ -564,18 +564,15 @@ def evaluation(e: Any, v: Any) -> Evaluation:
         return lambda x: (number, 0.0)
     norm = _is_norm(e)
     inner = [evaluation(a, v) for a in (e.args[0].args if norm else e.args)]
-    affine = AFFINE.get(type(e).__name__)
+    name = "norm" if norm else type(e).__name__
+    affine, atom = AFFINE.get(name), ATOMS.get(name)
 
     def evaluated(x: Array) -> tuple[Any, Any]:
         values, slopes = zip(*(part(x) for part in inner), strict=True)
         if affine is not None:
             return affine(values, slopes)
-        if norm:
-            value = np.sqrt(sum(np.square(each) for each in values))
-            parts = [each / np.maximum(value, 1e-300) for each in values]
-        else:
-            with np.errstate(all="ignore"):
-                value, parts = _by_cvxpy(e, values)
+        with np.errstate(all="ignore"):
+            value, parts = atom(e, values) if atom else _by_cvxpy(e, values)
         return value, sum(part * slope for part, slope in zip(parts, slopes, strict=True) if np.any(slope))
 
     return evaluated
@@ -605,3 +602,31 @@ AFFINE: dict[str, Callable[[Any, Any], tuple[Any, Any]]] = {
     "MulExpression": _product,
 }
 """Affine expressions: value and derivative, from those of what they are made of."""
+
+
+def _huber(e: Any, v: Sequence[Array]) -> tuple[Array, list[Array]]:
+    bound = float(e.M.value)
+    cut = np.clip(v[0], -bound, bound)
+    return cut * (2 * v[0] - cut), [2 * cut]
+
+
+def _maximum(_: Any, v: Sequence[Any]) -> tuple[Array, list[Array]]:
+    v = np.broadcast_arrays(*v)
+    first = np.argmax(v, axis=0)
+    return np.maximum.reduce(v), [(first == i).astype(float) for i in range(len(v))]
+
+
+def _norm(_: Any, v: Sequence[Any]) -> tuple[Any, list[Any]]:
+    length = np.sqrt(sum(np.square(each) for each in v))
+    return length, [each / np.maximum(length, 1e-300) for each in v]
+
+
+ATOMS: dict[str, Callable[[Any, Any], tuple[Any, list[Any]]]] = {
+    "huber": _huber,
+    "abs": lambda _, v: (np.abs(v[0]), [np.sign(v[0])]),
+    "maximum": _maximum,
+    "logistic": lambda _, v: (np.logaddexp(0.0, v[0]), [1.0 / (1.0 + np.exp(-v[0]))]),
+    "exp": lambda _, v: (np.exp(v[0]), [np.exp(v[0])]),
+    "norm": _norm,
+}
+"""Atoms that losses are mostly made of: value and partial derivatives. CVXPY evaluates any other."""

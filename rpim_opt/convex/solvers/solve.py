@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -192,18 +192,18 @@ def _coupled(
             continue
         warm.z = point.x[warm.penalty.at]
         v = entries(rows.A @ warm.z - rows.b)
-        slope = np.zeros(len(rows.b))
-        slope[rows.places(warm.working)] = point.slope
         more = _violated(canonical, owner, warm.working, v, point.rest)
         if len(more) and point.rest is not None:  # unknowns of the loss that nothing holds count as violated, too
             bound = part.value(point.rest)
             if canonical.at_best(v) - bound <= VIOLATED * max(abs(bound), 1.0):
                 more = more[:0]
         if not len(more):  # the next minimum begins with what is active, and the largest beside it
-            size = np.abs(entries(slope))
+            pull = np.zeros(len(rows.b))
+            pull[rows.places(warm.working)] = point.slope
+            size = np.abs(entries(pull))
             active = np.flatnonzero(size > INACTIVE * size.max())
             warm.working = np.union1d(active, np.argsort(-np.abs(v))[: len(active) + n])
-            return replace(point, slope=slope)
+            return point
         warm.working = np.union1d(warm.working, more[: max(4 * n, len(warm.working))])
     return _all_rows(loss, rows, warm, weight, squares, damping)
 
