@@ -57,9 +57,6 @@ class Deviations:
     def __len__(self) -> int:
         return len(self._parameters)
 
-    def _ipython_key_completions_(self) -> list[str]:
-        return list(self._parameters.names)
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Given(Identified):

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,8 +21,7 @@ LEAST = 1e-6
 """Slacks below this are the solver's accuracy."""
 
 
-@dataclass(frozen=True, eq=False)
-class Stated:
+class Stated(NamedTuple):
     """CVXPY constraints of z, by a name that their user knows."""
 
     name: str

@@ -174,7 +174,7 @@ class Program(Brief):
     @property
     def separable(self) -> bool:
         """Whether the loss is a sum over equations or configurations, but no square."""
-        return self.structure.loss is not None and self.structure.loss.summands is not None
+        return self.structure.loss is not None and self.structure.loss.separable
 
     @property
     def constrained(self) -> bool:
@@ -229,10 +229,11 @@ class Program(Brief):
     def _rows(self) -> Rows:
         """The equations in the order in which the solver has them."""
         A, b = self.rows
-        order = self.structure.order
-        if order is not None:
+        sizes = None
+        if self.structure.by_configuration is not None:
+            order, sizes = self.structure.by_configuration
             A, b = A[order], b[order]
-        return Rows(A, b, self.structure.sizes, self.model.triangle)
+        return Rows(A, b, sizes, self.model.triangle)
 
     @property
     def _squares(self) -> Squares | None:
@@ -331,19 +332,16 @@ class Program(Brief):
         return self._distance(z) <= feasibility_tolerance(z) and self.excess(z) <= FEASIBLE
 
     def gradient(self, z: Array, weight: float) -> Array | None:
-        """Return the gradient (n,) of the objective by the functions; None where CVXPY knows none.
+        """Return the gradient (n,) of the objective; None where the loss, or a weighted penalty, is no quadratic.
 
         Arguments as for `value`.
         """
-        A, b = self.rows
-        slope = self.structure.loss_slope(A @ z - b)
-        if slope is None or len(slope) != len(b):
+        if self.loss_form is None or (weight > 0 and not self.linear_penalty):
             return None
-        gradient = A.T @ slope
-        if self.formulation.penalty is None or weight == 0:
+        gradient = 2 * self.squared.A.T @ (self.squared.A @ z - self.squared.b)
+        if self.penalty_form is None or weight == 0:
             return gradient
-        of_penalty = self.structure.penalty_slope(z)
-        return None if of_penalty is None else gradient + weight * of_penalty
+        return gradient + weight * self.penalty_form.slope(z)
 
     def trust(self, z: Array) -> Trusted | None:
         """Return what a robust loss trusts at z (n,); None for a squared loss, which trusts everything.

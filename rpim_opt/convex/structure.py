@@ -34,7 +34,7 @@ from rpim_opt.convex.formulation import Formulation, lost
 from rpim_opt.convex.given import given
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
 from rpim_opt.convex.solvers.conic import Canonical
-from rpim_opt.convex.solvers.solve import Loss
+from rpim_opt.convex.solvers.separable import Loss
 from rpim_opt.convex.trust import SMALL, Squares, Trusted, separable, trusted
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
@@ -215,7 +215,7 @@ class Structure:
     def on_squares(self) -> Structure:
         """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
         made = copy.copy(self)
-        for name in ("quadratic_of_r", "loss", "joint", "inner", "order", "sizes"):
+        for name in ("quadratic_of_r", "loss", "joint", "inner", "by_configuration"):
             vars(made).pop(name, None)
         made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation", largest=float("inf"))
         made.equations, made.limited = self.n + 1, False
@@ -312,24 +312,16 @@ class Structure:
             return None
         with self._lock:
             if not self.limited:
-                return Loss(self.answers.loss.expression, self.answers.loss.variable, (), self.over_norms)
+                return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms)
             expression = self.loss_of_r if self.quadratic_of_r is None else cp.Constant(0.0)  # squares are reduced
-            return Loss(expression, self.answers.r, (self.limit_of_norms,), False)
+            return Loss(expression, self.answers.r, False, (self.limit_of_norms,))
 
     @cached_property
-    def order(self) -> np.ndarray | None:
-        """(m,) sorts equations by configurations; None where they stay as they are."""
+    def by_configuration(self) -> tuple[np.ndarray, np.ndarray] | None:
+        """(m,) sorts equations by configurations, (N,) how many each has; None where the loss gets no norms."""
         if self.limited or not self.over_norms:
             return None
-        order = np.argsort(self.groups, kind="stable")
-        return order if (np.diff(order) != 1).any() else None
-
-    @cached_property
-    def sizes(self) -> np.ndarray | None:
-        """(N,) equations of every configuration, where the loss gets norms."""
-        if self.limited or not self.over_norms:
-            return None
-        return np.unique(self.groups, return_counts=True)[1]
+        return np.argsort(self.groups, kind="stable"), np.unique(self.groups, return_counts=True)[1]
 
     # --- values ------------------------------------------------------------------------------------------------
 
@@ -410,28 +402,6 @@ class Structure:
     def seen(self, r: Array) -> Array:
         """Return what the loss gets of a residual: itself, or the norms of the configurations."""
         return np.sqrt(np.bincount(self.groups, r**2)) if self.over_norms else r
-
-    def loss_slope(self, r: Array) -> Array | None:
-        """Return the gradient (m,) of the loss by the residual; None where CVXPY knows none."""
-        if self.inner:
-            return None
-        if self.formulation.loss == SQUARES:
-            return 2 * r
-        seen = self.seen(r)
-        slope = self.answers.loss.slope(seen)
-        if slope is None or not self.over_norms:
-            return slope
-        return (slope / np.maximum(seen, 1e-150))[self.groups] * r
-
-    def penalty_slope(self, z: Array) -> Array | None:
-        """Return the gradient (n,) of the penalty by z; None where CVXPY knows none."""
-        if self.inner or self.formulation.penalty is None:
-            return None
-        if self.formulation.penalty_over is None:
-            form = declared_form(self.formulation.penalty, self.n)
-            return self.answers.penalty.slope(z) if form is None else form.slope(z)
-        own = cp.Variable(self.n)
-        return Term(substituted(self.answers.penalty_of_z, {id(self.answers.z): own}), own).slope(z)
 
     def trusted(self, lengths: Array, count: np.ndarray) -> Trusted:
         """Return the rows that the loss trusts, of configurations with these norms and numbers of equations (N,)."""

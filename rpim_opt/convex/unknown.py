@@ -28,6 +28,3 @@ class Unknown(cp.Variable):
 
     def __getitem__(self, key: Any) -> Any:
         return super().__getitem__(index_of(self.names, key, "z"))
-
-    def _ipython_key_completions_(self) -> list[str]:
-        return list(self.names)

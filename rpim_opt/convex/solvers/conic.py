@@ -405,8 +405,10 @@ class Small:
         x[: p.size] += x0
         self.near = x[: p.size]
         own = slice(k, k + len(p.b))
-        slope = abs(data.link.T) @ z[len(z) - data.link.shape[0] :]
-        return Point(x[: p.size], z[own], int(found.iterations), x[p.size + k :], slope), s[own]
+        point = Point(x[: p.size], z[own], int(found.iterations))
+        if self.loss is not None:
+            point = replace(point, rest=x[p.size + k :], slope=data.link.T @ z[len(z) - data.link.shape[0] :])
+        return point, s[own]
 
     def _centre(self, squares: Squares, weight: float) -> Array:
         """Return a point (n,) near the minimum: the last one, or that of the squares with some weight on |z|^2."""
@@ -429,7 +431,7 @@ class _Data:
 
         clarabel = import_module("clarabel")
         n, m = len(p.at), 0 if loss is None else len(loss.at)
-        P = [sparse.csc_array((p.size, p.size)), 2.0 * sparse.eye_array(k, format="csr")]
+        P = [sparse.triu(sparse.csc_array(p.P)), 2.0 * sparse.eye_array(k, format="csr")]
         self.cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
         entries = sparse.eye_array(m, format="csr")
         self.link: Any = sparse.eye_array(m, format="csr")  # A z - v = b
@@ -464,15 +466,17 @@ class _Data:
         self._dense = np.flatnonzero(self._matrix.data != other.data)
         self._sign = self._matrix.data[self._dense]
         self._order = np.abs(other.data[self._dense]).astype(int) - 2
-        left = sparse.csc_array((self._matrix.shape[1] - p.size,) * 2)
-        self._P = sparse.block_diag([sparse.triu(sparse.csc_array(p.P)), left]), sparse.block_diag(P)
+        self._P = sparse.csc_matrix(sparse.block_diag(P))
+        self._curvature = (
+            self._P.data,
+            np.arange(self._P.nnz) < P[0].nnz,
+        )  # the penalty's, which comes first, is weighted
 
     def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
         """Return P at a weight, and the matrix with the numbers of R (k, n) and A (m, n), row by row."""
-        from scipy import sparse
-
         self._matrix.data[self._dense] = self._sign * numbers[self._order]
-        return sparse.csc_matrix(weight * self._P[0] + self._P[1]), self._matrix
+        self._P.data = np.where(self._curvature[1], weight, 1.0) * self._curvature[0]
+        return self._P, self._matrix
 
 
 def nearest(p: Canonical, z: Array) -> Array | None:

@@ -119,7 +119,7 @@ class Newton:
     left.
     """
 
-    loss: Summands
+    loss: Loss
     rows: Rows
     penalty: Canonical
     small: Small
@@ -384,7 +384,7 @@ def gram(A: Array, weights: Array) -> Array:
     return H
 
 
-def kink_of(loss: Summands, rows: Rows) -> float:
+def kink_of(loss: Loss, rows: Rows) -> float:
     """Return the largest jump of a loss's slope: by residuals, or where norms are zero."""
     size = float(np.sqrt(np.mean(rows.entries(rows.b) ** 2))) or 1.0
     kink = loss.jump(size)
@@ -405,13 +405,16 @@ class OutsideDomain(Exception):
     """Raised where the loss has no derivative."""
 
 
-class Summands:
-    """f(v) = sum_i f_i(v_i) of v (M,): residuals, or where ``positive`` norms of configurations."""
+class Loss:
+    """A loss f(v) that is no square, and limits of v (M,): residuals, or where ``positive`` configurations' norms.
 
-    def __init__(self, expression: Any, variable: Any, positive: bool):
-        self.variable, self.positive = variable, positive
+    Where it is ``separable``, f(v) = sum_i f_i(v_i).
+    """
+
+    def __init__(self, expression: Any, variable: Any, positive: bool, limits: tuple[Any, ...] = ()):
+        self.expression, self.variable, self.positive, self.limits = expression, variable, positive, limits
         self.entries: Any = None
-        if {v.id for v in expression.variables()} == {variable.id}:
+        if not limits and {v.id for v in expression.variables()} == {variable.id}:
             self.entries = _summands(expression, variable)
 
     @property

@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.separable import FEW, Newton, OutsideDomain, Rows, Summands, kink_of
+from rpim_opt.convex.solvers.separable import FEW, Loss, Newton, OutsideDomain, Rows, kink_of
 
 GENERATIONS = 40
 """Rounds of row generation before all rows are taken."""
@@ -18,15 +18,6 @@ INACTIVE = 1e-6
 """Part of the largest slope below which an entry of a loss is not active."""
 VIOLATED = 1e-8
 """Part of the largest entry by which an inequality of a left-out row may be missed."""
-
-
-class Loss:
-    """A loss that is no square: an expression of residuals (m,) or of configurations' norms (N,), and limits of it."""
-
-    def __init__(self, expression: Any, variable: Any, limits: tuple[Any, ...], over_norms: bool):
-        self.expression, self.variable, self.limits, self.over_norms = expression, variable, limits, over_norms
-        summands = Summands(expression, variable, over_norms)
-        self.summands = summands if summands.separable and not limits else None
 
 
 @dataclass(eq=False)
@@ -92,11 +83,11 @@ def minimum(
         n = rows.A.shape[1]
         if loss is None:
             point = warm.program(n + 1).solve((squares or rows.squares).damped(damping), weight)
-        elif loss.summands is None:
+        elif not loss.separable:
             point = _coupled(loss, rows, warm, weight, squares, damping)
         else:
             try:
-                point = _separable(loss, loss.summands, rows, warm, weight, damping, accuracy)
+                point = _separable(loss, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
                 point = _all_rows(loss, rows, warm, weight, None, damping)
         warm.z, warm.x = point.x[warm.penalty.at], point.x
@@ -105,7 +96,6 @@ def minimum(
 
 def _separable(
     loss: Loss,
-    summands: Summands,
     rows: Rows,
     warm: Warm,
     weight: float,
@@ -113,8 +103,8 @@ def _separable(
     accuracy: float,
 ) -> Point:
     if warm.kink < 0:
-        warm.kink = kink_of(summands, rows)
-    if warm.kink and summands.variable.size <= FEW:
+        warm.kink = kink_of(loss, rows)
+    if warm.kink and loss.variable.size <= FEW:
         return _all_rows(loss, rows, warm, weight, None, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
@@ -122,7 +112,7 @@ def _separable(
     if z is None or x is None or not known:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.penalty.at]
-    search = Newton(summands, rows, warm.penalty, small, weight, damping, warm.kink, warm.exact, accuracy)
+    search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, warm.exact, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
@@ -151,7 +141,7 @@ def _all_rows(
     terms = _beside(squares, n, damping)
     count = 0 if terms is None else n + 1
     if count not in warm.direct:
-        warm.direct[count] = Small(warm.penalty, count, warm.form(loss), rows.sizes if loss.over_norms else None)
+        warm.direct[count] = Small(warm.penalty, count, warm.form(loss), rows.sizes if loss.positive else None)
     return warm.direct[count].solve(terms, weight, rows.A, rows.b)
 
 
@@ -171,14 +161,14 @@ def _coupled(
     owner = np.full(len(canonical.b), -1)
     owner[touched.row] = touched.col
     terms = _beside(squares, n, damping)
-    entries = rows.entries if loss.over_norms else lambda r: r
+    entries = rows.entries if loss.positive else lambda r: r
     if not len(warm.working):
         start = warm.program(n + 1).solve(rows.squares.damped(damping), weight)
         v = entries(rows.A @ start.x[warm.penalty.at] - rows.b)
         warm.working = np.sort(np.argsort(-np.abs(v))[: 4 * n])
         warm.z = start.x[warm.penalty.at]
     for _ in range(GENERATIONS):
-        sizes = rows.sizes[warm.working] if loss.over_norms and rows.sizes is not None else None
+        sizes = rows.sizes[warm.working] if loss.positive and rows.sizes is not None else None
         part = canonical.part(warm.working, owner)
         small = Small(warm.penalty, 0 if terms is None else n + 1, part, sizes)
         A, b = rows.of(warm.working)
