@@ -306,7 +306,9 @@ class Program(Brief):
     def _distance(self, z: Array) -> float:
         """Return the distance of z (n,) from the constraints."""
         found = self._projected(z)
-        return float("inf") if found is None else float(np.linalg.norm(found - z))
+        if found is None:
+            return float("inf")
+        return float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
 
     def excess(self, z: Array) -> float:
         """Return by how much at z (n,) the worst configuration exceeds ``largest``, relative to it."""
