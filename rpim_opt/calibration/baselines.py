@@ -133,12 +133,3 @@ def extended_kalman_filter(problem: CalibrationProblem, passes: int = 1) -> Base
             left = np.eye(len(z)) - gain @ model.A
             P = left @ P @ left.T + gain @ gain.T  # Joseph's form stays symmetric and positive
     return Baseline(scale * z, passes, "extended Kalman filter")
-
-
-METHODS = {
-    "LSM": linear_least_squares,
-    "GN": gauss_newton,
-    "LM": levenberg_marquardt,
-    "GD": gradient_descent,
-    "EKF": extended_kalman_filter,
-}

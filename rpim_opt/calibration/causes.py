@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from typing import NamedTuple, cast
+from typing import cast
 
 import numpy as np
 
@@ -38,16 +38,6 @@ NOTHING = (
     "None of the tested mistakes explains it. Check the nominal parameters; the arm may be compliant, or less "
     "repeatable than stated. See rpim-opt inspect."
 )
-
-
-class Cause(NamedTuple):
-    """A likely cause of a bad fit in a sentence, and how many times better the data fit without it.
-
-    The factor is 1 where single rows are the cause, which no refit has judged.
-    """
-
-    sentence: str
-    factor: float = 1.0
 
 
 def likely_causes(result: Outcome) -> list[str]:
@@ -95,40 +85,30 @@ def likely_causes(result: Outcome) -> list[str]:
     ]
     signs += _large(result, problem)
     head: list[str] = []
-    causes: tuple[Cause, ...] = ()
+    causes: list[str] = []
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
-        causes = find_causes(result)
+        causes = _found(result, problem)
     elif not kept.all():
-        causes = tuple(map(Cause, _of_rows(problem)))
+        causes = list(_of_rows(problem))
     if causes or shared:
-        return [*head, *(f"Likely: {cause.sentence}" for cause in causes), *shared]
+        return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     if max(ratios) > HOPELESS:
         return [*head, NOTHING]
     return []
 
 
-def find_causes(result: Outcome) -> tuple[Cause, ...]:
-    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some.
-
-    The table is read in other ways; rows without value, exchanged rows, rounded joints and a base that moved are looked
-    for. Asked only of a fit that is bad, for it takes seconds; empty for data in blocks, and where nothing does.
-    """
-    if not result.problem.keeps_rows:
-        return ()
-    problem = cast(CalibrationProblem, result.problem)
+def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
+    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
-        return tuple(map(Cause, _of_rows(problem)))
+        return list(_of_rows(problem))
     better = better_reading(problem) or lost_row(_in_table_order(result, problem))
     if better is not None:
-        return (*map(Cause, rows_without_values(problem)), Cause(better.sentence, better.factor))
+        return [*rows_without_values(problem), better.sentence]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
-    if not found:
-        found += transmission(problem, result.x)
-    if not found:
-        found += rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)]))
-    return tuple(map(Cause, found))
+    found = found or list(transmission(problem, result.x))
+    return found or list(rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)])))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

@@ -52,18 +52,29 @@ class Spread:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of the fit: unpenalized directions, and sum s^2 / (s^2 + weight) over the others."""
+        """Degrees of freedom of the fit: unpenalized directions, and sum s^2 / (s^2 + weight) over the others.
+
+        >>> import rpim_opt as ro
+        >>> problem = ro.load("paper_arm").problem
+        >>> results = [ro.calibrate(problem, ro.tikhonov, weight) for weight in (1e-3, 1e3)]
+        >>> [round(result.spread.degrees_of_freedom, 1) for result in results]
+        [19.8, 5.9]
+        """
         return self.form.degrees_of_freedom(self.weight)
+
+    @property
+    def spare(self) -> float:
+        """What equations are left over, m - dof; with a robust loss of those that it keeps."""
+        return self.linear.equations - self.degrees_of_freedom
 
     @cached_property
     def noise_variance(self) -> float:
         """sigma^2 = RSS / (m - dof) in units of the stated variance, or 1 where no equation is left over."""
         if self.level is not None:
             return self.level
-        spare = self.linear.equations - self.degrees_of_freedom
-        if spare <= 1e-6:
+        if self.spare <= 1e-6:
             return 1.0
-        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / spare / self.factor
+        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self.spare / self.factor
 
     def _in_si(self, C: Array) -> Array:
         scale = self.linear.parameters.scale

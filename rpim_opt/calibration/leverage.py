@@ -65,7 +65,7 @@ class Influence(Tabled):
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
     >>> found = ro.calibration.influence(result)
-    >>> found.change.shape, f"{found.leverage.sum():.1f}", f"{result.degrees_of_freedom:.1f}"
+    >>> found.change.shape, f"{found.leverage.sum():.1f}", f"{result.spread.degrees_of_freedom:.1f}"
     ((40, 34), '26.7', '26.7')
     """
 

@@ -373,22 +373,6 @@ class Outcome:
         """The last linearization, of the rows that a robust loss keeps (`Program.trusted`)."""
         return self._squares[0]
 
-    @property
-    def equations(self) -> int:
-        """How many equations the fit rests on: all m, with a robust loss those that it keeps."""
-        return self.linear.equations
-
-    @property
-    def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of the fit, sum s_i^2 / (s_i^2 + weight) with the singular values s_i of `linear`.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> [round(ro.calibrate(problem, ro.tikhonov, weight).degrees_of_freedom, 1) for weight in (1e-3, 1e3)]
-        [19.8, 5.9]
-        """
-        return self.spread.degrees_of_freedom
-
     @cached_property
     def spread(self) -> Spread:
         """What the uncertainty rests on: the equations that the fit keeps, and its penalty.
@@ -414,7 +398,7 @@ class Outcome:
         """The noise's variance over the stated one, where it is larger than chance would have it, and otherwise 1."""
         if not self.linear_penalty or self.noise_test().probability >= UNLIKELY:
             return 1.0
-        return max(self.noise_variance, 1.0)
+        return max(self.spread.noise_variance, 1.0)
 
     def noise_test(self) -> NoiseTest:
         """Compare the residuals with the instrument's stated noise.
@@ -429,25 +413,14 @@ class Outcome:
         else:
             bare = self.problem.scattered(None)
             squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
-        return noise_test(squares, self.equations - self.degrees_of_freedom, self.problem.scatter is not None)
+        return noise_test(squares, self.spread.spare, self.problem.scatter is not None)
 
     @property
     def freedom(self) -> float:
         """Degrees of freedom of the noise: estimated with it, or what equations are left over, m - sum f."""
         if self.learned is not None:
             return self.learned.freedom
-        return max(self.equations - self.degrees_of_freedom, 0.0)
-
-    @cached_property
-    def noise_variance(self) -> float:
-        """sigma^2 = RSS / (m - dof) in units of the stated variance, or 1 where no equation is left over.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> round(result.noise_variance, 2), result.equations, round(result.degrees_of_freedom, 1)
-        (1.04, 120, 26.5)
-        """
-        return self.spread.noise_variance
+        return max(self.spread.spare, 0.0)
 
     @property
     def covariance(self) -> Array:

@@ -80,10 +80,6 @@ class Calibration(Outcome):
         """Name of the rule that chose the weight, ``given`` for a number, ``none`` where there is no penalty."""
         return words.selector(self)
 
-    def noise_sentence(self) -> list[str]:
-        """Say how the residuals compare with the stated measurement noise."""
-        return words.noise_sentence(self)
-
     def weight_sentence(self) -> str:
         """Say the weight and where it came from.
 
@@ -92,10 +88,6 @@ class Calibration(Outcome):
         Weight 1 (given), formulation 'Tikhonov'.
         """
         return words.weight_sentence(self)
-
-    def remarks(self) -> list[str]:
-        """Say what a reader must know besides the figures: outliers, active bounds, what did not converge."""
-        return words.remarks(self)
 
     def parameter_rows(self) -> list[dict[str, Any]]:
         """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
@@ -133,10 +125,6 @@ class Calibration(Outcome):
         True
         """
         return frame_of(words.frame_rows(self, what))
-
-    def parameter_table(self) -> str:
-        """Return the identified parameters as a table of text."""
-        return words.parameter_table(self)
 
     def __str__(self) -> str:
         """Return the parameters and errors as a person reads them."""

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -13,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, table
 from rpim_opt.basics.units import display
-from rpim_opt.calibration.covariance import Interval, NoiseTest, coverage_factor
+from rpim_opt.calibration.covariance import NoiseTest, coverage_factor
 from rpim_opt.calibration.outcome import Outcome, Prediction
 
 
@@ -30,8 +28,8 @@ class Uncertainty(Tabled):
     Where hyperparameters were estimated, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), and
     by how much Student's tails are wider than the normals that stand for them (`Learned.drift`).
 
-    It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty. Parameters at an
-    active bound are listed in ``at_bound``: their intervals do not know of it. Other penalties (lasso) are refused.
+    It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty; other penalties
+    (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.held_back``.
 
     Parameters
     ----------
@@ -51,12 +49,12 @@ class Uncertainty(Tabled):
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> uncertainty = ro.calibration.Uncertainty(result, confidence=0.95)
-    >>> print(f"{uncertainty.freedom:.1f} degrees of freedom, k = {uncertainty.coverage_factor:.2f}")
+    >>> print(f"{result.freedom:.1f} degrees of freedom, k = {uncertainty.coverage_factor:.2f}")
     93.5 degrees of freedom, k = 1.99
-    >>> bool(np.allclose(uncertainty.noise + uncertainty.prior, uncertainty.total))
+    >>> bool(np.allclose(result.spread.noise + result.spread.prior, result.covariance))
     True
-    >>> uncertainty.intervals().shape, uncertainty.at_bound, round(uncertainty.noise_level, 2)
-    ((34, 2), (), 1.02)
+    >>> uncertainty.intervals().shape
+    (34, 2)
     """
 
     result: Outcome
@@ -70,43 +68,13 @@ class Uncertainty(Tabled):
             raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
 
     @property
-    def freedom(self) -> float:
-        """Degrees of freedom of the noise: m - sum f, or what was estimated with it."""
-        return self.result.freedom
-
-    @property
-    def noise_level(self) -> float:
-        """Sigma = sqrt(RSS / (m - dof)), in units of the stated noise; 1 where no equation is left over."""
-        return float(np.sqrt(self.result.noise_variance))
-
-    @property
     def coverage_factor(self) -> float:
-        """Quantile k of Student's t at (1 + confidence) / 2, with `freedom` degrees of freedom, at least one."""
-        return float(coverage_factor(self.freedom, self.confidence))
-
-    @property
-    def noise(self) -> Array:
-        """Covariance (n, n) [SI] from the noise alone."""
-        return self.result.spread.noise
-
-    @property
-    def prior(self) -> Array:
-        """Mean square (n, n) [SI] of what the penalty holds back, in unidentifiable directions above all."""
-        return self.result.spread.prior
-
-    @property
-    def total(self) -> Array:
-        """Covariance (n, n) [SI]: noise and prior together."""
-        return self.result.covariance
-
-    @property
-    def at_bound(self) -> tuple[str, ...]:
-        """Parameters at an active bound, or of an active statement: their intervals do not know of it."""
-        return self.result.held_back
+        """Quantile k of Student's t at (1 + confidence) / 2, with the noise's degrees of freedom, at least one."""
+        return float(coverage_factor(self.result.freedom, self.confidence))
 
     def intervals(self) -> Array:
         """Return lower and upper ends (n, 2) [SI] of the deviations' intervals."""
-        half = self.coverage_factor * np.sqrt(np.diag(self.total))
+        half = self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
         return np.column_stack([self.result.x - half, self.result.x + half])
 
     def noise_test(self) -> NoiseTest:
@@ -119,16 +87,7 @@ class Uncertainty(Tabled):
         """
         return self.result.noise_test()
 
-    def predict(
-        self,
-        q: Array,
-        marker: str = "",
-        torque: Array | None = None,
-        payload: float | Array | None = None,
-        of: Interval = "reached",
-        columns: Mapping[str, Array] = MappingProxyType({}),
-        robot: str = "",
-    ) -> Prediction:
+    def predict(self, q: Array, marker: str = "", **arguments: Any) -> Prediction:
         """Return what `Calibration.predict` does, with the confidence's coverage factor; arguments as for it.
 
         The factor is larger for readings of an unknown session, where few sessions told how far they lie apart.
@@ -140,7 +99,7 @@ class Uncertainty(Tabled):
         >>> (where.expanded / where.standard).round(2)
         array([[2.63, 2.63, 2.63]])
         """
-        found = self.result.predict(q, marker, torque, payload, of, columns, robot)
+        found = self.result.predict(q, marker, **arguments)
         factor: float | Array = self.coverage_factor
         if isinstance(found.freedom, np.ndarray):
             factor = coverage_factor(found.freedom, self.confidence)[:, None]
@@ -163,8 +122,8 @@ class Uncertainty(Tabled):
             rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
         expanded = f"U, k = {self.coverage_factor:.2f}"
         head = ["parameter", "unit", "value", "u, noise", "u, prior", "u, combined", expanded]
-        lines = [table(head, rows), self.noise_test().verdict, f"Degrees of freedom left: {self.freedom:.1f}."]
-        if self.at_bound:
+        lines = [table(head, rows), self.noise_test().verdict, f"Degrees of freedom left: {self.result.freedom:.1f}."]
+        if self.result.held_back:
             lines.append("* at an active bound: the interval is conditional on it.")
         return "\n".join(lines)
 
@@ -174,20 +133,24 @@ class Uncertainty(Tabled):
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the budget: values, standard uncertainties u by what causes them, and U = k u."""
         free = self.result.problem.parameters.free
-        noise, prior, both = (np.sqrt(np.diag(C)) for C in (self.noise, self.prior, self.total))
+        spread = self.result.spread
+        noise, prior, both = (np.sqrt(np.diag(C)) for C in (spread.noise, spread.prior, spread.covariance))
         values = free.values(self.result.x)
         rows: list[dict[str, Any]] = []
         for i, name in enumerate(free.names):
             unit, si = display(free.dimensions[i])
             row: dict[str, Any] = {"parameter": name, "unit": unit, "value": float(values[i] / si)}
             row |= {"u_noise": float(noise[i] / si), "u_prior": float(prior[i] / si), "u": float(both[i] / si)}
-            row |= {"U": float(self.coverage_factor * both[i] / si), "held_back": name in self.at_bound}
+            row |= {"U": float(self.coverage_factor * both[i] / si), "held_back": name in self.result.held_back}
             rows.append(row)
         return rows
 
     def _notes(self) -> list[str]:
-        lines = [self.noise_test().verdict, f"k = {self.coverage_factor:.2f}; {self.freedom:.1f} degrees of freedom."]
-        if self.at_bound:
+        lines = [
+            self.noise_test().verdict,
+            f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
+        ]
+        if self.result.held_back:
             lines.append("Intervals of parameters at an active bound are conditional on it.")
         return lines
 
@@ -204,7 +167,7 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     """Return deviations (draws, n) [SI] identified from data drawn anew around the fit, noise at the observed level.
 
     The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
-    with `Uncertainty.noise`. Every draw solves the linearized program at the same weight.
+    with `Spread.noise`. Every draw solves the linearized program at the same weight.
 
     Parameters
     ----------
@@ -219,13 +182,13 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> spread = ro.calibration.monte_carlo(result, draws=500).std(axis=0)
-    >>> stated = np.sqrt(np.diag(ro.calibration.Uncertainty(result).noise))
+    >>> stated = np.sqrt(np.diag(result.spread.noise))
     >>> bool(np.abs(spread / stated - 1).max() < 0.2)  # 500 draws tell each to 3 %
     True
     """
     rng = np.random.default_rng(seed)
     program = result.program
-    level = np.sqrt(result.noise_variance)
+    level = np.sqrt(result.spread.noise_variance)
     fitted = program.model.A @ result.z
     found = []
     for _ in range(draws):

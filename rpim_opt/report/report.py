@@ -23,7 +23,7 @@ from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
-from rpim_opt.calibration.words import HEADER, scatter, scatter_rows, turned_frames, weight_lines
+from rpim_opt.calibration.words import HEADER, noise_sentence, scatter, scatter_rows, turned_frames, weight_lines
 from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.rules.selection import Selection, weight_grid
@@ -240,7 +240,7 @@ def _parameters(content: Content) -> Iterator[Block]:
     head = ["parameter", "nominal", "identified", "deviation", "U", "tolerance"]
     with contextlib.suppress(InputError):
         uncertainty = Uncertainty(result)
-        half = uncertainty.coverage_factor * np.sqrt(np.diag(uncertainty.total))
+        half = uncertainty.coverage_factor * np.sqrt(np.diag(result.covariance))
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
         note = f"U = k u: expanded uncertainty ({k}, 95 %) from measurement noise and prior."
@@ -295,7 +295,7 @@ def _diagnostics(content: Content) -> Iterator[Block]:
 
 
 def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
-    yield "text", [*result.noise_sentence(), *composition]
+    yield "text", [*noise_sentence(result), *composition]
     figures = []
     rows = []
     what = ""

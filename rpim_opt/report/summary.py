@@ -10,9 +10,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, percent, table
+from rpim_opt.calibration import words
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.words import camera_remarks, contact_remarks, known_points, turned_frames, weight_lines
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.data.record import Requirement
@@ -21,7 +21,7 @@ from rpim_opt.store.statements import FIELDS
 
 if TYPE_CHECKING:
     from rpim_opt.calibration.acceptance import Acceptance
-    from rpim_opt.calibration.region import Region
+    from rpim_opt.calibration.acceptance import Region
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
@@ -127,13 +127,13 @@ class Workspace(NamedTuple):
 
 def workspace(result: Calibration) -> Workspace | None:
     """Return the expanded uncertainty over the region; None for several robots, or a formulation without covariance."""
-    from rpim_opt.calibration.region import reaching, region_of
+    from rpim_opt.calibration.acceptance import reaching, region_of
 
     requirement = result.record.requirement or ANYWHERE
     try:
         region = region_of(result, requirement)
         q = region.drawn()
-        expanded = reaching(result, region, q, requirement.confidence).bound
+        expanded = reaching(result, region, q, requirement.confidence)[1]
     except InputError:
         return None
     if not np.isfinite(expanded).all():
@@ -205,18 +205,18 @@ def identifiability(result: Calibration) -> str:
 
 def warnings(result: Calibration) -> list[str]:
     """Return what a reader must know besides the figures, the worst first."""
-    lines = [line for line in result.remarks() if line != result.message]
+    lines = [line for line in words.remarks(result) if line != result.message]
     validation = result.record.validation
     if validation is not None:
-        lines += known_points(result.problem.sample(), validation)
+        lines += words.known_points(result.problem.sample(), validation)
         known = {q.tobytes() for q in result.problem.data.q}
         repeated = sum(q.tobytes() in known for q in validation.q)
         if repeated:
             lines.append(f"{repeated} validation rows repeat identification configurations: they validate nothing.")
     elif result.record.held_out is None:
         lines.append("Without validation data the accuracy elsewhere in the workspace is not verified.")
-    lines += contact_remarks(result.problem.sample())
-    lines += camera_remarks(result)
+    lines += words.contact_remarks(result.problem.sample())
+    lines += words.camera_remarks(result)
     if result.record.simulated:
         lines.append("The measurements are simulated.")
     return lines
@@ -248,10 +248,10 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     uncertainty = workspace(result) if accepted is None else None  # whose search ends above the drawn maximum
     remarks = [
         *([] if uncertainty is None else [uncertainty.sentence()]),
-        *weight_lines(result),
+        *words.weight_lines(result),
         identifiability(result),
-        *result.noise_sentence(),
-        *turned_frames(result),
+        *words.noise_sentence(result),
+        *words.turned_frames(result),
         nominal_note(result),
         *warnings(result),
     ]
@@ -287,7 +287,7 @@ def describe(result: Calibration, document: Mapping[str, Any]) -> str:
     lines += ["", table(["error [mm]", *COLUMNS], cells(document["errors"]))]
     if document["orientation"]:
         lines += ["", table(["orientation error [mrad]", *COLUMNS], cells(document["orientation"], "mrad"))]
-    return "\n".join([*lines, "", result.parameter_table()])
+    return "\n".join([*lines, "", words.parameter_table(result)])
 
 
 def describe_times(seconds: Mapping[str, float]) -> str:

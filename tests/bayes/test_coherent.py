@@ -9,6 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes.outliers import coherent
+from rpim_opt.calibration import words
 from tests.simulate import simulated
 
 SIGMA = 5e-5
@@ -44,7 +45,7 @@ def test_a_sweep_that_the_model_lacks_is_kept_and_said() -> None:
     refit = result.without_flagged()
     assert sweep <= set(refit.problem.labels)
     assert not {problem.labels[17], problem.labels[55]} & set(refit.problem.labels)
-    assert any("they are no outliers" in text for text in result.remarks())
+    assert any("they are no outliers" in text for text in words.remarks(result))
 
 
 def test_suspects_dealt_out_at_random_are_no_cluster() -> None:

@@ -150,8 +150,8 @@ def test_two_campaigns_of_one_arm_end_where_one_with_all_rows_does() -> None:
     sd = np.sqrt(np.diag(wanted.covariance))
     assert result.converged
     assert np.max(np.abs(result.x - wanted.x) / sd) < 0.05  # the model bends a little between the two
-    assert np.sqrt(np.diag(result.covariance / result.noise_variance)) == pytest.approx(
-        np.sqrt(np.diag(wanted.covariance / wanted.noise_variance)), rel=0.02
+    assert np.sqrt(np.diag(result.covariance / result.spread.noise_variance)) == pytest.approx(
+        np.sqrt(np.diag(wanted.covariance / wanted.spread.noise_variance)), rel=0.02
     )
 
 

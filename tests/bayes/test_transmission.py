@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.calibration import words
 from tests.simulate import ARM
 
 ROBOT = dataclasses.replace(
@@ -55,7 +56,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     assert rms(result.errors(others)) < 1.4 * floor < rms(ro.calibrate(result.stated).errors(others)) / 2
     assert 0.90 < ro.use.validate(result, others).coverage <= 0.99
     assert "Transmission error of joints (1 sigma)" in str(result)
-    assert "transmission2_c1" not in result.parameter_table()
+    assert "transmission2_c1" not in words.parameter_table(result)
 
 
 def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):

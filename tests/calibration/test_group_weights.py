@@ -40,7 +40,7 @@ def test_given_weights_are_those_of_a_weighted_penalty() -> None:
     assert np.abs(result.x - wanted.x).max() == pytest.approx(0, abs=1e-6 * sd.max())
     apart = (result.covariance - wanted.covariance) / np.outer(sd, sd)
     assert np.abs(apart).max() < 1e-6
-    assert result.degrees_of_freedom == pytest.approx(wanted.degrees_of_freedom, rel=1e-6)
+    assert result.spread.degrees_of_freedom == pytest.approx(wanted.spread.degrees_of_freedom, rel=1e-6)
 
 
 @pytest.mark.parametrize("name", ["position", "paper_arm", "distance"])

@@ -111,9 +111,9 @@ def test_a_weighted_squared_loss_tells_the_noise_of_what_it_sums(problem: Any, k
     }[kind]
     result = ro.calibrate(problem, ro.Formulation(kind, lambda r: cp.sum_squares(W @ r), cp.sum_squares), 2.0)
     dof, variance = noise_of(result, W)
-    assert result.equations == len(W)
-    assert result.degrees_of_freedom == pytest.approx(dof, rel=1e-8)
-    assert result.noise_variance * np.mean(np.sum(W**2, axis=1)) == pytest.approx(variance, rel=1e-8)
+    assert result.linear.equations == len(W)
+    assert result.spread.degrees_of_freedom == pytest.approx(dof, rel=1e-8)
+    assert result.spread.noise_variance * np.mean(np.sum(W**2, axis=1)) == pytest.approx(variance, rel=1e-8)
 
 
 def test_leaving_out_configurations_means_so_where_a_loss_mixes_their_equations(problem: Any) -> None:
@@ -139,7 +139,7 @@ def test_the_norm_of_the_residual_has_a_spread(problem: Any) -> None:
     """It is posed on a triangle, and trusts equations all the same."""
     result = ro.calibrate(problem, ro.Formulation("norm", cp.norm2, cp.sum_squares), 0.1)
     assert result.converged
-    assert 0.8 < result.noise_variance < 1.4
+    assert 0.8 < result.spread.noise_variance < 1.4
 
 
 @pytest.mark.parametrize("formulation", [ro.tikhonov, ro.robust, ro.lasso], ids=lambda f: f.name)

@@ -28,21 +28,19 @@ def test_covariances_are_their_formulas() -> None:
     inverse = np.linalg.inv(m.A.T @ m.A + WEIGHT * np.eye(len(SCALE)))
     freedom = len(m.b) - np.trace(m.A @ inverse @ m.A.T)
     variance = np.sum((m.A @ RESULT.z - m.b) ** 2) / freedom
-    assert RESULT.noise_variance == pytest.approx(variance, rel=1e-9)
-    assert RESULT.degrees_of_freedom == pytest.approx(len(m.b) - freedom, rel=1e-9)
-    u = Uncertainty(RESULT)
-    assert u.freedom == pytest.approx(freedom, rel=1e-9)
-    assert u.noise_level == pytest.approx(np.sqrt(variance), rel=1e-9)
+    assert RESULT.spread.noise_variance == pytest.approx(variance, rel=1e-9)
+    assert RESULT.spread.degrees_of_freedom == pytest.approx(len(m.b) - freedom, rel=1e-9)
+    assert RESULT.freedom == pytest.approx(freedom, rel=1e-9)
     units = np.outer(SCALE, SCALE)
     assert RESULT.covariance / units == pytest.approx(variance * inverse, rel=1e-6, abs=1e-11)
-    assert u.noise / units == pytest.approx(variance * inverse @ m.A.T @ m.A @ inverse, rel=1e-6, abs=1e-11)
-    assert u.prior / units == pytest.approx(variance * WEIGHT * inverse @ inverse, rel=1e-6, abs=1e-11)
+    assert RESULT.spread.noise / units == pytest.approx(variance * inverse @ m.A.T @ m.A @ inverse, rel=1e-6, abs=1e-11)
+    assert RESULT.spread.prior / units == pytest.approx(variance * WEIGHT * inverse @ inverse, rel=1e-6, abs=1e-11)
 
 
 def test_intervals_are_students() -> None:
     for confidence in (0.5, 0.95, 0.99):
         u = Uncertainty(RESULT, confidence)
-        assert u.coverage_factor == pytest.approx(student.ppf((1 + confidence) / 2, u.freedom), rel=1e-9)
+        assert u.coverage_factor == pytest.approx(student.ppf((1 + confidence) / 2, RESULT.freedom), rel=1e-9)
         half = u.coverage_factor * np.sqrt(np.diag(RESULT.covariance))
         assert u.intervals() == pytest.approx(np.column_stack([RESULT.x - half, RESULT.x + half]), rel=1e-9, abs=1e-12)
     for wrong in (0.0, 1.0, -0.5, 95.0):
@@ -53,10 +51,7 @@ def test_intervals_are_students() -> None:
 def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     result: Any = SimpleNamespace(
         linear_penalty=True,
-        equations=equations,
-        degrees_of_freedom=dof,
         freedom=max(equations - dof, 0.0),
-        noise_variance=variance,
         noise_test=lambda: noise_test(variance * (equations - dof), equations - dof),
     )
     return Uncertainty(result)
@@ -89,20 +84,20 @@ def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
 @pytest.mark.parametrize(("left", "tells"), [(0.0, False), (0.9, False), (1.0, True), (1.5, True)])
 def test_what_few_equations_tell(left: float, tells: bool) -> None:
     u = stand_in(20, 20.0 - left, 1.0)
-    assert u.freedom == pytest.approx(left, abs=1e-12)
+    assert u.result.freedom == pytest.approx(left, abs=1e-12)
     test = u.noise_test()
     assert ("No degree of freedom is left" in test.verdict) != tells
     if not tells:
         assert (test.ratio, test.probability) == (1.0, 1.0)
     assert u.coverage_factor == pytest.approx(student.ppf(0.975, max(left, 1.0)), rel=1e-12)
-    assert stand_in(20, 21.0, 1.0).freedom == 0.0
+    assert stand_in(20, 21.0, 1.0).result.freedom == 0.0
 
 
 def test_without_equations_left_over_the_noise_is_the_declared() -> None:
     few, _ = simulated(("a2", "theta1", "d5"), noise=5e-5, configurations=1)
     exact = ro.calibrate(few, ro.least_squares)
-    assert exact.equations == 3
-    assert exact.noise_variance == 1.0
+    assert exact.linear.equations == 3
+    assert exact.spread.noise_variance == 1.0
 
 
 def test_what_nothing_decides_is_infinite_and_moves_what_it_moves() -> None:
@@ -148,7 +143,7 @@ def test_predictions_propagate() -> None:
 def test_draws_scatter_as_the_noise() -> None:
     draws = ro.calibration.monte_carlo(RESULT, draws=400, seed=1)
     assert draws.shape == (400, len(SCALE))
-    stated = np.sqrt(np.diag(Uncertainty(RESULT).noise))
+    stated = np.sqrt(np.diag(RESULT.spread.noise))
     assert draws.std(axis=0) / stated == pytest.approx(np.ones(len(SCALE)), abs=0.2)  # each is told to 3.5 %
     m = RESULT.program.model
     shrunk = RESULT.program.on(m.with_values(m.A @ RESULT.z)).solve(WEIGHT).z * SCALE

@@ -258,4 +258,4 @@ def test_parameters_that_are_not_identified_are_nominal() -> None:
 
 def test_intervals_say_which_parameters_are_held_back() -> None:
     result = calibrated("a3 + d4 = 572.00 +- 0.05 mm", "a2 - 0.5 a3 <= -100 mm")
-    assert set(ro.calibration.Uncertainty(result).at_bound) == {"a3", "d4"}
+    assert set(result.held_back) == {"a3", "d4"}

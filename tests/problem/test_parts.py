@@ -12,6 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics import threads
+from rpim_opt.calibration import words
 from rpim_opt.convex.trust import Squares, trusted_rows
 from rpim_opt.problem import blocks as parts_module
 from rpim_opt.problem.blocks import PartitionedProblem, in_parts, on_cluster, whole_configurations
@@ -86,7 +87,7 @@ def test_flags_come_from_all_parts_and_are_dropped_in_all(whole: ro.CalibrationP
     order = np.concatenate(thirds(whole))
     np.testing.assert_allclose(here.nominal_errors(), there.nominal_errors()[order], rtol=1e-9)
     assert str(here).splitlines()[-1] == here.message
-    assert sum("Outlying" in line and "1:" in line for line in here.remarks()) == 1
+    assert sum("Outlying" in line and "1:" in line for line in words.remarks(here)) == 1
 
 
 def test_dropping_everything_is_refused(whole: ro.CalibrationProblem) -> None:
@@ -176,7 +177,7 @@ def test_robust_losses_take_few_passes_more(name: str, variant: str | None, form
 def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationProblem) -> None:
     there, here = ro.calibrate(whole, ro.robust, 1.0), ro.calibrate(apart(whole), ro.robust, 1.0)
     assert here.equations == there.equations
-    assert here.noise_variance == pytest.approx(there.noise_variance, rel=1e-5)
+    assert here.spread.noise_variance == pytest.approx(there.spread.noise_variance, rel=1e-5)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=0, atol=1e-5 * np.abs(there.covariance).max())
     chosen = ro.calibrate(apart(whole), ro.robust, ro.reml)
     squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, trusted_rows(whole, chosen.x, ro.robust)))

@@ -190,7 +190,7 @@ def _stated(result) -> float:
     """Return the variance of the tool that a result states, for noise as declared."""
     names = result.problem.parameters.free.names
     k = [names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
-    return float(np.trace(result.covariance[np.ix_(k, k)])) / result.noise_variance
+    return float(np.trace(result.covariance[np.ix_(k, k)])) / result.spread.noise_variance
 
 
 def test_a_shared_tool_is_known_better_than_apart() -> None:

@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.calibration import words
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import blocks as streaming
 from rpim_opt.problem.blocks import PartitionedProblem, on_cluster, partitions, reduced
@@ -101,8 +102,8 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     fixed = ro.calibrate(whole, ro.tikhonov, there.weight)
     np.testing.assert_allclose(again.x, fixed.x, rtol=0, atol=1e-13)
     assert again.equations == fixed.equations == 3 * PARTS * ROWS
-    assert again.noise_variance == pytest.approx(fixed.noise_variance, rel=1e-9)
-    assert 0.9 < again.noise_variance < 1.1  # as simulated
+    assert again.spread.noise_variance == pytest.approx(fixed.spread.noise_variance, rel=1e-9)
+    assert 0.9 < again.spread.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
     assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
 
@@ -139,7 +140,7 @@ def test_robust_losses_are_reweighted_to_the_same_minimum(whole: CalibrationProb
     here = ro.calibrate(partitioned(rows, bad), ro.robust, 1.0, max_iterations=200)
     assert here.converged
     assert here.formulation is ro.robust
-    assert not any("squared loss" in line for line in here.remarks())
+    assert not any("squared loss" in line for line in words.remarks(here))
     assert (np.abs(here.x - there.x) / there.problem.parameters.free.scale).max() < 2e-6  # as exact as Clarabel's
     assert all(b.objective <= a.objective * (1 + 1e-9) for a, b in zip(here.history, here.history[1:], strict=False))
     squared = ro.calibrate(rows, ro.tikhonov, 1.0)
