@@ -20,8 +20,7 @@ from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
 
 if TYPE_CHECKING:
-    from rpim_opt.calibration.acceptance import Acceptance
-    from rpim_opt.calibration.acceptance import Region
+    from rpim_opt.calibration.acceptance import Acceptance, Region
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
