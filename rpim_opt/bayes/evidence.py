@@ -297,7 +297,11 @@ class Evidence:
         value = logdet + sum(part.logdet for part in parts) + float(np.sum((prior.rows @ z - prior.values) ** 2))
         value += sum(float(np.sum(residual**2)) for residual in residuals)
         value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[normal])))
-        value += self._tails_value(e2, size2, v)
+        nu = prior.tails
+        t2, of_tails = size2[self._heavy], (e2 / v)[self._heavy]
+        value += float(
+            np.sum((nu + 1) * np.log((nu * t2 + e2[self._heavy]) / (nu + 1)) - nu * np.log(t2) + 1 - of_tails)
+        )
         slope = 2 * (1 - e2 / v)
         slope[self._heavy] = (2 * prior.tails * (size2 / v - 1))[self._heavy]
         gradient = slope @ of_size / 2
@@ -454,12 +458,6 @@ class Evidence:
             system = np.diag((tails + 1) * v[heavy]) - follows[heavy][:, heavy]
             found[heavy] = np.linalg.solve(system, wanted)
         return found
-
-    def _tails_value(self, e2: Array, size2: Array, v: Array) -> float:
-        """Return what heavy tails add to -2 ln L."""
-        nu = self.prior.tails
-        e2, t2, v = e2[self._heavy], size2[self._heavy], v[self._heavy]
-        return float(np.sum((nu + 1) * np.log((nu * t2 + e2) / (nu + 1)) - nu * np.log(t2) + 1 - e2 / v))
 
 
 def _by_noise(

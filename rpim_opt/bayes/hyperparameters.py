@@ -153,12 +153,6 @@ class Learned(Brief):
             return None
         return float(min(without) - min(having))
 
-    def unusual(self, names: tuple[str, ...], z: Array, least: float) -> list[tuple[str, float]]:
-        """Return the parameters beyond so many of their group's scales, z (n,) in units of the local scales."""
-        ratio = np.abs(z) * self.local
-        order = np.argsort(-ratio)
-        return [(names[i], float(ratio[i])) for i in order if ratio[i] > least]
-
 
 def sessions_spread(learned: Learned | None) -> float:
     """Return the standard deviation of the logarithm of how far sessions lie apart; zero where it was not estimated."""

@@ -14,7 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, sampled, sides
 from rpim_opt.bayes.outliers import clustered
-from rpim_opt.bayes.prior import Prior, family_of
+from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Result
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
@@ -57,7 +57,9 @@ OWNED = {
     SESSIONS: ("session",),
     WARMTH: ("expansion",),
 }
-"""Extensions whose evidence is asked for at a result, and the terms that stand for them."""
+"""Extensions whose evidence is asked for at a result, and the terms that stand for them.
+
+First moments of links are gravity's, too: either would stand for the other."""
 NOISE = ("position", "orientation", "joint")
 """Parts of the noise of a comparison at a result."""
 KNOWN = Prior(joint_offset=1.0, frames=1.0)
@@ -294,15 +296,6 @@ class Comparison(Models):
     def gain(self) -> float:
         """By how much -2 ln L falls from the result's model to the best."""
         return self.plain.point.value - self.best.point.value
-
-    def owned(self) -> dict[str, np.ndarray]:
-        """Return the extensions that the result identifies, with which parameters (n,) are theirs.
-
-        First moments of links are gravity's, too: either would stand for the other.
-        """
-        group = [family_of(name) for name in self.own]
-        found = {family: np.isin(group, patterns) for family, patterns in OWNED.items()}
-        return {family: members for family, members in found.items() if members.any()}
 
     def rise_without(self, members: np.ndarray) -> float:
         """Return by how much -2 ln L would rise without some of the result's own parameters (n,)."""

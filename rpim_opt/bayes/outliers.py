@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc, pdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.trust import RARE
+from rpim_opt.data.dataset import Block
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, error_dimensions
@@ -37,15 +40,20 @@ LOOSE = 1e-9
 """Part of the largest singular value below which the other equations do not decide a direction."""
 
 
+def by_block(problem: CalibrationProblem, values: Array) -> Iterator[tuple[Block, Array]]:
+    """Yield every block of a problem's data, with what some values (m, ...) of equations are there, (N, k, ...)."""
+    start = 0
+    for block in problem.data.blocks:
+        end = start + len(block.row) * len(block.measurement.components)
+        yield block, values[start:end].reshape(len(block.row), -1, *values.shape[1:])
+        start = end
+
+
 def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
     """Return measured minus modelled position of every row (N, 3) [m] at deviations x (n,); NaN where none was."""
-    start = 0
     vectors = np.full((len(problem.data), 3), np.nan)
-    residual = problem.residual(x)
-    for block in problem.data.blocks:
+    for block, part in by_block(problem, problem.residual(x)):
         names = list(block.measurement.components)
-        part = residual[start : start + len(block.row) * len(names)].reshape(-1, len(names))
-        start += part.size
         if {"x", "y", "z"} <= set(names):
             vectors[block.row] = part[:, [names.index(axis) for axis in "xyz"]]
     return vectors
@@ -184,14 +192,11 @@ def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels
     """Return those of some excluded rows that a fit x (n,) without them, of covariance (n, n), cannot explain [SI]."""
     kept = dict(labels)
     residual, J = problem.slopes(x)
-    start = 0
-    for block, V in zip(problem.data.blocks, problem.covariances(), strict=True):
+    parts = by_block(problem, np.column_stack([residual, J]))
+    for (block, part), V in zip(parts, problem.covariances(), strict=True):
         k = len(block.measurement.components)
-        end = start + k * len(block.row)
         asked = np.array([problem.labels[row] in labels for row in block.row])
-        r = residual[start:end].reshape(-1, k, 1)[asked]
-        slopes = J[start:end].reshape(-1, k, len(x))[asked]
-        start = end
+        r, slopes = part[asked][:, :, :1], part[asked][:, :, 1:]
         S = slopes @ covariance @ slopes.transpose(0, 2, 1) + np.broadcast_to(V, (len(block.row), k, k))[asked]
         squares = np.sum(r * np.linalg.solve(S, r), axis=(1, 2))
         for row in block.row[asked][chdtrc(k, squares) > FALSE_RATE]:

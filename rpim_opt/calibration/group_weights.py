@@ -15,7 +15,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes.prior import Prior
-from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.calibration.at_weight import calibrated
 from rpim_opt.calibration.loop import Options
 from rpim_opt.calibration.result import Calibration
@@ -273,43 +272,6 @@ def _least(objective: Objective, bounds: tuple[float, float], count: int) -> Arr
 # --- calibration -----------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Weighing:
-    """What stays the same while weights of groups are chosen; ``stated`` is what a prior says, in unweighted scales."""
-
-    formulation: Formulation
-    members: Members
-    stated: Stated
-    options: Options
-
-    def solved(self, problem: Source, t: Array, start: Array | None) -> Calibration:
-        """Return the calibration of a problem (without weights in its scales) at weight 1 with those weights."""
-        size = self.stated.scale / np.sqrt(self.members.weights(t))
-        table = problem.parameters
-        scale = table.scale.copy()
-        scale[table.identified] *= size
-        weighted = problem.with_parameters(replace(table, scale=scale))
-        formulation = self.stated.inside(size).penalized(self.formulation)
-        return calibrated(weighted, formulation, 1.0, start=start, options=self.options)
-
-    def choice(self, linear: LinearModel, t: Array) -> Selection:
-        """Return the most likely weights for the squares that a calibration with weights of logarithms t ended at."""
-        root = np.sqrt(self.members.weights(t))
-        widths = self.stated.scale
-        scale = linear.parameters.scale * root
-        linear = replace(linear, A=linear.A * root, parameters=replace(linear.parameters, scale=scale))
-        form = pose(self.formulation, linear).penalty_form
-        if form is None or form.c.any() or not form.diagonal:
-            found = f"formulation '{self.formulation.name}'"
-            raise InputError("weight", found, "numbers for its groups, or a penalty that sums squared deviations")
-        own = np.where(self.stated.replaced, 0.0, form.L**2)
-        return reml_groups(
-            Grouped(
-                linear, self.members, own, self.stated.centre / widths, self.stated.rows * widths, self.stated.values
-            )
-        )
-
-
 def grouped(
     problem: Source,
     formulation: Formulation,
@@ -336,21 +298,43 @@ def grouped(
                 "The stated frames are far from their registration; deviations count from the registered frames."
             )
     stated = (prior or Prior()).stated(problem.parameters, widened=False)
-    weighing = Weighing(formulation, found, stated, options)
+
+    def solved(t: Array, start: Array | None) -> Calibration:
+        """Return the calibration at weight 1 with weights of logarithms t (G,) in the scales."""
+        size = stated.scale / np.sqrt(found.weights(t))
+        scale = problem.parameters.scale.copy()
+        scale[problem.parameters.identified] *= size
+        weighted = problem.with_parameters(replace(problem.parameters, scale=scale))
+        penalized = stated.inside(size).penalized(formulation)
+        return calibrated(weighted, penalized, 1.0, start=start, options=options)
+
+    def choice(linear: LinearModel, t: Array) -> Selection:
+        """Return the most likely weights for the squares that a calibration with weights t ended at."""
+        root = np.sqrt(found.weights(t))
+        scale = linear.parameters.scale * root
+        linear = replace(linear, A=linear.A * root, parameters=replace(linear.parameters, scale=scale))
+        form = pose(formulation, linear).penalty_form
+        if form is None or form.c.any() or not form.diagonal:
+            accepted = "numbers for its groups, or a penalty that sums squared deviations"
+            raise InputError("weight", f"formulation '{formulation.name}'", accepted)
+        own = np.where(stated.replaced, 0.0, form.L**2)
+        centre = stated.centre / stated.scale
+        return reml_groups(Grouped(linear, found, own, centre, stated.rows * stated.scale, stated.values))
+
     t = np.zeros(len(found.names))
-    result = weighing.solved(problem, t, start)
+    result = solved(t, start)
     selection = Selection(1.0, "given by group", np.zeros(0), np.zeros(0), True, "as stated", found.told)
     if found.names:
         change = np.inf
-        selection = weighing.choice(result.linear, t)
+        selection = choice(result.linear, t)
         for _ in range(MOST_ROUNDS):
             answer = np.log([selection.groups[name] for name in found.names])
             change = float(np.max(np.abs(answer - t)))
             if change <= SAME:
                 break
             t = answer
-            result = weighing.solved(problem, t, result.x)
-            selection = weighing.choice(result.linear, t)
+            result = solved(t, result.x)
+            selection = choice(result.linear, t)
         used = dict(zip(found.names, np.exp(t).tolist(), strict=True))
         selection = replace(selection, groups={**selection.groups, **used})
         if change > NEARLY:

@@ -11,6 +11,7 @@ from scipy.special import fdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import sessions_spread
+from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import coverage_factor, row_freedom, scattered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
@@ -44,18 +45,13 @@ def judged(result: Calibration, data: Dataset) -> Judged:
         return Judged(sigmas, allowed, None)
     inside: list[np.ndarray] = []
     problem = result.problem.on(data)
-    residual = problem.residual(result.x)
-    J = problem.jacobian(result.x)
+    parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
-    start = 0
     added = scattered(problem, result.noise_level)
-    for block, reading, session in zip(data.blocks, added.reading, added.session, strict=True):
+    for (block, part), reading, session in zip(parts, added.reading, added.session, strict=True):
         k = len(block.measurement.components)
-        end = start + k * len(block.row)
-        r = residual[start:end].reshape(-1, k)
-        A = J[start:end].reshape(-1, k, len(C))
-        start = end
+        r, A = part[:, :, 0], part[:, :, 1:]
         S = A @ C @ A.transpose(0, 2, 1) + reading
         freedom = row_freedom(result.freedom, sessions_spread(result.learned), S, session)
         squares = np.sum(r * np.linalg.solve(S, r[:, :, None])[:, :, 0], axis=1)

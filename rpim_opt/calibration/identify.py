@@ -137,11 +137,7 @@ def calibrate(
         prior=prior,
         model=model,
         noise=noise,
-        max_iterations=max_iterations,
-        tolerance=tolerance,
-        solver=solver,
-        settings=settings,
-        verbose=verbose,
+        **(vars(options) | {"progress": None}),
     )
     require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None

@@ -16,6 +16,7 @@ from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import sampled
 from rpim_opt.bayes.model_selection import FIRST, OWNED, SESSIONS, SPEAK, TURNED, WARMTH, Comparison, Judged
+from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import family_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
@@ -168,7 +169,43 @@ class LackOfFit:
 
     def sentences(self) -> list[str]:
         """Return the paragraph, sentence by sentence."""
-        return _sentences(self)
+        rms = f"Residual RMS {_size(self, self.left)}"
+        if not self.instrument:
+            count = max(round(self.spare), 0)
+            degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
+            return [f"{rms}; {degrees} too few to tell what it consists of. Measure more configurations."]
+        lines = [f"{rms} ({_division(self)})."]
+        for family, effect in self.present.items():
+            size = ""
+            if effect.rms is not None:
+                size = f": {_size(self, effect.rms)} RMS beyond what geometry can imitate"
+            lines.append(f"{DOES[family]}{size} (-2 ln L falls by {effect.gain:.0f}).")
+        if self.missing:
+            what = joined([WHAT[family] for family in self.missing])
+            lines.append(
+                f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (-2 ln L "
+                f'falls by {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
+            )
+        if self.upward:
+            named = joined([str(joint) for joint in self.upward])
+            joints = f"Compliances of joints {named} are"
+            if len(self.upward) == 1:
+                joints = f"Compliance of joint {named} is"
+            lines.append(
+                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the "
+                "controller compensates sag; do not use such a fit outside the measured joint ranges."
+            )
+        lines += _limit(self)
+        if self.repeated is not None:
+            agree = f"Repeated readings of a configuration agree to {_size(self, self.repeated)} RMS"
+            if self.excess:
+                lines.append(
+                    f"{agree}; {_size(self, self.excess)} of the residuals repeat with the configuration, unless the "
+                    "robot stood still between them."
+                )
+            else:
+                lines.append(f"{agree}: residuals are no larger.")
+        return lines
 
     def __str__(self) -> str:
         """Return the paragraph."""
@@ -221,10 +258,10 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         return LackOfFit(**known)
     best = compared.best
     after = _parts(compared, best)
-    total = _square(_parts(compared, compared.plain))
+    total = sum(part**2 for part in _parts(compared, compared.plain).values())  # the variance of a row
     share = 0.0
     if best.families:
-        share = max(total - _square(after), 0.0) / total
+        share = max(total - sum(part**2 for part in after.values()), 0.0) / total
     present = _present(compared)
     again, freedom = _repeated(problem, result.x, dimension)
     excess = 0.0
@@ -295,15 +332,14 @@ def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
     return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
 
 
-def _square(parts: Mapping[str, float]) -> float:
-    """Return the variance of a row."""
-    return sum(value**2 for value in parts.values())
-
-
 def _present(compared: Comparison) -> Mapping[str, Effect]:
     """Return the extensions of the result's own model that are worth more than `SPEAK`, with what they do."""
+    group = [family_of(name) for name in compared.own]
+    owned = {family: np.isin(group, terms) for family, terms in OWNED.items()}
     found = {}
-    for family, members in compared.owned().items():
+    for family, members in owned.items():
+        if not members.any():
+            continue
         gain = compared.rise_without(members)
         if gain > SPEAK:
             found[family] = Effect(gain, _beyond_geometry(compared, members))
@@ -359,17 +395,11 @@ def _narrow(problem: CalibrationProblem) -> tuple[int, ...]:
 
 def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:
     """Return the RMS [m or rad] of repeated readings about their mean, None for too few, and its freedom."""
-    residual = problem.residual(x)
-    start = 0
     squares = 0.0
     rows = 0
     freedom = 0
-    for block in problem.data.blocks:
-        components = list(block.measurement.components.values())
-        end = start + len(components) * len(block.row)
-        r = residual[start:end].reshape(-1, len(components))
-        start = end
-        r = r[:, [d == dimension for d in components]]
+    for block, residual in by_block(problem, problem.residual(x)):
+        r = residual[:, [d == dimension for d in block.measurement.components.values()]]
         same = np.unique(repeatable(block).round(7), axis=0, return_inverse=True)[1].ravel()
         count = np.bincount(same)
         mean = np.array([np.bincount(same, column) / count for column in r.T]).reshape(-1, len(count)).T
@@ -434,44 +464,6 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
 
 
 # --- in words ---------------------------------------------------------------------------------------------------------
-
-
-def _sentences(found: LackOfFit) -> list[str]:
-    rms = f"Residual RMS {_size(found, found.left)}"
-    if not found.instrument:
-        count = max(round(found.spare), 0)
-        degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
-        return [f"{rms}; {degrees} too few to tell what it consists of. Measure more configurations."]
-    lines = [f"{rms} ({_division(found)})."]
-    for family, effect in found.present.items():
-        size = ""
-        if effect.rms is not None:
-            size = f": {_size(found, effect.rms)} RMS beyond what geometry can imitate"
-        lines.append(f"{DOES[family]}{size} (-2 ln L falls by {effect.gain:.0f}).")
-    if found.missing:
-        what = joined([WHAT[family] for family in found.missing])
-        lines.append(
-            f"{what[0].upper()}{what[1:]} would explain {found.share:.0%} of the mean square residual (-2 ln L falls "
-            f'by {found.gain:.0f}): add {joined(found.parameters)} to `identify`, or model = "auto".'
-        )
-    if found.upward:
-        named = joined([str(joint) for joint in found.upward])
-        joints = f"Compliance of joint {named} is" if len(found.upward) == 1 else f"Compliances of joints {named} are"
-        lines.append(
-            f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the controller "
-            "compensates sag; do not use such a fit outside the measured joint ranges."
-        )
-    lines += _limit(found)
-    if found.repeated is not None:
-        agree = f"Repeated readings of a configuration agree to {_size(found, found.repeated)} RMS"
-        if found.excess:
-            lines.append(
-                f"{agree}; {_size(found, found.excess)} of the residuals repeat with the configuration, unless the "
-                "robot stood still between them."
-            )
-        else:
-            lines.append(f"{agree}: residuals are no larger.")
-    return lines
 
 
 def _size(found: LackOfFit, value: float) -> str:

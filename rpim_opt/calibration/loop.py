@@ -253,7 +253,8 @@ class Loop:
         weight = state.choice.weight
         how = {key: getattr(self.options, key) for key in ("solver", "settings", "verbose")}
         with phase("solve"):
-            estimate = program.solve(weight, damping=_term(state), accuracy=accuracy, **how)
+            damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
+            estimate = program.solve(weight, damping=damping, accuracy=accuracy, **how)
         return program.inside(estimate.z, state.z, weight)
 
     def _curved(self, state: State, straight: Array) -> Array:
@@ -329,12 +330,6 @@ def merit(program: Program, z: Array, weight: float) -> float:
     if excess == 0:
         return objective
     return objective + EXCESS_COST * (1 + abs(objective)) * excess
-
-
-def _term(state: State) -> Damping | None:
-    if state.damping == 0:
-        return None
-    return Damping(state.z, np.sqrt(state.damping) * state.size)
 
 
 def _damping(state: State, gain: float, promised: float, z: Array) -> float:

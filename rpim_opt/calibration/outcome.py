@@ -268,20 +268,18 @@ class Outcome:
         source = self.problem
         if data is not None:
             source = source.on(data)
-        return np.concatenate([self._positions(part.data) for part in source.rows()])
-
-    def _positions(self, data: Dataset) -> Array:
-        points = np.empty((len(data), 3))
-        for block in data.blocks:
-            names = list(block.measurement.columns)
-            torque = None
-            if block.torque is not None:
-                torque = block.torque[:, 0]
-            found = self.forward(block.q[:, 0], block.markers[0], torque, block.payload, block.columns, block.robot)
-            points[block.row] = found[:, :3, 3]
-            if {"x", "y", "z"} <= set(names):
-                points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
-        return points
+        found = []
+        for part in source.rows():
+            points = np.empty((len(part.data), 3))
+            for block in part.data.blocks:
+                torque = None if block.torque is None else block.torque[:, 0]
+                of = (block.markers[0], torque, block.payload, block.columns, block.robot)
+                points[block.row] = self.forward(block.q[:, 0], *of)[:, :3, 3]
+                names = list(block.measurement.columns)
+                if {"x", "y", "z"} <= set(names):
+                    points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
+            found.append(points)
+        return np.concatenate(found)
 
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m], of the identification data by default.

@@ -87,7 +87,7 @@ class Calibration(Outcome):
         >>> print(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).weight_sentence())
         Weight 1 (given), formulation 'Tikhonov'.
         """
-        return words.weight_sentence(self)
+        return " ".join(words.weight_lines(self))
 
     def parameter_rows(self) -> list[dict[str, Any]]:
         """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit.

@@ -155,11 +155,6 @@ def weight_lines(result: Outcome) -> list[str]:
     return [f"Formulation '{result.formulation.name}'.", *learned_lines(result.learned, names, result.z)]
 
 
-def weight_sentence(result: Outcome) -> str:
-    """Say the same in one line."""
-    return " ".join(weight_lines(result))
-
-
 def _carried_on(last: Earlier) -> str:
     """Say which calibration's posterior the prior is."""
     text = f"Prior: the posterior of '{last.title}', {last.rows} rows, made {last.made or 'just now'}"
@@ -266,9 +261,11 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         _said("Thermal expansion", expansion),
         _model(learned),
     ]
-    for name, ratio in learned.unusual(names, z, UNUSUAL)[:MOST]:
-        cause = ": an error of assembly or of its zero" if is_joint_offset(name) else ""
-        lines.append(f"{name} deviates by {ratio:.0f} prior standard deviations of its group{cause}.")
+    ratio = np.abs(z) * learned.local
+    for i in np.argsort(-ratio)[:MOST]:
+        if ratio[i] > UNUSUAL:
+            cause = ": an error of assembly or of its zero" if is_joint_offset(names[i]) else ""
+            lines.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
     excluded = [f"{row.label} ({row.ratio:.0f} times the median error)" for row in learned.left_out[:MOST]]
     if len(learned.left_out) > MOST:
         excluded[-1] += f" and {len(learned.left_out) - MOST} more"

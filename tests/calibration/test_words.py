@@ -90,9 +90,9 @@ def test_errors_before_and_after_are_in_millimetres() -> None:
 
 
 def test_a_weight_is_said_with_where_it_came_from() -> None:
-    assert words.weight_sentence(RESULT) == "Weight 0.001 (given), formulation 'Tikhonov'."
+    assert RESULT.weight_sentence() == "Weight 0.001 (given), formulation 'Tikhonov'."
     free = ro.calibrate(ro.load("position").problem, ro.least_squares)
-    assert words.weight_sentence(free) == "Formulation 'least squares' has no penalty and needs no weight."
+    assert free.weight_sentence() == "Formulation 'least squares' has no penalty and needs no weight."
     assert (free.selector, free.penalty_weight) == ("none", 0.0)
     assert (RESULT.selector, RESULT.penalty_weight) == ("given", 1e-3)
 
