@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -17,9 +16,8 @@ from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.expressions import term
 from rpim_opt.convex.trust import SMALL
-from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import in_parts
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Machine, reduced_rows, require_robot
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import moved, predicted, within_ranges
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
@@ -150,15 +148,12 @@ def influence(result: Outcome) -> Influence:
     if not result.linear_penalty:
         raise InputError("influence", f"formulation '{result.formulation.name}'", "a squared penalty or none")
     stated = result.problem.parameters.free
-    n = len(stated)
-    blocks = list(_weighted(result))
-    R = None
-    for block in blocks:
-        R = reduced_rows(np.column_stack([block.model.A, block.model.b]), R)
-    if R is None:
-        raise InputError("data", "no row", "at least one")
-    A, b = R[:, :n], R[:, n]
-    L, c = np.zeros((0, n)), np.zeros(0)
+    model, first_label = _equations(result)
+    numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)
+    weight = _weights(result, model, which)
+    model = model.scaled(np.sqrt(weight))
+    A, b = model.triangle[:, :-1], model.triangle[:, -1]
+    L, c = np.zeros((0, len(stated))), np.zeros(0)
     form = result.program.penalty_form
     if form is not None:
         root = np.sqrt(result.penalty_weight)
@@ -169,70 +164,56 @@ def influence(result: Outcome) -> Influence:
     if np.linalg.norm(gradient[free]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
         raise _unweighted(result)
     T = _inverse_root(np.vstack([A, L]), free)
-    parts = [_left_out(block, result.z, T) for block in blocks]
-    leverage, change, squares = (np.concatenate(each) for each in zip(*parts, strict=True))
+    residual = model.A @ result.z - model.b
+    leverage, change = _left_out(model.A @ T, residual, equations)
+    change = change @ T.T
     used = float(np.sum(leverage))
-    spare = sum(len(block.model.b) for block in blocks) - used
+    spare = len(residual) - used
     variance = 1.0
     if spare > 1e-6:
-        variance = float(np.sum(squares)) / spare
-    moved = change @ A.T
+        variance = float(residual @ residual) / spare
     spread = np.sqrt(variance * np.sum((A @ T @ T.T) ** 2, axis=0))
     spread[spread < UNIDENTIFIABLE] = 0.0
     return Influence(
-        label=tuple(label for block in blocks for label in block.label),
-        configuration=np.concatenate([block.configuration for block in blocks]),
+        label=tuple(first_label[number] for number in numbers),
+        configuration=numbers,
         parameters=stated.names,
         dimensions=stated.dimensions,
         leverage=leverage,
-        cook=np.sum(moved**2, axis=1) / (max(used, TINY) * max(variance, TINY)),
+        cook=np.sum((change @ A.T) ** 2, axis=1) / (max(used, TINY) * max(variance, TINY)),
         change=change * stated.scale,
         deviation=spread * stated.scale,
-        weight=np.concatenate([block.weight for block in blocks]),
+        weight=np.bincount(which, weight) / equations,
     )
 
 
-class _Block(NamedTuple):
-    """Weighted equations sorted by configuration; how many each configuration has, and its mean weight."""
-
-    model: LinearModel
-    equations: np.ndarray
-    weight: Array
-    configuration: np.ndarray
-    label: tuple[str, ...]
-
-
-def _weighted(result: Outcome) -> Iterator[_Block]:
-    """Yield the equations of the last linearization, with the weights that the loss ended with."""
+def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:
+    """Return the last linearization, sorted by configuration, and the label of every configuration's first row."""
     model = result.program.model
     if model.stands_for is None and isinstance(result.problem, CalibrationProblem):
-        if result.squared_loss:
-            model = result.program.squared
-        yield _block(result, model, result.problem.data)
-        return
-    for part in in_parts(result.problem).rows():
-        yield _block(result, part.linearize(result.x), part.data)
+        models = [result.program.squared if result.squared_loss else model]
+        data = [result.problem.data]
+    else:
+        parts = list(in_parts(result.problem).rows())
+        models = [part.linearize(result.x) for part in parts]
+        data = [part.data for part in parts]
+    A, b, group = (np.concatenate([getattr(each, name) for each in models]) for name in ("A", "b", "group"))
+    order = np.argsort(group, kind="stable")
+    labels: dict[int, str] = {}
+    for each in data:
+        labels |= dict(zip(each.configuration[::-1], each.label[::-1], strict=True))
+    return replace(models[0], A=A[order], b=b[order], group=group[order]), labels
 
 
-def _block(result: Outcome, model: LinearModel, data: Dataset) -> _Block:
-    order = np.argsort(model.group, kind="stable")
-    model = replace(model, A=model.A[order], b=model.b[order], group=model.group[order])
-    numbers, which, count = np.unique(model.group, return_inverse=True, return_counts=True)
-    weight = _weights(result, model, which, len(count))
-    first = dict(zip(data.configuration[::-1], data.label[::-1], strict=True))
-    label = tuple(first[number] for number in numbers)
-    return _Block(model.scaled(np.sqrt(weight)), count, np.bincount(which, weight) / count, numbers, label)
-
-
-def _weights(result: Outcome, model: LinearModel, which: np.ndarray, configurations: int) -> Array:
-    """Return loss'(v) / (2 v) of every equation (m,): the squares that the loss ended with."""
+def _weights(result: Outcome, model: LinearModel, which: np.ndarray) -> Array:
+    """Return loss'(v) / (2 v) of every equation (m,), of the configuration ``which`` (m,): the loss ended with them."""
     if result.squared_loss:
         return np.ones(len(model.b))
     residual = model.A @ result.z - model.b
     stated = result.formulation
     v = np.abs(residual)
     if stated.loss_over == "configuration":
-        v = np.sqrt(np.bincount(which, residual**2, minlength=configurations))
+        v = np.sqrt(np.bincount(which, residual**2))
     v = np.maximum(v, SMALL)
     slope = term(stated.loss, len(v), f"formulation '{stated.name}', loss").slope(v)
     if slope is None:
@@ -255,29 +236,25 @@ def _inverse_root(rows: Array, free: np.ndarray) -> Array:
     return T
 
 
-def _left_out(block: _Block, z: Array, T: Array) -> tuple[Array, Array, Array]:
-    """Return leverages (C,), changes (C, n) in scales, and the sum of squares (C,) of the configurations."""
-    residual = block.model.A @ z - block.model.b
-    Q = block.model.A @ T
-    first = np.cumsum(block.equations) - block.equations
+def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, Array]:
+    """Return leverages (C,), and changes (C, k) by Q (m, k) of leaving out so many ``equations`` (C,) in turn."""
+    first = np.cumsum(equations) - equations
     leverage = np.empty(len(first))
-    squares = np.empty(len(first))
-    change = np.empty((len(first), len(z)))
-    for count in np.unique(block.equations):
-        chosen = np.flatnonzero(block.equations == count)
+    change = np.empty((len(first), Q.shape[1]))
+    for count in np.unique(equations):
+        chosen = np.flatnonzero(equations == count)
         rows = first[chosen][:, None] + np.arange(count)
         q, r = Q[rows], residual[rows]
         hat = q @ q.transpose(0, 2, 1)
         leverage[chosen] = np.einsum("kii->k", hat)
-        squares[chosen] = np.sum(r**2, axis=1)
         spare = np.eye(count) - hat
         alone = np.linalg.eigvalsh(spare)[:, 0] < ALONE
         spare[alone] = np.eye(count)
         pull = np.linalg.solve(spare, r[:, :, None])[:, :, 0]
-        moved = np.einsum("kij,ki->kj", q, pull) @ T.T
+        moved = np.einsum("kij,ki->kj", q, pull)
         moved[alone] = np.nan
         change[chosen] = moved
-    return leverage, change, squares
+    return leverage, change
 
 
 # --- improvement of the flange ----------------------------------------------------------------------------------------
