@@ -147,7 +147,6 @@ def test_heavy_libraries_wait_until_they_are_used(code: str) -> None:
 
 SMALL = "calibrate paper_arm"
 ELSEWHERE = {
-    "rpim_opt.calibration.acceptance",
     "rpim_opt.calibration.leverage",
     "rpim_opt.calibration.group_weights",
     "rpim_opt.convex.infeasible",
@@ -156,7 +155,7 @@ ELSEWHERE = {
     "rpim_opt.robot.formats.urdf",
     "cattrs",
 }
-"""What a plain calibration has no use of: a limit, cameras, a drawing's words, a result file."""
+"""What a plain calibration has no use of: cameras, a drawing's words, a result file."""
 HEAVY = {"cvxpy", "clarabel", "scipy.stats"}
 """Libraries that a calibration without cones does not use; SciPy's optimizers estimate hyperparameters."""
 UNUSED = {

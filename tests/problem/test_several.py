@@ -340,7 +340,7 @@ def test_the_covariance_of_shared_parameters_is_right_by_monte_carlo() -> None:
     first = ro.calibrate(measured(whole, truth, seed=0), ro.least_squares)
     names = whole.parameters.free.names
     k = [names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
-    C = first.spread.noise[np.ix_(k, k)] / first.noise_variance
+    C = first.spread.noise[np.ix_(k, k)] / first.spread.noise_variance
     found = np.array([ro.calibrate(measured(whole, truth, seed), ro.least_squares).x[k] for seed in range(DRAWS)])
     off = found - [truth[name] for name in ("tool_x", "tool_y", "tool_z")]
     white = np.linalg.solve(np.linalg.cholesky(C), off.T).T
@@ -350,7 +350,7 @@ def test_the_covariance_of_shared_parameters_is_right_by_monte_carlo() -> None:
     assert np.abs(white.mean(axis=0)).max() < 3 / np.sqrt(DRAWS)
     alone = ro.calibrate(left, ro.least_squares)
     own = [left.parameters.free.names.index(name) for name in ("tool_x", "tool_y", "tool_z")]
-    apart = alone.spread.noise[np.ix_(own, own)] / alone.noise_variance
+    apart = alone.spread.noise[np.ix_(own, own)] / alone.spread.noise_variance
     assert np.linalg.eigvalsh(apart - C).min() > 0
 
 
