@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import frame_of
+from rpim_opt.basics.text import html_table
 from rpim_opt.calibration import words
 from rpim_opt.calibration.causes import likely_causes, mistakes
 from rpim_opt.calibration.outcome import Iteration, Kept, Outcome, Prediction
@@ -124,16 +126,20 @@ class Calibration(Outcome):
         >>> len(result.to_frame("history")) == len(result.history)
         True
         """
-        return frame_of(words.frame_rows(self, what))
+        if what not in words.FRAMES:
+            raise InputError("to_frame", f"'{what}'", choices(what, words.FRAMES))
+        return frame_of(words.FRAMES[what](self))
 
     def __str__(self) -> str:
         """Return the parameters and errors as a person reads them."""
-        return words.as_text(self, self.verdict)
+        return "\n".join([words.parameter_table(self), "", *words.sentences(self, self.verdict)])
 
     def __repr__(self) -> str:
         """Return one line."""
-        return words.in_short(self)
+        asked = f"'{self.formulation.name}', {len(self.x)} parameters, weight {self.weight:.4g}"
+        return f"<Calibration {asked}: {self.message}>"
 
     def _repr_html_(self) -> str:
         """Return the same as the text for a notebook."""
-        return words.as_html(self, self.verdict)
+        title = repr(self).strip("<>")
+        return html_table(*words.columns(self), notes=words.sentences(self, self.verdict), title=title)

@@ -8,8 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.text import html_table, joined, listed, table
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
@@ -85,10 +85,11 @@ def turned_frames(result: Outcome) -> list[str]:
 
 def parameter_table(result: Outcome) -> str:
     """Return the identified parameters as a table of text."""
-    return table(*_columns(result))
+    return table(*columns(result))
 
 
-def _columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
+def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
+    """Return head and cells of the table of identified parameters."""
     cells = []
     for row in parameter_rows(result):
         if family_of(row["name"]) != "transmission":
@@ -98,25 +99,8 @@ def _columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
     return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
 
 
-def as_text(result: Outcome, verdict: Verdict) -> str:
-    """Return the parameters and errors as a person reads them."""
-    return "\n".join([parameter_table(result), "", *_sentences(result, verdict)])
-
-
-def as_html(result: Outcome, verdict: Verdict) -> str:
-    """Return the same for a notebook."""
-    return html_table(*_columns(result), notes=_sentences(result, verdict), title=in_short(result).strip("<>"))
-
-
-def in_short(result: Outcome) -> str:
-    """Return one line: what was asked, and how it ended."""
-    count = len(result.x)
-    return (
-        f"<Calibration '{result.formulation.name}', {count} parameters, weight {result.weight:.4g}: {result.message}>"
-    )
-
-
-def _sentences(result: Outcome, verdict: Verdict) -> list[str]:
+def sentences(result: Outcome, verdict: Verdict) -> list[str]:
+    """Return what stands below the table: errors, the verdict's reasons, weight, noise and remarks."""
     before = 1e3 * np.nanmean(result.nominal_errors())
     after = 1e3 * np.nanmean(result.errors())
     errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
@@ -321,33 +305,20 @@ def _model(learned: Learned) -> str:
 # --- tables -----------------------------------------------------------------------------------------------------
 
 
-def _parameter_frame(result: Outcome) -> list[dict[str, Any]]:
-    return [{"parameter": row.pop("name"), **row} for row in parameter_rows(result)]
-
-
-def _error_frame(result: Outcome) -> list[dict[str, Any]]:
-    both = zip(result.problem.labels, 1e3 * result.nominal_errors(), 1e3 * result.errors(), strict=True)
-    return [{"label": label, "nominal_mm": float(b), "identified_mm": float(a)} for label, b, a in both]
-
-
 FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
-    "parameters": _parameter_frame,
-    "errors": _error_frame,
+    "parameters": lambda result: [{"parameter": row.pop("name"), **row} for row in parameter_rows(result)],
+    "errors": lambda result: [
+        {"label": label, "nominal_mm": float(before), "identified_mm": float(after)}
+        for label, before, after in zip(
+            result.problem.labels, 1e3 * result.nominal_errors(), 1e3 * result.errors(), strict=True
+        )
+    ],
     "history": lambda result: [dict(vars(each)) for each in result.history],
     "flags": lambda result: [flag._asdict() for flag in result.flagged],
     "bounds": lambda result: [held._asdict() for held in result.held],
     "prices": lambda result: [price._asdict() for price in result.prices],
 }
 """Tables of a result by name."""
-
-
-def frame_rows(result: Outcome, what: str) -> list[dict[str, Any]]:
-    """Return the rows of one of the `FRAMES`."""
-    if what not in FRAMES:
-        raise InputError("to_frame", f"'{what}'", choices(what, FRAMES))
-    return FRAMES[what](result)
-
-
 MOST_POINTS = 20
 """Points of a table; of others one row says how many there are."""
 HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
