@@ -25,7 +25,6 @@ from rpim_opt.convex.rules.scores import reml
 from rpim_opt.convex.rules.selection import Selection, grid_of
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
-from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.robot.parameter_names import own_name
 from rpim_opt.robot.parameters import Parameters
 
@@ -289,14 +288,6 @@ def grouped(
     if formulation.penalty is None:
         raise InputError("weight", f"weights for formulation '{formulation.name}'", "one with a penalty")
     found = members(problem.parameters.free, weights)
-    notes: list[str] = []
-    if start is None:
-        elsewhere = relocated(problem)
-        if elsewhere is not None:
-            problem = elsewhere
-            notes.append(
-                "The stated frames are far from their registration; deviations count from the registered frames."
-            )
     stated = (prior or Prior()).stated(problem.parameters, widened=False)
 
     def solved(t: Array, start: Array | None) -> Calibration:
@@ -338,10 +329,11 @@ def grouped(
         used = dict(zip(found.names, np.exp(t).tolist(), strict=True))
         selection = replace(selection, groups={**selection.groups, **used})
         if change > NEARLY:
-            notes.insert(0, f"The weights of groups did not converge in {MOST_ROUNDS} rounds: the last ones are used.")
+            note = f" The weights of groups did not converge in {MOST_ROUNDS} rounds: the last ones are used."
+            result = replace(result, message=result.message + note)
     how = {"formulation": formulation, "weights": weights, "prior": prior, "options": replace(options, progress=None)}
     again = partial(_again, table=problem.parameters, **how)
-    return replace(result, selection=selection, message=" ".join([result.message, *notes]), asked=again)
+    return replace(result, selection=selection, asked=again)
 
 
 def _again(problem: Source, *, table: Parameters, **how: Any) -> Calibration:

@@ -126,11 +126,7 @@ def calibrate(
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
     kinds = _noise(noise, model)
     require_affordable(problem)
-    if isinstance(weight, Mapping):
-        from rpim_opt.calibration.group_weights import grouped
-
-        return grouped(problem, formulation, weight, prior=prior, start=start, options=options)
-    asked = partial(
+    asked: Callable[[Source], Calibration] = partial(
         calibrate,
         formulation=formulation,
         weight=weight,
@@ -153,7 +149,12 @@ def calibrate(
     if weight is None and formulation.penalty is None:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
-    if weight is None:
+    if isinstance(weight, Mapping):
+        from rpim_opt.calibration.group_weights import grouped
+
+        result = grouped(problem, formulation, weight, prior=prior, start=start, options=options)
+        asked = result.asked
+    elif weight is None:
         found = estimate(problem, estimator, model, start)
         formulation = found.stated.penalized(formulation)
         result = calibrated(found.problem, formulation, 1.0, start=found.x, options=options)
