@@ -352,8 +352,16 @@ class Dataset(Tabled):
             q = q[:, None]
         _require_shapes(q, y, measurement)
         N = len(q)
+        k = len(measurement.components)
         rows = np.arange(N)
-        covariance = _covariance(sigma, N, len(measurement.components))
+        covariance = np.array(sigma, dtype=float)
+        positive = covariance.ndim > 0 or covariance > 0
+        if covariance.ndim == 0:
+            covariance = covariance**2 * np.eye(k)
+        if covariance.ndim == 2:
+            covariance = covariance[None]
+        if not positive or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
+            raise InputError("sigma", f"{sigma}", f"a number greater than zero, or a covariance of shape ({k}, {k})")
         block = Block(
             measurement,
             q,
@@ -426,20 +434,6 @@ def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:
     if found.size != like.size or found.shape[:1] != like.shape[:1] or not np.isfinite(found).all():
         raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {like.shape}")
     return found.reshape(like.shape)
-
-
-def _covariance(sigma: float | Array, N: int, k: int) -> Array:
-    """Return covariances (1 or N, k, k) from one standard deviation, or from covariances."""
-    covariance = np.array(sigma, dtype=float)
-    wrong = False
-    if covariance.ndim == 0:
-        wrong = not sigma > 0
-        covariance = covariance**2 * np.eye(k)
-    if covariance.ndim == 2:
-        covariance = covariance[None]
-    if wrong or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
-        raise InputError("sigma", f"{sigma}", f"a number greater than zero, or a covariance of shape ({k}, {k})")
-    return covariance
 
 
 def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:

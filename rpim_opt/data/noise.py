@@ -121,7 +121,13 @@ def covariances(
         i, j = names.index(a), names.index(b)
         covariance[:, i, j] = columns[f"cov_{a}_{b}", ""]
         covariance[:, j, i] = covariance[:, i, j]
-    _require_definite(covariance, label)
+    unit = np.sqrt(np.einsum("nii->ni", covariance))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        correlation = np.nan_to_num(covariance / (unit[:, :, None] * unit[:, None, :]))
+    definite = np.linalg.eigvalsh(correlation)[:, 0] > DEFINITE
+    if not definite.all():
+        row = label[int(np.argmin(definite))]
+        raise InputError(f"row {row}, columns cov_...", "a covariance that is not positive definite", "one that is")
     return covariance
 
 
@@ -148,13 +154,3 @@ def _declared(columns: Numbers, declared: Mapping[str, Any], kind: Measurement, 
         accepted = f"{with_unit(common, dimension, 2)[-1]}, or a column {column}"
         raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
     return 0.0
-
-
-def _require_definite(covariance: Array, label: Sequence[str]) -> None:
-    unit = np.sqrt(np.einsum("nii->ni", covariance))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        correlation = np.nan_to_num(covariance / (unit[:, :, None] * unit[:, None, :]))
-    smallest = np.linalg.eigvalsh(correlation)[:, 0]
-    if not (smallest > DEFINITE).all():
-        row = label[int(np.argmin(smallest > DEFINITE))]
-        raise InputError(f"row {row}, columns cov_...", "a covariance that is not positive definite", "one that is")

@@ -159,6 +159,7 @@ def _draws(robot: Robot) -> Array:
     return q
 
 
+@lru_cache(maxsize=64)
 def bend_names(robot: Robot) -> tuple[str, ...]:
     """Return the parameters ``bend{i}_{k}{a}`` that say something about a robot, each something else.
 
@@ -166,14 +167,7 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
     constant, that of an earlier one of the same joint. With constants they say all that masses of links can do to
     an arm of revolute joints.
     """
-    return _bend_names(robot.mdh.tobytes(), robot.joint_types, robot.joint_map.tobytes(), robot.gravity)
-
-
-@lru_cache(maxsize=64)
-def _bend_names(mdh: bytes, joint_types: tuple[str, ...], joint_map: bytes, gravity: Gravity) -> tuple[str, ...]:
-    n = len(joint_types)
-    table, signs = (np.frombuffer(values).reshape(n, -1) for values in (mdh, joint_map))
-    robot = Robot("", table, joint_types, signs, gravity=gravity)
+    n = len(robot.mdh)
     slopes = moment_slopes(robot, _draws(robot))
     names = []
     for i in range(n):

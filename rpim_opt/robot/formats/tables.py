@@ -43,6 +43,8 @@ SHEET = {
     "r": "a",
 }
 """Other names of columns."""
+JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")
+"""Columns of the joints' own names."""
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
 WITHOUT_COLUMN = {
@@ -206,10 +208,16 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     lost = next((note for note in raw.notes if "is no row of the table" in note or "sums others up" in note), "")
     if lost:
         raise InputError("the table", lost.rstrip("."), "a row a joint", path)
-    named = {name: _sheet_name(name) for name in raw.columns}
-    columns = {named[name]: [str(cell) for cell in cells] for name, cells in raw.columns.items() if named[name]}
-    if len(columns) < sum(map(bool, named.values())):
-        raise InputError("the header", ", ".join(raw.columns), "every column once", path)
+    columns: dict[str, list[str]] = {}
+    for name, cells in raw.columns.items():
+        stem, unit = split(name.partition(" #")[0])
+        stem = INDEX_BEFORE.sub("", stem).strip().lower()
+        if stem in JOINT_NAMES:
+            continue
+        key = SHEET.get(stem, stem) + (f"_{unit}" if unit else "")
+        if key in columns:
+            raise InputError("the header", ", ".join(raw.columns), "every column once", path)
+        columns[key] = [str(cell) for cell in cells]
     said = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
         said.add("modified")
@@ -227,16 +235,6 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     if robot.gravity.masses:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified", path)
     return _from_standard(robot)
-
-
-def _sheet_name(name: str) -> str:
-    """Return the key of a ``[[joint]]`` that a column of a DH table is; nothing for the joint's own name."""
-    stem, unit = split(name.partition(" #")[0])
-    stem = INDEX_BEFORE.sub("", stem).strip().lower()
-    if stem in ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk"):
-        return ""
-    stem = SHEET.get(stem, stem)
-    return f"{stem}_{unit}" if unit else stem
 
 
 def _from_standard(robot: Robot) -> Described:
