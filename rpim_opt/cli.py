@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -104,27 +105,8 @@ def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
 
 def _shipped() -> Iterable[str]:
     """Return the problems that come with the package; folders are the shell's own."""
-    from rpim_opt.store.problem_file import problems_folder
-
-    return sorted(path.parent.name for path in problems_folder().glob("*/problem.toml"))
-
-
-def _formulations() -> Iterable[str]:
-    from rpim_opt.convex.formulation import FORMULATIONS
-
-    return FORMULATIONS
-
-
-def _selectors() -> Iterable[str]:
-    from rpim_opt.convex.select import SELECTORS
-
-    return ["learned", *SELECTORS]
-
-
-def _robots() -> Iterable[str]:
-    from rpim_opt.robot.library import robots
-
-    return robots()
+    folder = import_module("rpim_opt.store.problem_file").problems_folder()
+    return sorted(path.parent.name for path in folder.glob("*/problem.toml"))
 
 
 Text = str | None
@@ -135,12 +117,15 @@ Problem = Annotated[
     str,
     Argument(help="A problem folder, or the name of a shipped one.", autocompletion=_completed(_shipped)),
 ]
+FORMULATIONS = _completed(lambda: import_module("rpim_opt.convex.formulation").FORMULATIONS)
+SELECTORS = _completed(lambda: ["learned", *import_module("rpim_opt.convex.select").SELECTORS])
+ROBOTS = _completed(lambda: import_module("rpim_opt.robot.library").robots())
 MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
 RULES = "learned (prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
-Selector = Annotated[Text, Option(help=RULES, autocompletion=_completed(_selectors))]
+Selector = Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)]
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
-Formulation = Annotated[Text, Option(help=READY, autocompletion=_completed(_formulations))]
+Formulation = Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)]
 Noise = Annotated[
     Text,
     Option(help="Variance components to estimate: robot, free, level, declared (none).", autocompletion=COMPONENTS),
@@ -185,7 +170,7 @@ def new(
         str,
         Option(
             help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.",
-            autocompletion=_completed(_robots),
+            autocompletion=ROBOTS,
         ),
     ],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],

@@ -166,22 +166,19 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     """
     verdict, *details = str(found).splitlines()
     heading = title or "Checks"
+    charts = [
+        figure(partial(plot.checks, found), "Residual of every check and its limit", "Each check on its own."),
+        figure(
+            partial(plot.cumulative_sum, found), "Cumulative sum of the checks and its limit", "All together (CUSUM)."
+        ),
+    ]
     sections: list[tuple[str, list[Block]]] = [
         ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
-        ("Over time", [("figures", _over_time(found))]),
+        ("Over time", [("figures", charts)]),
         ("Every check", [("table", _checks(found))]),
     ]
     text = render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections)
     write_text(Path(path), text)
-
-
-def _over_time(found: Monitoring) -> list[Figure]:
-    each = "Residual of every check and its limit"
-    together = "Cumulative sum of the checks and its limit"
-    return [
-        figure(partial(plot.checks, found), each, "Each check on its own."),
-        figure(partial(plot.cumulative_sum, found), together, "All checks together (CUSUM)."),
-    ]
 
 
 def _checks(found: Monitoring) -> Table:

@@ -24,8 +24,6 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import HEADER, noise_sentence, scatter, scatter_rows, turned_frames, weight_lines
-from rpim_opt.convex.expressions import SQUARES
-from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
@@ -493,9 +491,6 @@ def _noise(block: Rows) -> str:
 
 WHY = {"learned": "maximum of the marginal likelihood"}
 """Reasons of choices that have no note; others were given."""
-MANY_EQUATIONS = 600
-"""Equations beyond which a loss that is no square is drawn by its quadratic model, which has a closed form: the two
-curves look the same, and a hundred robust fits of two thousand rows take minutes."""
 L_CURVE_HEIGHT = 330.0
 PICARD = "Picard's condition at the solution: the penalty damps directions below the line; data near 1 are noise."
 
@@ -513,11 +508,9 @@ def _regularization(content: Content) -> Iterator[Block]:
 
 def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
     """Yield the L-curve and the choice of every rule; what the page's slider needs goes into ``embedded``."""
-    program, note = _drawn_program(result)
-    chosen = {result.selector: result.selection or Selection(result.weight, "given", np.array([]), np.array([]), True)}
-    if not _slow(program):
-        chosen = {**compare(program), **chosen}
-    name, curve = _path(result, program, chosen)
+    given = Selection(result.weight, "given", np.array([]), np.array([]), True)
+    chosen = {**compare(result.program), result.selector: result.selection or given}
+    name, curve = _path(result, chosen)
     weights = np.array(curve["weight"])
     points = np.column_stack([curve["residual"], curve["solution"]])
     places = {
@@ -537,7 +530,7 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
     drawn = {"x": x.tolist(), "y": (L_CURVE_HEIGHT - y).tolist()}
     embedded["curve"] = {**curve, **drawn, "of": name, "takers": names, "chosen": k}
     caption = "Every point is the solution at one weight: small weights above left, large ones below right."
-    yield "weight", {"figure": Figure(svg, caption + note), "last": len(weights) - 1, "chosen": k}
+    yield "weight", {"figure": Figure(svg, caption), "last": len(weights) - 1, "chosen": k}
     rows = []
     for rule, choice in sorted(chosen.items(), key=lambda item: item[1].weight):
         mean = mm(curve["error"][places[rule]]) if rule in places else ""
@@ -547,29 +540,10 @@ def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
     yield "table", Table(title, ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True)
 
 
-def _slow(program: Program) -> bool:
-    """Return whether a path of such programs takes longer than anybody waits for a report."""
-    return not program.quadratic and program.model.equations > MANY_EQUATIONS
-
-
-def _drawn_program(result: Calibration) -> tuple[Program, str]:
-    """Return the program whose path is drawn, and a sentence where it is the loss's quadratic model."""
-    program = result.program
-    if program.loss_form is not None or not _slow(program):
-        return program, ""
-    try:
-        weighted = result.linear
-    except InputError:  # a loss that rests on a few equations
-        return program, ""
-    squares = replace(result.formulation, loss=SQUARES, loss_over="equation", largest=float("inf"))
-    return pose(squares, weighted), " The curve is that of its quadratic model at the chosen weight."
-
-
-def _path(result: Calibration, program: Program, chosen: Mapping[str, Selection]) -> tuple[str, dict[str, list[float]]]:
+def _path(result: Calibration, chosen: Mapping[str, Selection]) -> tuple[str, dict[str, list[float]]]:
     """Solve over a grid of weights and at the chosen ones; return whose mean error [mm] is given, and the curve."""
+    program = result.program
     count = 80 if program.closed_form else 30
-    if _slow(program):
-        count = 10
     name, data = next(iter(summary.sets(result).items()))
     problem = result.problem.on(data)
     scale = result.problem.parameters.free.scale

@@ -210,6 +210,12 @@ def load(
         requirement = stated_requirement(table.acceptance, problem.robot)
     except InputError as error:
         raise error.within(path) from None
+    for file in table.published:
+        if not inside(path.parent, file, "table published", path).is_file():
+            raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
+    for key, pair in table.reference.items():
+        if len(pair) != 2:
+            raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
     return Instance(
         title=table.title,
         source=table.source,
@@ -218,8 +224,8 @@ def load(
         formulation=formulation,
         weight=named_weight(table.selector, path),
         prior=prior,
-        published=_published(table, files, path),
-        reference=_reference(table, path),
+        published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
+        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         simulation=table.simulation,
         files=_hashes(stated, files),
         excluded=table.exclude,
@@ -294,20 +300,6 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
         if isinstance(constraint, Parsed):
             constraint.require_near(parameters)
     return formulation
-
-
-def _published(table: ProblemTable, files: Files, path: Path) -> dict[str, Mapping[str, float]]:
-    for file in table.published:
-        if not inside(path.parent, file, "table published", path).is_file():
-            raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
-    return {role: table.published.get(names[0], {}) for role, names in files.items() if names}
-
-
-def _reference(table: ProblemTable, path: Path) -> dict[str, tuple[float, float]]:
-    for key, pair in table.reference.items():
-        if len(pair) != 2:
-            raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
-    return {key: (value, spread) for key, (value, spread) in table.reference.items()}
 
 
 def _hashes(stated: ProblemFile, files: Files) -> dict[str, str]:

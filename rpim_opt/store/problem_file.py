@@ -303,6 +303,12 @@ def read_problem(
     base = None
     if table.base != "auto":
         base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
+    if not table.tool:
+        tools = {"": tuple(arm.tool)}
+    elif any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
+        tools = {"": _frame(table.tool, "tool", path)}
+    else:
+        tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
     return ProblemFile(
         path=path,
         table=table,
@@ -310,7 +316,7 @@ def read_problem(
         robot=arm.robot,
         kinds=kinds,
         observations=tuple(observations),
-        tools=_tools(table, arm, path),
+        tools=tools,
         base=base,
         board=_board(table, path),
     )
@@ -365,15 +371,6 @@ def _arm(table: ProblemTable, path: Path) -> Described:
     turned = numeric_frame(arm.base)[:3, :3]
     gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
     return replace(arm, robot=replace(arm.robot, gravity=gravity))
-
-
-def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[float, ...]]:
-    """Return where the reflectors start, by marker; one without a name is the only one."""
-    if not table.tool:
-        return {"": tuple(arm.tool)}
-    if any(split_unit(key)[0] in FRAME for key in table.tool):
-        return {"": _frame(table.tool, "tool", path)}
-    return {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
 
 
 def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:

@@ -121,19 +121,15 @@ def _array(values: Any, kind: Any) -> np.ndarray:
     except (ValueError, OverflowError):
         raise InputError("", "rows of different lengths", "rows of the same length") from None
     if kind is not np.ndarray:
-        return _floats(values, array)
+        if array.dtype.kind in "if" and np.isfinite(array).all():
+            return array.astype(float)
+        spelled = np.array(values, dtype=object)
+        return np.array([_number(value) for value in spelled.ravel().tolist()], dtype=float).reshape(spelled.shape)
     if not array.size:
         return array.astype(int)
     if array.dtype.kind not in "biU":
         raise _unfit(values, "integers, truth values or texts")
     return array.astype(object) if array.dtype.kind == "U" else array
-
-
-def _floats(values: Any, array: np.ndarray) -> np.ndarray:
-    if array.dtype.kind in "if" and np.isfinite(array).all():
-        return array.astype(float)
-    spelled = np.array(values, dtype=object)
-    return np.array([_number(value) for value in spelled.ravel().tolist()], dtype=float).reshape(spelled.shape)
 
 
 # --- errors ------------------------------------------------------------------------------------------------------

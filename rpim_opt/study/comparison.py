@@ -16,7 +16,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import frame_of
-from rpim_opt.basics.text import progress_bar
+from rpim_opt.basics.text import counted, progress_bar
 from rpim_opt.study.methods import USUAL, Method, measure, methods_of, metrics_of
 from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
 from rpim_opt.study.provenance import package_code, provenance
@@ -25,7 +25,7 @@ from rpim_opt.study.replicates import Row, require_package, run_cases
 
 MOST_DRAWS = 100_000
 """Each is a calibration of its own, and is listed before the first begins."""
-LARGEST_FACTOR = float(np.finfo(float).max)
+LARGEST = float(np.finfo(float).max)
 """Whole numbers may be larger than any double."""
 
 
@@ -118,13 +118,13 @@ def compare(
     sources = {source.label: source for source in sources_of(problems)}
     compared = {method.label: method for method in methods_of(formulations, selectors, methods, options or {})}
     ways = {split.label: split for split in splits_of(splits)}
-    sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", _whole(1))
-    factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", _is_factor)
+    sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
+    factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
     if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
         if seeds > MOST_DRAWS:
             raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
         seeds = range(max(int(seeds), 0))
-    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", _whole(0))
+    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
     figured = metrics_of(metrics)
     cases: list[Row] = []
     for source, split, count, factor in product(sources.values(), ways.values(), sizes, factors):
@@ -169,21 +169,15 @@ def compare(
     return Comparison(tuple(rows), tuple(figured), families, asked, made)
 
 
-def _numbers(where: str, stated: Any, accepted: str, good: Callable[[Any], bool]) -> list[Any]:
-    """Return numbers, each once."""
+def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
+    """Return numbers of a kind, ``int`` or ``float``, each once."""
     values = list(stated) if isinstance(stated, Iterable) else [stated]
-    numeric = all(isinstance(v, int | float | np.number) and not isinstance(v, bool) for v in values)
-    if not values or not numeric or not all(map(good, values)):
+    kinds = (int, np.integer) if kind is int else (int, float, np.number)
+    if not values or not all(
+        isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= LARGEST for v in values
+    ):
         raise InputError(where, f"{stated!r}", accepted)
-    return list(dict.fromkeys(int(v) if isinstance(v, int | np.integer) else float(v) for v in values))
-
-
-def _whole(least: int) -> Callable[[Any], bool]:
-    return lambda value: isinstance(value, int | np.integer) and bool(value >= least)
-
-
-def _is_factor(value: Any) -> bool:
-    return 1 <= value <= LARGEST_FACTOR
+    return list(dict.fromkeys(map(kind, values)))
 
 
 def replicate(
@@ -321,7 +315,7 @@ class Comparison:
         """Return one line."""
         counts = Counter(row["status"] for row in self.rows)
         said = ", ".join(f"{count} {status}" for status, count in counts.items())
-        what = f"{_counted(len(self.methods), 'method')} on {_counted(len(self.problems), 'problem')}"
+        what = f"{counted(len(self.methods), 'method')} on {counted(len(self.problems), 'problem')}"
         return f"Comparison: {what}, {len(self.rows)} replicates ({said})"
 
     def __str__(self) -> str:
@@ -335,7 +329,3 @@ class Comparison:
         if any(row["status"] in WITH_FIGURES for row in self.rows):
             return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}"
         return None
-
-
-def _counted(count: int, what: str) -> str:
-    return f"{count} {what}" if count == 1 else f"{count} {what}s"

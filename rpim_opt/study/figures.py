@@ -17,7 +17,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarForm
 from rpim_opt.basics.files import refused, write_files
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.report.page import HEIGHT, Block, Table, figure, render
-from rpim_opt.study.ranking import Rows, Standing, Summary, figures, number, profiles, without_figures
+from rpim_opt.study.ranking import Rows, Summary, figures, number, profiles, without_figures
 
 ROW_INCHES = 0.25
 """Height of a method."""
@@ -94,7 +94,13 @@ def _ratios(rows: Rows, summary: Summary, ax: Any) -> None:
         if (ratios < 1 / LARGEST_RATIO).any():
             ax.plot([1 / LARGEST_RATIO], [top - k], "<", ms=6, color="C0", zorder=2)
         if each.ratio is not None:
-            _mean(ax, each, each.ratio, top - k, each.method == summary.reference)
+            colour = "0.3"
+            if each.different:
+                colour = "C2" if each.ratio < 1 else "C3"
+            if each.low is not None and each.method != summary.reference:
+                ends = _inside([each.low, each.high])
+                ax.plot(ends, [top - k] * 2, "-", lw=2, color=colour, zorder=3, solid_capstyle="butt")
+            ax.plot(_inside([each.ratio]), [top - k], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
     ax.set_yticks(range(top + 1), [each.method for each in reversed(summary.standings)], fontsize=8)
     ax.set_ylim(-0.7, top + 0.7)
     ax.set_xscale("log")
@@ -107,24 +113,12 @@ def _inside(ratios: Any) -> Any:
     return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
 
 
-def _mean(ax: Any, each: Standing, ratio: float, y: int, reference: bool) -> None:
-    colour = "0.3"
-    if each.different:
-        colour = "C2" if ratio < 1 else "C3"
-    if each.low is not None and not reference:
-        ends = _inside([each.low, each.high])
-        ax.plot(ends, [y, y], "-", lw=2, color=colour, zorder=3, solid_capstyle="butt")
-    ax.plot(_inside([ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
-
-
 def _profiles(rows: Rows, summary: Summary, ax: Any) -> None:
     """Draw what share of replicates is within a ratio of the best method's figure."""
     of = profiles(rows, summary.metric)
-
-    def area(name: str) -> float:  # below the logarithm of the ratio
-        return float(np.mean(np.maximum(np.log(LARGEST_PROFILE_RATIO) - np.log(of[name]), 0)))
-
-    ranked = sorted(of, key=area, reverse=True)
+    # by the area below the logarithm of the ratio
+    area = {name: np.mean(np.maximum(np.log(LARGEST_PROFILE_RATIO) - np.log(of[name]), 0)) for name in of}
+    ranked = sorted(of, key=lambda name: area[name], reverse=True)
     named = ranked[:NAMED_PROFILES]
     for name in reversed(ranked):
         style: dict[str, Any] = {"color": "0.85", "lw": 0.8}

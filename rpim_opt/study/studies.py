@@ -247,6 +247,7 @@ def run_study(
         Where results go; ``results/NAME`` or ``results/NAME-quick`` beside the study by default.
     """
     path = find_study(name)
+    require_package("pyarrow", "the study")
     study = load_study(path)
     folder = out or path.parent / "results" / _label(path, quick)
     with refused(folder):
@@ -275,9 +276,7 @@ def _run(path: Path, case: Mapping[str, Any]) -> Row:
 
 
 def replicate_file(rows: list[Row], made: str) -> dict[str, bytes]:
-    """Return the replicates as a Parquet file, or as JSON without pyarrow, with what made them; by its name."""
-    if importlib.util.find_spec("pyarrow") is None:
-        return {f"{REPLICATES}.json": json_text({"made": made, "replicates": rows}).encode()}
+    """Return the replicates as a Parquet file, with what made them, by its name."""
     import pyarrow as pa
     from pyarrow import parquet
 
@@ -290,25 +289,17 @@ def replicate_file(rows: list[Row], made: str) -> dict[str, bytes]:
 
 def read_replicates(folder: Path) -> tuple[list[Row], str]:
     """Return the replicates of an earlier run, without what a replicate does not have, and what made them."""
-    text = folder / f"{REPLICATES}.json"
     path = folder / f"{REPLICATES}.parquet"
-    accepted = "the replicates of a study"
-    if text.exists():
-        content = read_json(text)
-        if not isinstance(content, dict) or not isinstance(content.get("replicates"), list):
-            raise InputError("redraw", "no replicates", accepted, text)
-        return content["replicates"], str(content.get("made"))
     if not path.exists():
         raise InputError("redraw", "no replicates", "a study that was run before", path)
     require_file(path, LARGEST_DATA)
-    require_package("pyarrow", "redraw")
     from pyarrow import parquet
 
     try:
         table = parquet.read_table(path)
         made = (table.schema.metadata or {}).get(b"made", b"").decode()
     except (OSError, ValueError) as error:
-        raise InputError("redraw", str(error), accepted, path) from None
+        raise InputError("redraw", str(error), "the replicates of a study", path) from None
     return [{key: value for key, value in row.items() if value is not None} for row in table.to_pylist()], made
 
 
@@ -328,9 +319,6 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
             files[f"{title}.{kind}"] = picture(figure, title, kind)
     with refused(folder):
         write_files({folder / name: content for name, content in files.items()})
-        for name in (f"{REPLICATES}.json", f"{REPLICATES}.parquet"):
-            if replicates and name not in replicates:
-                (folder / name).unlink(missing_ok=True)
 
 
 def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> list[str]:

@@ -446,7 +446,14 @@ class _Cell(NamedTuple):
     ) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some rows, of which q or poses are there."""
         N = len(np.asarray(q if poses is None else poses))
-        load = self._load(N, torque, payload)
+        # what the joints of the model bear, as `Arm.at` takes it
+        borne = [np.empty((N, 0))]
+        if torque is not None:
+            borne.append(torque @ np.linalg.inv(self.robot.joint_map))
+        if self.loads.payload:
+            mass = self.robot.gravity.payload if payload is None else payload
+            borne.append(np.broadcast_to(mass, N)[:, None])
+        load = np.hstack(borne)
         if poses is not None:
             commands, target = self._commands(poses, q, load), poses
             missed = self.nominal.at(commands, load, poses)[1]
@@ -491,16 +498,6 @@ class _Cell(NamedTuple):
         variance += np.trace(scattered(problem, self.level).robot[0], axis1=1, axis2=2)
         unknown = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
         return np.where(unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
-
-    def _load(self, N: int, torque: Array | None, payload: Array | None) -> Array:
-        """Return what the joints of the model bear, as `Arm.at` takes it, (N, l)."""
-        parts = [np.empty((N, 0))]
-        if torque is not None:
-            parts.append(torque @ np.linalg.inv(self.robot.joint_map))
-        if self.loads.payload:
-            mass = self.robot.gravity.payload if payload is None else payload
-            parts.append(np.broadcast_to(mass, N)[:, None])
-        return np.hstack(parts)
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""

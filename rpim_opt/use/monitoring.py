@@ -232,7 +232,12 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         data = data.take(order)
         when = when[order]
         times = tuple(times[i] for i in order) if times else ()
-    problem = with_data(result, replace(data, configuration=_visits(data, when)))
+    # a place that is checked again and again is many configurations: one a visit
+    visit = np.cumsum(np.diff(data.configuration, prepend=data.configuration[0]) != 0)
+    if when is not None:
+        visit = np.unique(when, return_inverse=True)[1]
+    visits = np.unique(np.stack([visit, data.configuration]), axis=1, return_inverse=True)[1].ravel()
+    problem = with_data(result, replace(data, configuration=visits))
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
@@ -250,15 +255,6 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         drift=_drift(result, problem, level),
         mistake=misread(result, data),
     )
-
-
-def _visits(data: Dataset, when: Array | None) -> np.ndarray:
-    """Return a number (N,) for every visit to a configuration: a place that is checked again and again is many."""
-    changed = np.diff(data.configuration, prepend=data.configuration[0]) != 0
-    visit = np.cumsum(changed)
-    if when is not None:
-        visit = np.unique(when, return_inverse=True)[1]
-    return np.unique(np.stack([visit, data.configuration]), axis=1, return_inverse=True)[1].ravel()
 
 
 # --- each check --------------------------------------------------------------------------------------------
@@ -382,7 +378,8 @@ def _changes(misfit: Misfit, problem: CalibrationProblem, when: np.ndarray) -> I
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])
         for first, steady, course in courses:
-            g, G = misfit.of_drift(index, course)
+            # parameters that move while readings are taken, by a part of the whole change
+            g, G = misfit.projected(slice(misfit.m), misfit.A[:, index] * course[:, None])
             moved = None
             if len(g) == 1 and G[0, 0] > 0:
                 std = scale / np.sqrt(G[0, 0])

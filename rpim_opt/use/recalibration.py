@@ -249,7 +249,14 @@ def update(
     first, before = _weighed(result, updated, released)
     causes, after = first, before
     changes: list[Cause] = []
-    while (cause := _significant(causes)) is not None and _allowed(changes, cause, len(data)):
+    while True:
+        # the most probable of the causes that chance does not explain
+        cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
+        if cause is None:
+            break
+        alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
+        if len(alike) >= (max(SPARED * len(data), 1) if cause.kind == "reading" else MOST):
+            break
         say(f"releasing {cause.name}")
         changes.append(cause)
         if cause.kind == "reading":
@@ -265,17 +272,6 @@ def update(
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = _record(result, prior_inflation, released, left_out)
     return Update(replace(updated, record=record), before, after, tuple(changes), first, moved, len(data))
-
-
-def _significant(causes: Sequence[Cause]) -> Cause | None:
-    """Return the most probable of the causes that chance does not explain."""
-    return next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
-
-
-def _allowed(changes: Sequence[Cause], cause: Cause, readings: int) -> bool:
-    """Return whether one more change still leaves something of the robot, or of the readings."""
-    alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
-    return len(alike) < (max(SPARED * readings, 1) if cause.kind == "reading" else MOST)
 
 
 def _require_this_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
@@ -416,19 +412,8 @@ class Misfit:
         # all of it has as many degrees of freedom as there are readings
         self.fit = Fit(squares, self.m, self._p_value(squares, self.m))
 
-    def of_parameters(self, index: Sequence[int]) -> tuple[Array, Array]:
-        """Return g (p,) and G (p, p) of a change of some parameters."""
-        return self._projected(slice(self.m, None), self.L[:, list(index)])
-
-    def of_equations(self, index: np.ndarray) -> tuple[Array, Array]:
-        """Return the same of readings that are wrong."""
-        return self._projected(index, np.eye(len(index)))
-
-    def of_drift(self, index: Sequence[int], course: Array) -> tuple[Array, Array]:
-        """Return the same of parameters that move while readings are taken, by ``course`` (m,) of the whole change."""
-        return self._projected(slice(self.m), self.A[:, list(index)] * course[:, None])
-
-    def _projected(self, rows: slice | np.ndarray, values: Array) -> tuple[Array, Array]:
+    def projected(self, rows: slice | np.ndarray, values: Array) -> tuple[Array, Array]:
+        """Return g (p,) and G (p, p) of a change whose D has these values in some rows, and zeros in the others."""
         D = np.zeros((len(self.e), values.shape[1]))
         D[rows] = values
         along = self.Q.T @ D
@@ -474,7 +459,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
     logs: list[float] = []
     for cause in candidates(free, released):
         index = [free.names.index(name) for name in cause.members]
-        change = misfit.of_parameters(index)
+        change = misfit.projected(slice(misfit.m, None), misfit.L[:, index])
         causes.append(misfit.evidence(cause, *change))
         logs.append(_log_bayes_factor(*change, width[index]))
     rows: dict[int, list[str]] = {}  # a configuration may have been measured wrongly
@@ -483,7 +468,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
             rows.setdefault(int(configuration), []).append(label)
     for number, labels in rows.items():
         equations = np.flatnonzero(model.group == number)
-        change = misfit.of_equations(equations)
+        change = misfit.projected(equations, np.eye(len(equations)))
         causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
         logs.append(_log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
     kinds = [cause.kind for cause in causes]

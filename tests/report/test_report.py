@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.program import Program
 from rpim_opt.report import report
 from rpim_opt.report.report import page
 from tests.browser import NAMES, PROGRAM, Browser, browser
@@ -290,22 +289,6 @@ def test_it_prints(opened: Browser, tmp_path: Path) -> None:
     opened.print(tmp_path / "report.pdf")
     pages = (tmp_path / "report.pdf").read_bytes().count(b"/Type /Page\n")
     assert 3 <= pages <= 12
-
-
-@pytest.mark.slow
-def test_a_robust_result_of_many_rows_is_drawn_by_its_quadratic_model(monkeypatch) -> None:
-    problem = ro.load("blunders").problem
-    result = ro.calibrate(problem, ro.robust, weight=1.0)
-    sentence = "The curve is that of its quadratic model"
-    assert sentence not in page(result)
-    monkeypatch.setattr(report, "MANY_EQUATIONS", 100)  # 150 equations
-    asked = []
-    solve = Program.solve
-    monkeypatch.setattr(Program, "solve", lambda program, *a, **k: asked.append(program) or solve(program, *a, **k))
-    text = page(result)
-    assert sentence in text
-    assert not [program for program in asked if not program.quadratic]
-    assert "reml" in text
 
 
 def test_many_flagged_rows_are_not_all_named(monkeypatch) -> None:

@@ -203,18 +203,11 @@ def test_a_plain_installation_says_at_once_what_a_study_needs(place: Path, monke
     assert run_study("mine.py", quick=True)[0].metrics == {"largest": 2}
 
 
-def test_without_pyarrow_replicates_are_json(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    _, folder = run_study("mine.py")
-    assert (folder / "replicates.parquet").is_file()
-    before = (folder / "README.md").read_text()
+def test_a_study_asks_for_pyarrow_before_it_computes(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "pyarrow", None)
-    with pytest.raises(ro.InputError, match="redraw: found no package pyarrow"):
-        run_study("mine.py", redraw=True)
-    run_study("mine.py")
-    assert sorted(file.name for file in folder.iterdir()) == ["README.md", "metrics.json", "replicates.json"]
-    run_study("mine.py", redraw=True)
-    assert (folder / "README.md").read_text() == before
-    monkeypatch.undo()
+    with pytest.raises(ro.InputError, match=r"the study: found no package pyarrow, accepted: pip install"):
+        run_study("mine.py")
+    assert not (place / "results").exists()
 
 
 def test_results_say_whether_the_study_is_the_commits(place: Path) -> None:
