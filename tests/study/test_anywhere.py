@@ -177,23 +177,20 @@ def test_what_a_study_depends_on_is_there_and_not_endless(place: Path, monkeypat
 
 
 def test_a_plain_installation_says_at_once_what_a_study_needs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for package in ("matplotlib", "joblib", "distributed"):
+    for package in ("pandas", "joblib", "distributed"):
         monkeypatch.setitem(sys.modules, package, None)
-    monkeypatch.delitem(sys.modules, "rpim_opt.study.figures", raising=False)
-    monkeypatch.delitem(vars(ro.study), "distributions", raising=False)  # where it was loaded before
     ran = place.parent / "ran"
     text = (
         (place / "mine.py")
         .read_text()
         .replace("    from inside", f"    open({str(ran)!r}, 'w').close()\n    from inside")
     )
-    for late in ("", "\n    import matplotlib.pyplot as plt", "\n    from rpim_opt.study import distributions"):
+    for late in ("", "\n    import pandas as pd"):
         studies.load_study.cache_clear()
-        head = f"{late.strip()}\n" if "distributions" in late else ""
-        (place / "mine.py").write_text(head + text.replace("def report(rows):", f"def report(rows):{late}"))
+        (place / "mine.py").write_text(text.replace("def report(rows):", f"def report(rows):{late}"))
         for asked in ({}, {"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
             if late or asked:
-                with pytest.raises(ro.InputError, match=r"no package (matplotlib|joblib|distributed)"):
+                with pytest.raises(ro.InputError, match=r"no package (pandas|joblib|distributed)"):
                     run_study("mine.py", quick=True, **asked)
                 assert not ran.exists()
     (place / "mine.py").write_text(
