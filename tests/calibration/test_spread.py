@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -14,7 +15,6 @@ from scipy.stats import t as student
 import rpim_opt as ro
 from rpim_opt.calibration import Uncertainty
 from rpim_opt.calibration.covariance import noise_test
-from rpim_opt.data.measurements.position import position
 from tests.simulate import simulated
 
 PROBLEM, _ = simulated(noise=5e-5, configurations=25)
@@ -128,7 +128,7 @@ def test_predictions_propagate() -> None:
     h = 1e-6
 
     def at(x: np.ndarray) -> np.ndarray:
-        return RESULT._at(q, position, "", None, None).modelled(x)[0]
+        return replace(RESULT, x=x).forward(q)[:, :3, 3]
 
     J = np.stack([(at(RESULT.x + h * e) - at(RESULT.x - h * e)) / (2 * h) for e in np.eye(len(SCALE))], axis=2)
     want = np.einsum("nij,jk,nlk->nil", J, RESULT.covariance, J)
