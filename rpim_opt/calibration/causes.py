@@ -19,6 +19,7 @@ from rpim_opt.problem.diagnosis import (
     left_out_together,
     moved,
     moved_far,
+    odd_columns,
     rounded_joints,
     rows_without_values,
     shared_rows,
@@ -103,12 +104,14 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(_of_rows(problem))
-    better = better_reading(problem) or lost_row(_in_table_order(result, problem))
+    ordered = _in_table_order(result, problem)
+    better = better_reading(ordered) or lost_row(ordered)
     if better is not None:
         return [*rows_without_values(problem), better.sentence]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
     found = found or list(transmission(problem, result.x))
-    return found or list(rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)])))
+    found = found or list(rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)])))
+    return found or list(odd_columns(problem))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:
@@ -117,9 +120,10 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
     if apart is None:
         return problem
     numbers = [re.search(r"\d+$", label) for label in (*problem.data.label, *apart.label)]
-    if not all(numbers):
+    rows = [int(found[0]) for found in numbers if found]
+    if len(set(rows)) < len(numbers):  # labels without numbers, or a table of its own
         return problem
-    order = np.argsort([int(found[0]) for found in numbers if found], kind="stable")
+    order = np.argsort(rows, kind="stable")
     return problem.on(Dataset.together([problem.data, apart], ["identification", "validation"]).take(order))
 
 

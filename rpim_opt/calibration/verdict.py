@@ -12,6 +12,7 @@ from rpim_opt.basics.exceptions import NotDelivered
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.diagnosis import decimals_of
 from rpim_opt.robot.parameter_names import own_name
 
 BAD = "Larger than expected"
@@ -30,6 +31,8 @@ EXCLUDED = 0.25
 """Share of the rows that may be outliers."""
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5
 """Nominal RMS over the stated noise, and itself [m], below which positions were computed and not measured."""
+ROUNDED = 1.1
+"""Nominal RMS over what rounding of the measured values makes, below which they were computed, too."""
 SPARE = 2.0
 """Equations per parameter of the frames below which nominal errors may vanish by themselves."""
 WORSE = 3.0
@@ -269,3 +272,20 @@ def _computed(result: Outcome) -> Iterator[str]:
             f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, far below the stated noise: they look "
             "computed from it, not measured."
         )
+    elif nominal < ROUNDED * _rounding(problem):
+        yield (
+            f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, no more than their rounding: they look "
+            "computed from it, or have too few decimals to calibrate it."
+        )
+
+
+def _rounding(problem: Source) -> float:
+    """Return the RMS error [m] that rounding of measured lengths makes; zero beyond four decimals of a millimetre."""
+    largest = 0.0
+    for block in (block for part in problem.rows() for block in part.data.blocks):
+        lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
+        decimals = decimals_of(1e3 * block.y[:, lengths]) if lengths else None
+        if decimals is None:
+            return 0.0
+        largest = max(largest, 1e-3 * 10.0**-decimals * np.sqrt(len(lengths) / 12))
+    return largest

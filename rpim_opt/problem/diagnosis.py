@@ -13,7 +13,7 @@ from scipy.special import fdtrc
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import Tabled, counted, listed, table, three_digits
+from rpim_opt.basics.text import Tabled, counted, joined, listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import Observability, combination, observe
@@ -25,6 +25,7 @@ from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.points import points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.parameter_names import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
 """A joint that moves less [rad, m] is hardly seen."""
@@ -42,8 +43,12 @@ MOVED = 0.5
 """An instrument has moved if that leaves less than this part of the sum of squares."""
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
+SMALL = 0.2
+"""Ratios and couplings [1, m] from which on a linearization says nothing of them."""
 RARE = 1e-6
 """Probability with which chance may explain what is reported."""
+FLAT = 1e-3
+"""A coordinate that spreads less than this part of another one is hardly measured."""
 FEWEST = 6
 """Rows on either side of a change, or of which copies are told."""
 COPIES = 0.2
@@ -486,7 +491,7 @@ def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
     for unit, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        decimals = _decimals(_all_q(problem.data)[:, turning] / size)
+        decimals = decimals_of(_all_q(problem.data)[:, turning] / size)
         if decimals is None:
             continue
         made = size * 10.0**-decimals / np.sqrt(12) * arm
@@ -499,7 +504,42 @@ def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
             return
 
 
-def _decimals(values: Array) -> int | None:
+def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
+    """Say which columns of joint and measured values are frozen, alike, flat or without their signs.
+
+    Asked of data that nothing else explains: a robot may be measured so.
+    """
+    for block in problem.data.blocks:
+        q, y = block.q[:, 0], block.y[:, :3]
+        labels = [problem.data.label[i] for i in block.row]
+        for i, column in enumerate(q.T):
+            changes = np.concatenate([[-1], np.flatnonzero(np.diff(column)), [len(column) - 1]])
+            k = int(np.argmax(np.diff(changes)))
+            first, last = changes[k] + 1, changes[k + 1]
+            if last - first + 1 >= FEWEST and np.ptp(q[first : last + 1], axis=0).any():
+                yield (
+                    f"joint {i + 1} has one and the same value in rows {labels[first]} to {labels[last]}, where others "
+                    "move: was its reading frozen?"
+                )
+        named = dict(zip([*(f"q{i + 1}" for i in range(q.shape[1])), *"xyz"], np.hstack([q, y]).T, strict=False))
+        ordered = [name for name, column in named.items() if np.ptp(column) > 0 and (np.diff(column) >= 0).all()]
+        if len(ordered) == 1 and len(q) >= 2 * FEWEST:
+            yield f"column {ordered[0]} is in ascending order, and no other one: was it sorted alone?"
+        negative = problem.robot.limits[:, 0] < -LEAST_TRAVEL["revolute"]
+        unsigned = [f"q{i + 1}" for i in np.flatnonzero((q.min(axis=0) >= 0) & (np.ptp(q, axis=0) > 0) & negative)]
+        if y.shape[1] == 3:
+            for i, j in combinations(range(3), 2):
+                if (y[:, i] == y[:, j]).all():
+                    yield f"columns {'xyz'[i]} and {'xyz'[j]} have the same values: is one a copy?"
+            spread = y.std(axis=0)
+            for k in np.flatnonzero(spread < FLAT * spread.max()):
+                yield f"column {'xyz'[k]} spreads over {three_digits(1e3 * spread[k])} mm only: is it another column?"
+            unsigned += [*("xyz" if y.min() >= 0 else "")]
+        if unsigned and len(q) >= 2 * FEWEST:
+            yield f"no value of column {joined(unsigned)} is negative: were signs lost?"
+
+
+def decimals_of(values: Array) -> int | None:
     """Return how many decimals all values have at most, up to 4; None where they have more."""
     for decimals in range(5):
         scaled = values * 10.0**decimals
@@ -525,9 +565,13 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
         # the second part's points by the other base
         there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
         far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
+        other, what = "base", "the instrument or the robot's foot moved"
+        reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
+        if reflectors > far:
+            other, what, far = "reflector", "the reflector was exchanged", reflectors
         yield (
-            f"from row {problem.data.label[points.row[place]]} on the points fit another base, "
-            f"{three_digits(1e3 * far)} mm away: the instrument or the robot's foot moved; calibrate "
+            f"from row {problem.data.label[points.row[place]]} on the points fit another {other}, "
+            f"{three_digits(1e3 * far)} mm away: {what}; calibrate "
             "the two parts apart, or register the second one anew."
         )
 
@@ -572,63 +616,86 @@ def _added(problem: CalibrationProblem, x: Array, additions: Callable[[Array], S
         G = without(each)
         steps.append(np.linalg.lstsq(G, rest, rcond=1e-9)[0])
         gains.append(float(rest @ rest - np.sum((rest - G @ steps[-1]) ** 2)))
-    best = int(np.argmax(gains)) if gains else 0
+    spare = [max(len(model.A) - len(x) - len(step), 1) for step in steps]
+    # of many columns against few: by the variance that is left
+    best = int(np.argmin((rest @ rest - np.array(gains)) / spare)) if gains else 0
     if not gains or gains[best] <= (1 - MOVED) * whole:
         return None
     c = len(steps[best])
-    freedom = max(len(model.A) - len(x) - c, 1)
     left = max(whole - gains[best], 1e-300)
-    if float(fdtrc(c, freedom, gains[best] / c / (left / freedom))) * len(gains) >= RARE:
+    if float(fdtrc(c, spare[best], gains[best] / c / (left / spare[best]))) * len(gains) >= RARE:
         return None
     return _Added(best, steps[best], float(np.sqrt(left / whole)))
 
 
 def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say whether the residuals at x (n,) are those of a joint's gear ratio, or of a coupling to another joint.
+    """Say whether the residuals at x (n,) are those of a gear ratio, a coupling of joints, or of the instrument.
 
-    One column is added to the linearization (`_added`), the slope of a joint's zero times the value of a joint.
+    One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, or that
+    of the base's place along the measured positions (scale) or their directions (offset of distances).
     """
     free = problem.parameters.free
     q = problem.joint_values[problem.owners]
     zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(problem.robot.joint_types, 1)]
     pairs = [(i, j) for i, name in enumerate(zeros) for j in range(q.shape[1]) if name in free.names and q[:, j].any()]
+    base = [free.names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in free.names]
+    y = np.zeros((len(problem.data), 3))
+    for block in problem.data.blocks:
+        if block.measurement.name in ("position", "pose"):
+            y[block.row] = block.y[:, :3]
+    ways = [y, y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)] if y.any() and len(base) == 3 else []
 
     def columns(A: Array) -> list[Array]:
+        slopes = A / free.scale
         places = [free.names.index(zeros[i]) for i, _ in pairs]
-        return [A[:, [k]] * q[:, [j]] / free.scale[k] for k, (_, j) in zip(places, pairs, strict=True)]
+        along = [np.sum(slopes[:, base] * way[problem.owners], axis=1, keepdims=True) for way in ways]
+        return [*(slopes[:, [k]] * q[:, [j]] for k, (_, j) in zip(places, pairs, strict=True)), *along]
 
     found = _added(problem, x, columns)
-    if found is not None:
+    if found is None or abs(factor := found.coefficients[0]) > SMALL:
+        return
+    left = f"that leaves {100 * found.left:.0f} % of the residuals"
+    if found.number < len(pairs):
         i, j = pairs[found.number]
-        factor = found.coefficients[0]
         what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
         if i != j:
             what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {factor:+.4f} q{j + 1})"
-        yield f"{what}: that leaves {100 * found.left:.0f} % of the residuals; write it into coupling in robot.toml."
+        yield f"{what}: {left}; write it into coupling in robot.toml."
+    elif found.number == len(pairs):
+        yield f"measured lengths are {100 * factor:+.2g} % too long: {left}; check the scale of the instrument."
+    else:
+        far = three_digits(1e3 * factor)
+        yield f"measured distances are {far} mm too long: {left}; check the reflector's radius."
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say from which row on the residuals at x (n,) show a base that has moved: a change point.
+    """Say from which row on the residuals at x (n,) show a base, a reflector or a joint's zero that moved.
 
-    Six columns are added to the linearization (`_added`), the base's motion for the rows from there on.
+    Its columns for the rows from there on are added to the linearization (`_added`).
     """
     free = problem.parameters.free
-    base = [free.names.index(f"base_{c}") for c in FRAME if f"base_{c}" in free.names]
     data = problem.data
-    if len(base) < len(FRAME) or len(data) < 2 * FEWEST:
+    markers = {marker for block in data.blocks for marker in block.markers}
+    parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
+    for i, kind in enumerate(problem.robot.joint_types, start=1):
+        parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
+    of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
+    if len(of["base"]) < len(FRAME) or len(data) < 2 * FEWEST:
         return
-    places = _places(len(data))
-    found = _added(problem, x, lambda A: [A[:, base] * (problem.owners >= k)[:, None] for k in places])
+    tried = [(k, what) for k in _places(len(data)) for what, some in of.items() if some]
+    found = _added(problem, x, lambda A: [A[:, of[what]] * (problem.owners >= k)[:, None] for k, what in tried])
     if found is not None:
-        place = places[found.number]
+        place, what = tried[found.number]
+        some = of[what]
         equations = Equations.of(data)
         after = equations.length & (equations.row >= place)
-        change = problem.jacobian(x)[np.ix_(after, base)] @ (free.scale[base] * found.coefficients)
+        change = problem.jacobian(x)[np.ix_(after, some)] @ (free.scale[some] * found.coefficients)
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
+        asked = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
         yield (
             f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
-            f"them, and fit a base that moved (that leaves {100 * found.left:.0f} % of the residuals): did the "
-            "instrument or the robot's foot move? Calibrate the two parts apart."
+            f"them, and fit a {what} that moved (that leaves {100 * found.left:.0f} % of the residuals): "
+            f"{asked.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
         )
 
 

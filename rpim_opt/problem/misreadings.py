@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import reduce
-from itertools import combinations, permutations
+from itertools import combinations, permutations, product
 from typing import NamedTuple
 
 import numpy as np
@@ -76,6 +76,8 @@ FURTHER = 0.7
 """A second mistake is looked for behind a reading that leaves less than this part."""
 WRONG = 0.02
 """Points that are off by more than this part of their extent fit no drawing of their robot."""
+LEFT = 0.05
+"""What leaves more than this part of the extent explains nothing, even if gross errors are behind it."""
 FEW = 30
 """Rows of a first try; what comes near the best is tried on more."""
 SAME = 1.05
@@ -99,8 +101,12 @@ ANGLES = {
     np.pi / 180: ("as degrees, not radians", "name the columns q1_deg, ... (--units deg)"),
     180 / np.pi: ("as radians, not degrees", "name the columns q1_rad, ... (--units rad)"),
     0.9: ("as gon, not degrees", "multiply the joint values by 0.9"),
+    360.0: ("as turns, not degrees", "multiply the joint values by 360"),
+    1e-3: ("as thousandths of a degree", "divide the joint values by 1000"),
 }
 """The same of joint angles."""
+DEGREES_PER_MM = np.radians(1) / 1e-3
+"""Radians that a metre stands for where millimetres were degrees."""
 
 
 class Reading(NamedTuple):
@@ -145,7 +151,7 @@ class Better(NamedTuple):
 
 def _readings(robot: Robot, points: Points) -> list[Reading]:
     """Return all single mistakes that are looked for."""
-    readings = [*_of_joints(robot), *_of_rows(len(points.row))]
+    readings = [*_of_joints(robot), *_of_rows(len(points.row), robot.dof)]
     if points.seen:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
         return [*readings, Reading("the camera and the board exchanged", remedy, _inverted)]
@@ -165,15 +171,19 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
     eye = np.eye(robot.dof)
     for factor, (unit, remedy) in ANGLES.items():
         yield of(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
+    for (factor, (unit, _)), i in product(list(ANGLES.items())[:2], np.flatnonzero(turning)):
+        remedy = f"multiply column q{i + 1} by {factor:.6g} or name its unit"
+        yield of(f"joint {i + 1} read {unit}", remedy, eye + (factor - 1) * np.outer(eye[i], eye[i]))
     for i in np.flatnonzero(turning):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         yield of(f"joint {i + 1} reversed", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
     for i, j in combinations(range(robot.dof), 2):
-        if turning[i] == turning[j]:
-            exchanged = eye.copy()
-            exchanged[[i, j]] = eye[[j, i]]
-            remedy = f"exchange the names of the columns q{i + 1} and q{j + 1}"
-            yield of(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
+        exchanged = eye.copy()
+        exchanged[[i, j]] = eye[[j, i]]
+        if turning[i] != turning[j]:  # degrees were read as millimetres, and these as degrees
+            exchanged *= np.where(turning, DEGREES_PER_MM, 1 / DEGREES_PER_MM)[:, None] ** (eye[i] + eye[j])[:, None]
+        remedy = f"exchange the names of the columns q{i + 1} and q{j + 1}"
+        yield of(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
     for i, j in permutations(np.flatnonzero(turning), 2):
         for factor in COUPLINGS[bool(abs(i - j) == 1)]:
             M = eye.copy()
@@ -241,8 +251,8 @@ def _inverted(points: Points) -> Points:
     return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
 
 
-def _of_rows(count: int) -> Iterator[Reading]:
-    """Yield readings with joint values of other rows: shifted, reversed, in the order of texts."""
+def _of_rows(count: int, dof: int) -> Iterator[Reading]:
+    """Yield readings with joint values of other rows: shifted, one column or all, reversed, in the order of texts."""
 
     def of(what: str, remedy: str, joints: np.ndarray, values: np.ndarray) -> Reading:
         return Reading(what, remedy, lambda points: replace(points.take(values), q=points.q[joints]))
@@ -253,6 +263,15 @@ def _of_rows(count: int) -> Iterator[Reading]:
         remedy = f"move the measured values {by} {{}}, against the joint values"
         yield of(f"measured values {by} too low in the table", remedy.format("up"), rows[:-k], rows[k:])
         yield of(f"measured values {by} too high in the table", remedy.format("down"), rows[k:], rows[:-k])
+    for i, (by, low, back) in product(range(dof), ((1, "low", "up"), (-1, "high", "down"))):
+
+        def slipped(points: Points, i: int = i, by: int = by) -> Points:
+            q = points.q.copy()
+            q[:, i] = np.roll(q[:, i], -by)
+            return replace(points, q=q).take(rows[:-1] if by > 0 else rows[1:])
+
+        what = f"column q{i + 1} one row too {low} in the table"
+        yield Reading(what, f"move column q{i + 1} one row {back}", slipped)
     yield of("the rows of joint values in the reverse order", "reverse the order of one of the two", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
@@ -298,7 +317,7 @@ def lost_row(problem: CalibrationProblem) -> Better | None:
         return None
     robot = problem.robot
     points = points.take(np.argsort(points.row))
-    stated = misfit(robot, points.evenly(SOME_ROWS))
+    stated = float(misfits(robot, [points.evenly(SOME_ROWS)])[0])
     if stated <= WRONG:
         return None
     rows = np.arange(len(points.row))
@@ -349,7 +368,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                 "robot.toml; a known direction in the instrument's frame, up for instance, tells which"
             )
         return Better(what, remedy, mapping.nominal, mapping.left)
-    stated = misfit(robot, points)
+    stated = float(misfits(robot, [points])[0])  # with zeros fitted, as of every other reading
     if not np.isfinite(stated):
         return None
     chain, left = _mistakes(robot, points, stated)
@@ -357,7 +376,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         for readings in (_orders, _other_robots):
             if not left < BETTER * stated:
                 chain, left = _best(robot, points, list(readings(robot)))
-    if not left < BETTER * stated:
+    if not left < BETTER * stated or (left > LEFT and not points.seen):
         return None
     return _compared(robot, chain, points, stated, left)
 

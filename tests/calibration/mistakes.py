@@ -102,6 +102,21 @@ def twice(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     return problem.on(ro.Dataset((again,), tuple(f"R{i}" for i in rows), rows))
 
 
+def of_joint(i: int, change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Change the column (N,) of one joint alone."""
+
+    def changed(q: np.ndarray) -> np.ndarray:
+        q[:, 0, i] = change(q[:, 0, i])
+        return q
+
+    return joints(changed)
+
+
+def too_long(y: np.ndarray) -> np.ndarray:
+    """Measure to the surface of a reflector of 19 mm radius, from an instrument at the origin."""
+    return y * (1 + 0.019 / np.linalg.norm(y, axis=1, keepdims=True))
+
+
 def rounded(degrees: float) -> Change:
     step = np.radians(degrees)
     return joints(lambda q: (q / step).round() * step)
@@ -190,6 +205,27 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "two rows exchanged": (rows_exchanged(4, 21), "P5 and P22"),
     "tracker moved by 300 mm": (moved_by(0.3, 0.2), "from row P2"),
     "tracker moved by 1 mm": (moved_by(1e-3), "from row P2"),
+    "joint 5 in radians": (of_joint(4, np.radians), "joint 5 read as radians, not degrees"),
+    "joints in turns": (joints(lambda q: q / 360), "as turns, not degrees"),
+    "column q1 a row too low": (of_joint(0, lambda q: np.roll(q, 1)), "column q1 one row too low"),
+    "joint 5 frozen": (of_joint(4, lambda q: 0 * q + 0.3), "joint 5 has one and the same value in rows P1 to P40"),
+    "joint 2 frozen halfway": (
+        of_joint(1, lambda q: np.where(np.arange(COUNT) < 20, q, q[20])),
+        "joint 2 has one and the same value in rows P21 to P40",
+    ),
+    "signs of joint 3 lost": (of_joint(2, np.abs), "no value of column q3 is negative"),
+    "signs of positions lost": (values(np.abs), "no value of column x, y and z is negative"),
+    "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "columns x and y have the same values"),
+    "z a column of RMS": (values(lambda y: y * [1, 1, 1e-5]), "column z spreads over"),
+    "x sorted alone": (
+        values(lambda y: np.column_stack([np.sort(y[:, 0]), y[:, 1:]])),
+        "column x is in ascending order",
+    ),
+    "distances too long": (values(too_long), "too long"),
+    "joint 2 slipped halfway": (
+        of_joint(1, lambda q: q + 0.014 * (np.arange(COUNT) < 20)),
+        "fit a zero of joint 2 that moved",
+    ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),
 }

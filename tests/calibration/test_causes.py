@@ -16,6 +16,7 @@ from rpim_opt.problem.misreadings import lost_row
 from tests.calibration import mistakes
 from tests.calibration.mistakes import (
     COUNT,
+    IN_TABLES,
     MISTAKES,
     OTHER,
     ROBOTS,
@@ -24,9 +25,11 @@ from tests.calibration.mistakes import (
     exchanged,
     flipped,
     good,
+    joints,
     likely,
     reflectors_exchanged,
     rows_set,
+    shifted,
     simulated_arm,
     validated,
     values,
@@ -42,6 +45,10 @@ QUICK = {
         "joint 6 reversed",
         "three rows of zeros",
         "tracker moved by 1 mm",
+        "joint 5 in radians",
+        "joint 5 frozen",
+        "distances too long",
+        "joint 2 slipped halfway",
     ],
     "irb120": ["joint 3 coupled to 2", "values a row too low", "two rows exchanged", "joints rounded to 0.1 degrees"],
     "iiwa7": [
@@ -153,7 +160,7 @@ def test_inspection_names_the_same(monkeypatch, capsys, tmp_path) -> None:
     assert "mm instead of" in text
 
 
-def made(monkeypatch, folder, problem) -> None:
+def made(monkeypatch, folder, problem, *options: str) -> None:
     """Make the folder ``cell`` from a raw table of what was measured."""
     (block,) = problem.data.blocks
     header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"])
@@ -162,7 +169,8 @@ def made(monkeypatch, folder, problem) -> None:
         for label, q, y in zip(problem.data.label, block.q[:, 0], block.y, strict=True)
     ]
     (folder / "raw.csv").write_text("\n".join([header, *rows]))
-    assert run(monkeypatch, "new", str(folder / "cell"), "--robot", "ur5e", "--data", str(folder / "raw.csv")) == 0
+    table = str(folder / "raw.csv")
+    assert run(monkeypatch, "new", str(folder / "cell"), "--robot", "ur5e", "--data", table, *options) == 0
 
 
 def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
@@ -175,6 +183,50 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
         assert "joints 2 and 3 exchanged" in capsys.readouterr().out
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_zero_that_is_off_by_degrees_is_calibrated(monkeypatch, tmp_path) -> None:
+    """Other readings with zeros fitted are compared with the stated one with zeros fitted."""
+    made(monkeypatch, tmp_path, shifted(2, 5)(simulated_arm("ur5e")))
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 0
+
+
+def test_a_column_that_slipped_is_named_with_rows_held_out(monkeypatch, capsys, tmp_path) -> None:
+    made(monkeypatch, tmp_path, IN_TABLES["column q1 a row too low"][0](simulated_arm("ur5e")), "--hold-out", "0.25")
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
+    assert "column q1 one row too low in the table" in capsys.readouterr().out
+
+
+def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys, tmp_path) -> None:
+    problem = simulated_arm("ur5e")
+    y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
+    made(monkeypatch, tmp_path, values(lambda _: y.round(4))(problem))
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
+    assert "computed from it" in capsys.readouterr().out
+
+
+def test_an_exchanged_reflector_is_no_moved_foot() -> None:
+    """What moves far in the flange and not in the room is on the flange."""
+    problem = simulated_arm("ur5e", markers=2)
+    first, second = (block.y for block in problem.data.blocks)
+    half = np.arange(COUNT)[:, None] < COUNT // 2
+    causes = likely_causes(ro.calibrate(values(lambda _: np.where(half, first, second))(simulated_arm("ur5e"))))
+    assert any("the reflector was exchanged" in text for text in causes), causes
+
+
+def test_stroke_and_roll_exchanged_are_named() -> None:
+    """A SCARA's millimetres and degrees, each in the other's column."""
+    problem = ro.load("scara").problem
+    kinds = problem.robot.joint_dimensions
+    i, j = kinds.index("length"), len(kinds) - 1
+    mm = np.radians(1) / 1e-3
+
+    def change(q: np.ndarray) -> np.ndarray:
+        q[..., i], q[..., j] = q[..., j] / mm, q[..., i] * mm
+        return q
+
+    causes = likely_causes(ro.calibrate(joints(change)(problem)))
+    assert any(f"joints {i + 1} and {j + 1} exchanged" in text for text in causes), causes
 
 
 @pytest.mark.slow
