@@ -471,7 +471,8 @@ def _against(requirement: Requirement, least: float, seen: Checked | None) -> li
             )
     if least > requirement.limit:
         reasons.append(
-            f"The robot's repeatability alone contributes {1e3 * least:.3f} mm at least: no calibration lowers that."
+            f"With this model the robot's repeatability contributes {1e3 * least:.3f} mm at least: only a model that "
+            'explains more of it (model = "auto") or a more repeatable robot lowers that.'
         )
     return reasons
 

@@ -212,5 +212,5 @@ def noise_test(squares: float, freedom: float, learned: bool = False) -> NoiseTe
         if learned:
             cause += ' (noise = "free" estimates it)'
     elif learned:
-        cause = "the difference is the robot's repeatability"
+        cause = "the difference is the robot's repeatability, or an effect that the model lacks"
     return NoiseTest(ratio, probability, f"Residuals are {ratio:.2f} times the stated measurement noise: {cause}.")

@@ -122,9 +122,13 @@ class Uncertainty(Tabled):
             rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
         expanded = f"U, k = {self.coverage_factor:.2f}"
         head = ["parameter", "unit", "value", "u, noise", "u, prior", "u, combined", expanded]
-        lines = [table(head, rows), self.noise_test().verdict, f"Degrees of freedom left: {self.result.freedom:.1f}."]
-        if self.result.held_back:
-            lines.append("* at an active bound: the interval is conditional on it.")
+        lines = [
+            table(head, rows),
+            self.noise_test().verdict,
+            f"Effective degrees of freedom: {self.result.freedom:.1f}.",
+        ]
+        if any(row["held_back"] for row in self._frame_rows()):
+            lines.append("* at an active bound or held by a constraint: the interval is conditional on it.")
         return "\n".join(lines)
 
     def _short(self) -> str:
@@ -141,7 +145,10 @@ class Uncertainty(Tabled):
             unit, si = display(free.dimensions[i])
             row: dict[str, Any] = {"parameter": name, "unit": unit, "value": float(values[i] / si)}
             row |= {"u_noise": float(noise[i] / si), "u_prior": float(prior[i] / si), "u": float(both[i] / si)}
-            row |= {"U": float(self.coverage_factor * both[i] / si), "held_back": name in self.result.held_back}
+            row |= {
+                "U": float(self.coverage_factor * both[i] / si),
+                "held_back": bool(both[i] == 0) or name in self.result.held_back,
+            }
             rows.append(row)
         return rows
 
@@ -188,8 +195,13 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     """
     rng = np.random.default_rng(seed)
     program = result.program
-    level = np.sqrt(result.spread.noise_variance)
     fitted = program.model.A @ result.z
+    if result.linear_penalty:
+        variance = result.spread.noise_variance
+    else:  # no degrees of freedom are known: as many as parameters
+        squares = np.sum((fitted - program.model.b) ** 2)
+        variance = squares / max(len(fitted) - len(result.z), 1)
+    level = np.sqrt(variance)
     found = []
     for _ in range(draws):
         b = fitted + level * rng.normal(size=len(fitted))

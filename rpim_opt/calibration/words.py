@@ -159,7 +159,8 @@ def _one_weight(result: Outcome) -> str:
     if result.selection.groups:
         weights = ", ".join(f"{group} {weight:.4g}" for group, weight in result.selection.groups.items())
         return f"Weights {weights} ({selector(result)}: {result.selection.note}), formulation '{name}'."
-    text = f"Weight {result.weight:.4g} ({selector(result)}: {result.selection.note}), formulation '{name}'."
+    rule = ": ".join(filter(None, [selector(result), result.selection.note]))
+    text = f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."
     return " ".join(filter(None, [text, disagreement(result.program)]))
 
 
@@ -298,7 +299,7 @@ def _model(learned: Learned) -> str:
     supported = [f"{family} {gain:.0f}" for family, gain in gains.items() if gain is not None and gain >= 0.5]
     evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
     if not learned.families:
-        return f"Model: geometry alone; the data support no model extension{evidence}."
+        return f"Model: the data support no extension{evidence}."
     return f"Model: geometry with {joined(learned.families)}{evidence}."
 
 

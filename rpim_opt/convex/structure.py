@@ -407,7 +407,7 @@ class Structure:
         """Return the rows that the loss trusts, of configurations with these norms and numbers of equations (N,)."""
 
         def slope_at(v: Array) -> Array | None:
-            if self.inner:
+            if len(self.answers.loss.expression.variables()) > 1:  # own ones, of whose values the slope depends
                 return None
             size = self.answers.loss.variable.size
             if size < len(v):  # a program of n + 1 rows

@@ -292,7 +292,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         repeatability=repeatability,
         warnings=tuple(text for check in checks for text in check),
         proposals=tuple(proposals),
-        observability=observe(problem),
+        observability=observe(whole),
         contact=tuple(contact_sentences(problem)),
     )
 

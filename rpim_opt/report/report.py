@@ -123,8 +123,6 @@ def _headline(content: Content) -> Iterator[Block]:
     ]
     if content.map is not None:
         largest = content.map.expanded.max()
-        if found is not None and found.bound is not None:
-            largest = found.bound  # its search goes on between the configurations of the map
         sure = percent(content.map.requirement.confidence)
         cards.append(("Expanded uncertainty U", "after", mm(1e3 * largest), f"{sure}, maximum over the region"))
     yield "cards", cards
@@ -210,7 +208,6 @@ def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block
     limit = None
     if result.record.requirement is not None:
         limit = 1e3 * map_.requirement.limit
-        notes.append("The search for the maximum goes on between these configurations, and may end above the map's.")
     else:
         notes.insert(0, map_.sentence())
     yield "text", notes

@@ -108,7 +108,10 @@ def cells(rows: Sequence[Mapping[str, Any]], unit: Unit = "mm") -> list[list[str
 
 
 class Workspace(NamedTuple):
-    """Region, configurations (N, dof), and expanded uncertainty (N,) [m] of the position reached at each."""
+    """Region, configurations (N, dof), and expanded uncertainty (N,) [m] of the position reached at each.
+
+    The last configuration is the worst that a search from the worst of the others found, as in `accept`.
+    """
 
     region: Region
     q: Array
@@ -119,8 +122,8 @@ class Workspace(NamedTuple):
         """Return its maximum and median in a sentence."""
         return (
             f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
-            f"{mm(1e3 * self.expanded.max())} mm, median {mm(1e3 * float(np.median(self.expanded)))} mm, over "
-            f"{len(self.q)} configurations of the region ({self.requirement.where})."
+            f"{mm(1e3 * self.expanded.max())} mm (worst of {len(self.q) - 1} configurations and a search from there), "
+            f"median {mm(1e3 * float(np.median(self.expanded)))} mm; region: {self.requirement.where}."
         )
 
 
@@ -131,13 +134,18 @@ def workspace(result: Calibration) -> Workspace | None:
     requirement = result.record.requirement or ANYWHERE
     try:
         region = region_of(result, requirement)
+
+        def bound(q: Array) -> Array:
+            return reaching(result, region, q, requirement.confidence)[1]
+
         q = region.drawn()
-        expanded = reaching(result, region, q, requirement.confidence)[1]
+        expanded = bound(q)
+        if not np.isfinite(expanded).all():
+            return None
+        q = np.vstack([q, region.largest(q, expanded, bound)])
+        return Workspace(region, q, np.append(expanded, bound(q[-1:])), requirement)
     except InputError:
         return None
-    if not np.isfinite(expanded).all():
-        return None
-    return Workspace(region, q, expanded, requirement)
 
 
 def acceptance(result: Calibration) -> Acceptance | None:
@@ -244,7 +252,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
     accepted = acceptance(result)
-    uncertainty = workspace(result) if accepted is None else None  # whose search ends above the drawn maximum
+    uncertainty = workspace(result) if accepted is None else None  # an acceptance test states it, too
     remarks = [
         *([] if uncertainty is None else [uncertainty.sentence()]),
         *words.weight_lines(result),

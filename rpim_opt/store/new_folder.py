@@ -26,7 +26,7 @@ from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
-from rpim_opt.robot.kinematics import FRAME, FRAME_DIMENSION, forward_kinematics, numeric_frame
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import RobotSource, find_source, read_arm
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.store.raw import Understanding, understand_of
@@ -359,9 +359,9 @@ def _patterns(names: Sequence[str], dof: int) -> list[str]:
 
 def _frame(place: Array) -> str:
     lines = []
-    for name, value in zip(FRAME, place, strict=True):
-        unit, (number,) = exact(FRAME_DIMENSION[name], [value])
-        lines.append(f"{name}_{unit} = {number + 0.0!r}")
+    for dimension, part in (("length", slice(3)), ("angle", slice(3, 6))):
+        unit, numbers = exact(dimension, place[part])
+        lines += [f"{name}_{unit} = {number + 0.0!r}" for name, number in zip(FRAME[part], numbers, strict=True)]
     return "\n".join(lines)
 
 

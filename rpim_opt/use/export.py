@@ -18,9 +18,11 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
+from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.formulation import Formulation
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
@@ -171,7 +173,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     """
     if result.learned is None or not result.learned.added:
         return result, []
-    alone = replace(calibrate(result.stated, result.formulation), record=result.record)
+    alone = replace(_without_extensions(result, result.learned.added), record=result.record)
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
@@ -180,6 +182,19 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
     )
     return alone, [said]
+
+
+def _without_extensions(result: Calibration, added: Sequence[str]) -> Calibration:
+    """Calibrate the geometry; beside a prior of earlier results with that prior's rows, extensions at zero."""
+    form = result.program.penalty_form
+    if not result.record.earlier or form is None:
+        return calibrate(result.stated, result.formulation)
+    free = np.array(result.problem.parameters.free.names)
+    kept = ~np.isin(free, added)
+    none = [0.0] * int(kept.sum())
+    penalty = prior_penalty(None, none, none, form.matrix[:, kept], form.c, None)
+    problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[kept]))
+    return calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:

@@ -102,3 +102,25 @@ def test_commands_are_corrected_for_curves(rippled):
 def test_an_arm_without_ripple_gets_no_curves():
     problem, _ = measured(0.0, 60, seed=1)
     assert "transmission error" not in ro.calibrate(problem, model="auto").learned.families
+
+
+def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
+    """The prior of the update knows the curves' coefficients, which no file of a robot holds."""
+    result, others = rippled
+    updated = ro.use.update(result, others).result
+    alone, notes = ro.use.geometry_alone(updated)
+    assert notes
+    assert len(alone.x) == len(result.stated.parameters.free)
+    fitted = ro.calibrate(result.stated.on(ro.Dataset.together([result.problem.data, others], ["first", "then"])))
+    assert rms(alone.errors(others)) < 1.05 * rms(fitted.errors(others))  # both measurements without curves
+    ro.use.export_files(updated, mdh=tmp_path / "robot.toml")
+    text = (tmp_path / "robot.toml").read_text()
+    assert "alpha_rad" in text
+    assert "_deg" not in text.replace("limits_deg", "")
+
+
+@pytest.mark.parametrize("noise", ["level", "declared"])
+def test_curves_stand_beside_any_noise(noise):
+    problem, _ = measured(SIZE, configurations=80)
+    result = ro.calibrate(problem, noise=noise, model="auto")
+    assert "transmission error" in result.learned.families

@@ -131,7 +131,7 @@ def test_a_scatter_that_is_known_rejects_what_no_calibration_can_keep() -> None:
     problem, _ = simulated(noise=5e-4)  # ten times what the instrument has
     found = accept(ro.calibrate(problem), Requirement(2e-4))
     assert found.verdict == "rejected"
-    assert "repeatability alone" in found.reasons[0]
+    assert "the robot's repeatability contributes" in found.reasons[0]
     assert found.scatter > 2e-4
 
 

@@ -192,7 +192,7 @@ def test_families_are_compared_with_the_best_model_without_them() -> None:
     assert found.gain("compliance") is None
     assert said(found) == ["Model: geometry with gravity (-2 ln L falls by gravity 30)."]
     alone = learned(trials=(Trial((), 40.0), Trial(("gravity",), 40.2)))
-    assert said(alone) == ["Model: geometry alone; the data support no model extension."]
+    assert said(alone) == ["Model: the data support no extension."]
 
 
 @pytest.mark.parametrize(("count", "more"), [(1, ""), (5, ""), (7, " and 2 more")])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -71,3 +72,27 @@ def test_a_robust_fit_is_as_certain_as_one_of_the_rows_it_trusts() -> None:
     clean = ro.calibration.Uncertainty(ro.calibrate(robust.result.without_flagged().problem, ro.tikhonov, 1.0))
     q = instance.problem.data.q[:20]
     assert robust.predict(q).expanded == pytest.approx(clean.predict(q).expanded, rel=0.25)
+
+
+def test_monte_carlo_serves_losses_and_penalties_without_a_covariance() -> None:
+    problem = ro.load("position").problem
+    result = ro.calibrate(problem, ro.Formulation("L1", loss=cp.norm1, penalty=cp.norm1), weight=1.0)
+    spread = ro.calibration.monte_carlo(result, draws=40).std(axis=0)
+    squares = ro.calibration.monte_carlo(ro.calibrate(problem, ro.tikhonov, weight=1.0), draws=40).std(axis=0)
+    moved = spread > 0.3 * squares  # the others rest at zero
+    assert 0.7 < np.median(spread[moved] / squares[moved]) < 1.8  # 1.25 with normal noise and no penalty
+
+
+def test_what_a_constraint_of_a_script_holds_is_marked() -> None:
+    problem = ro.load("position").problem
+    fixed = ro.Formulation("a2", penalty=cp.sum_squares, constraints=(lambda z, p: p.x["a2"] == 1e-4,))
+    assert "a2 *" in ro.calibration.Uncertainty(ro.calibrate(problem, fixed, weight=1.0)).budget()
+
+
+def test_rules_serve_an_own_variable_in_the_penalty_beside_any_loss() -> None:
+    problem = ro.load("position").problem
+    slack = cp.Variable(nonneg=True)
+    own = ro.Formulation(
+        "slack", cp.norm1, lambda z: cp.norm1(z) + 10 * slack, (lambda z, p: cp.abs(p.x["a2"]) <= 3e-4 + 1e-3 * slack,)
+    )
+    assert ro.calibrate(problem, own, weight=ro.l_curve).converged

@@ -190,3 +190,13 @@ def test_where_some_markers_do_not_tell_the_base_all_are_asked(monkeypatch: pyte
     monkeypatch.setattr(located, "MOST_PLACING", 2)
     some = locate(ARM, data, tools)
     assert np.array_equal(some.base, whole.base)
+
+
+def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:
+    """Else errors and identifiable combinations would be those of a reflector in the flange."""
+    arm = ro.load("position").problem
+    problem = ro.problem_from(arm.robot, arm.data)
+    result = ro.calibrate(problem)
+    assert np.array_equal(result.problem.parameters.nominal, problem.parameters.nominal)
+    assert np.array_equal(problem.errors(result.x), result.errors())
+    assert ro.problem.inspect(arm).observability.rank == ro.problem.observe(arm).rank

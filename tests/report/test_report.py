@@ -317,7 +317,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
     assert "The maximum U is at joints" in words
-    assert words.count("mm, above the limit") == (0 if verdict == "Accepted" else words.count("From above") * 2)
+    assert ("mm, above the limit" in words) == (verdict != "Accepted")
 
 
 def test_no_verdict_where_nothing_is_demanded(arm) -> None:

@@ -134,8 +134,8 @@ def _by_key(
             raise InputError(f"the key {how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
     rows = [i for i, name in enumerate(right) if name in place]
     if not rows:
-        found = f"none that {moving[0].file} and {seen[0].file} share"
-        accepted = "--key with a column that both have, --key row, or --time-tolerance for the nearest time"
+        found = f"no value that {moving[0].file} and {seen[0].file} share"
+        accepted = "--key with a column whose values both have, --key row, or --time-tolerance for the nearest time"
         raise InputError(f"the key {how}", found, accepted)
     names = [right[i] for i in rows]
     notes = [f"joined by {how}: {len(rows)} rows of {len(left)} with joints and {len(right)} measured."]
@@ -199,10 +199,11 @@ def _by_time(
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     there = _times(moving, key)
     then = _times(seen, key)
-    left, right, apart = partners(there, then, within)
+    rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # of times since 1970, half a microsecond
+    left, right, apart = partners(there, then, within + rounding)
     if not len(left):
         nearest = float(np.abs(there - then[0]).min())
-        found = f"no two within {within:g} s; the first measured row is {nearest:.4g} s from the nearest with joints"
+        found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from the nearest with joints"
         raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
     notes = [
         f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "

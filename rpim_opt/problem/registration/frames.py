@@ -265,7 +265,8 @@ def problem_from(
         (6,) start of the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx;
         ``"auto"`` registers it.
     tool
-        (6,) start of the reflector in the flange frame; where it is not stated, that of the URDF, or the flange.
+        (6,) start of the reflector in the frame behind the last joint's modified-DH row; where it is not stated, that
+        of the URDF's tip, or zero. A start that the data contradict is replaced by its registration.
 
     Raises
     ------
@@ -288,7 +289,9 @@ def problem_from(
     start = np.zeros(6) if tool is None else np.asarray(tool, dtype=float)
     placed = None if isinstance(base, str) else np.asarray(base, dtype=float)
     parameters = starting_parameters(robot, data, placed, {"": start})
-    return CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
+    problem = CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
+    found = relocated(problem)
+    return found if isinstance(found, CalibrationProblem) else problem
 
 
 def starting_parameters(

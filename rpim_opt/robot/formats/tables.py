@@ -363,7 +363,7 @@ def _content(robot: Robot) -> dict[str, Any]:
         content["source"] = robot.source
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
-    joints = [_keys(robot, i) for i in range(n)]
+    joints = [_keys(robot, i, _in_si(robot)) for i in range(n)]
     for joint, sign in zip(joints, signs, strict=False):
         if plain and sign < 0:
             joint["sign"] = -1
@@ -376,7 +376,13 @@ def _content(robot: Robot) -> dict[str, Any]:
     return content | {"joint": joints}
 
 
-def _keys(robot: Robot, i: int, in_si: bool = False) -> dict[str, Any]:
+def _in_si(robot: Robot) -> bool:
+    """Whether the numbers of a table are written in m and rad, all of them: some would not read back the same."""
+    columns = zip(MDH, robot.mdh.T, strict=True)
+    return any(exact(MDH_DIMENSION[column], values)[0] == SI[MDH_DIMENSION[column]] for column, values in columns)
+
+
+def _keys(robot: Robot, i: int, in_si: bool) -> dict[str, Any]:
     """Return the keys of a ``[[joint]]``, but for its sign; all in SI if wanted."""
     joint: dict[str, Any] = {}
     for column, value in zip(MDH, robot.mdh[i], strict=True):
@@ -425,10 +431,10 @@ def _csv(robot: Robot, content: dict[str, Any], path: Path) -> str:
     for key, what in WITHOUT_COLUMN.items():
         if key in content:
             raise InputError("robot", what, "a name ending in .toml or .json", path)
-    units = {column: exact(MDH_DIMENSION[column], values)[0] for column, values in zip(MDH, robot.mdh.T, strict=True)}
-    in_si = any(unit != display(MDH_DIMENSION[column])[0] for column, unit in units.items())  # all numbers or none
+    in_si = _in_si(robot)
     rows = [_cells(_keys(robot, i, in_si) | {"sign": joint.get("sign", 1)}) for i, joint in enumerate(content["joint"])]
-    header = [f"{column}_{SI[MDH_DIMENSION[column]] if in_si else units[column]}" for column in MDH]
+    units = {column: SI[kind] if in_si else display(kind)[0] for column, kind in MDH_DIMENSION.items()}
+    header = [f"{column}_{unit}" for column, unit in units.items()]
     signs = {"sign"} if all(row["sign"] == 1 for row in rows) else set()
     header += sorted({key for row in rows for key in row} - set(header) - signs)
     table = ([*(row.get(key, 0.0 if key in header[:5] else "") for key in header), "modified"] for row in rows)
