@@ -228,7 +228,7 @@ class Estimator:
         if not (np.isfinite(J).all() and np.isfinite(y).all()):
             raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
         unit = free.scale * stated.scale
-        stacks = problem.stacks(at=parameter_values(problem, x))
+        stacks = problem.stacks(joints="joint" in self.noise, at=parameter_values(problem, x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
         heavy = np.isin(np.arange(len(stated.names)), stated.group[stated.heavy])
         base = np.array([name == BASE for name in stated.names], dtype=bool)

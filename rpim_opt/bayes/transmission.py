@@ -143,7 +143,8 @@ def _most_likely(
     """Return the optimum of curves and noise, those curves and their columns (m, c); None where no joint turned."""
     problem, data = models.whole, models.columns.data
     slopes = np.zeros((len(data.y), len(problem.robot.joint_types)))
-    for stack in data.stacks:
+    by_joints = "joint" in models.columns.noise
+    for stack in data.stacks if by_joints else problem.stacks():  # other noise needs no slopes by joints
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]
     size = np.log(CURVES["transmission size"][0])
