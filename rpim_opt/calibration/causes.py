@@ -20,6 +20,7 @@ from rpim_opt.problem.diagnosis import (
     moved,
     moved_far,
     odd_columns,
+    part_way,
     rounded_joints,
     rows_without_values,
     shared_rows,
@@ -76,9 +77,10 @@ def likely_causes(result: Outcome) -> list[str]:
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     kept = kept_rows(result)
-    errors, pixels = (np.where(kept, problem.errors(result.x, of), np.nan) for of in ("length", "pixel"))
-    ratios = noise_ratio(problem, errors), noise_ratio(problem, pixels, "pixel")
-    figures = f"{three_digits(1e3 * rms(errors))} mm", f"{three_digits(rms(pixels))} px"
+    kinds = {"length": (1e3, "mm"), "angle": (1e3, "mrad"), "pixel": (1.0, "px")}
+    errors = {kind: np.where(kept, problem.errors(result.x, kind), np.nan) for kind in kinds}
+    ratios = [noise_ratio(problem, each, kind) for kind, each in errors.items()]
+    figures = [f"{three_digits(size * rms(errors[kind]))} {unit}" for kind, (size, unit) in kinds.items()]
     signs = [
         f"residual RMS {figure}, {three_digits(ratio)} times the stated noise"
         for figure, ratio in zip(figures, ratios, strict=True)
@@ -111,7 +113,7 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
     found = found or list(transmission(problem, result.x))
     found = found or list(rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)])))
-    return found or list(odd_columns(problem))
+    return found or list(part_way(ordered)) or list(odd_columns(problem))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

@@ -576,6 +576,21 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
         )
 
 
+def part_way(problem: CalibrationProblem) -> Iterator[str]:
+    """Say from which row on, roughly, the table is to be read in another way; the rows before fit as they stand."""
+    points = points_of(problem)
+    if points is None or len(points.row) < 2 * FEWEST:
+        return
+    rows = np.arange(len(points.row))
+    whole = misfit(problem.robot, points)
+    fitting = [k for k in _places(len(rows)) if misfit(problem.robot, points.take(rows[:k])) < FITS * whole]
+    if not fitting:
+        return
+    better = better_reading(problem.on(problem.data.take(points.row[max(fitting) :])))
+    if better is not None:
+        yield f"from about row {problem.data.label[points.row[max(fitting)]]} on {better.sentence}"
+
+
 def _places(count: int) -> list[int]:
     """Return before which rows a table may be parted."""
     return np.unique(np.linspace(FEWEST, count - FEWEST, 40).round().astype(int)).tolist()

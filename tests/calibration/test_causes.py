@@ -214,6 +214,22 @@ def test_an_exchanged_reflector_is_no_moved_foot() -> None:
     assert any("the reflector was exchanged" in text for text in causes), causes
 
 
+def test_another_unit_from_halfway_on_is_named() -> None:
+    half = np.arange(COUNT) < COUNT // 2
+    wrong = joints(lambda q: np.where(half[:, None, None], q, np.radians(q)))(simulated_arm("ur5e"))
+    causes = likely_causes(ro.calibrate(wrong))
+    assert "from about row P2" in causes[1]
+    assert "as radians, not degrees" in causes[1]
+
+
+def test_misread_orientations_are_named() -> None:
+    """Positions alone may fit well."""
+    problem = ro.load("pose").problem
+    conjugate = values(lambda y: y * [1, 1, 1, 1, -1, -1, -1])(problem)
+    causes = likely_causes(ro.calibrate(conjugate))
+    assert any("the other way round" in text for text in causes), causes
+
+
 def test_stroke_and_roll_exchanged_are_named() -> None:
     """A SCARA's millimetres and degrees, each in the other's column."""
     problem = ro.load("scara").problem
