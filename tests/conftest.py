@@ -31,7 +31,7 @@ DEFAULT = {
     "tests/problem/test_camera.py::test_mistakes_are_found_in_views": ("sign",),
     "tests/problem/test_design.py::test_a_design_is_near_the_best_and_better_than_chance": ("D",),
     "tests/problem/test_derivatives.py::test_no_optimizer_finds_a_lower_objective": ("1.0",),
-    "tests/problem/test_parts.py::test_no_digit_depends_on_the_number_of_cores": ("9000",),
+    "tests/problem/test_blocks.py::test_no_digit_depends_on_the_number_of_cores": ("9000",),
     "tests/bayes/test_groups.py::test_the_most_likely_weights_are_those_of_a_grid": ("0",),
     "tests/study/test_comparison.py::test_intervals_of_other_problems_cover_as_they_say": ("5",),
 }
@@ -42,7 +42,7 @@ LONG = {
         "parameters in the loss, markers",
         "squares and L1 + squares, seven_axis",
     ),
-    "tests/convex/test_constraints_met.py::test_a_constraint_is_met": (
+    "tests/convex/test_cones.py::test_a_constraint_is_met": (
         "matrix inequality, markers, 0.1, squared",
         "matrix inequality, position, 1, Huber",
         "matrix inequality, distance, 0.5, Huber",

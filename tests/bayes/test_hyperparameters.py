@@ -1,4 +1,4 @@
-"""What is learned before a fit: sizes, noise, families, blunders; and that the fit is an ordinary one afterwards."""
+"""Hyperparameters estimated before a fit: scales, noise, model extensions, outliers; the fit is an ordinary one."""
 
 from __future__ import annotations
 

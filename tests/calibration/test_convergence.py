@@ -1,4 +1,4 @@
-"""What a calibration says of itself is so: converged, not converged and why, infeasible and what contradicts what."""
+"""A calibration says whether it converged, why it did not, and which constraints contradict each other."""
 
 from __future__ import annotations
 

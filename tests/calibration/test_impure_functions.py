@@ -1,4 +1,4 @@
-"""What a user's functions say now is solved, not what they said at the last calibration."""
+"""A user's functions are called at every calibration: what they return now is solved."""
 
 from __future__ import annotations
 

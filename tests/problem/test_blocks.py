@@ -1,4 +1,4 @@
-"""Measurements in parts: a source of linear models, whose rows are those of the whole, wherever they are asked for."""
+"""Data in blocks: a source of linear models, whose rows are those of the whole."""
 
 from __future__ import annotations
 

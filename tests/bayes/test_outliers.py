@@ -1,4 +1,4 @@
-"""Who is accused: blunders that hide behind others are, clusters that err together and few good rows are not."""
+"""Outliers: masked ones are excluded; clusters that err together and few good rows are not."""
 
 from __future__ import annotations
 

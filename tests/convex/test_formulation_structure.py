@@ -1,4 +1,4 @@
-"""What is known of a formulation before any data: its structure, its boxes, its norms, and what it sees."""
+"""Structure of a formulation before any data: boxes, norms, residuals or configurations, and parameters."""
 
 from __future__ import annotations
 

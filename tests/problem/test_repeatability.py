@@ -1,4 +1,4 @@
-"""The robot's own scatter: whitening by configuration, through blocks, reflectors, parts and triangles."""
+"""The robot's repeatability: whitening by configuration, through blocks, reflectors and QR factors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Statements in the words of a drawing: what they mean, and what is refused."""
+"""Statements in words: what they mean, and what is refused."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constraints in the words of a drawing: each holds, each at the price that finite differences confirm."""
+"""Constraints stated as on a drawing: each holds, and finite differences confirm its multiplier."""
 
 from __future__ import annotations
 

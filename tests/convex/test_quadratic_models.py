@@ -1,4 +1,4 @@
-"""Squares in the place of a loss: its value and its slope where they are made, above it in the first pass."""
+"""Quadratic models of a loss: its value and slope at the point, and above it in the first iteration."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Constraints of any cone are met and never thrown at the user: seven kinds, eight problems, four radii, two losses."""
+"""Constraints of any cone are met and never raise: seven kinds, eight problems, four radii, two losses."""
 
 from __future__ import annotations
 
