@@ -137,7 +137,7 @@ Type = Annotated[Text, Option(help="Which of the result's measurement types, if 
 Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
 Largest = Annotated[Number, Option(help="Largest error that is allowed [mm]; exit code 1 above.")]
 Box = Annotated[
-    Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the base frame; default: the measured joint ranges.")
+    Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base frame; default: the measured joint ranges.")
 ]
 Marker = Annotated[Text, Option(help="Which reflector, where there are several.")]
 UrdfBase = Annotated[Text, Option(help="Link where the chain starts, if not the root: any link, a camera in the head.")]
@@ -300,6 +300,8 @@ def calibrate(
         say("summing up")
         found = summary(result, instance.published)
     text = describe(result, found)
+    if drop_outliers and not without:
+        text = f"No flagged row to drop: nothing was refitted.\n\n{text}"
     if without:
         text = f"Refitted without {', '.join(without)}.\n\n{text}"
     if profile:
@@ -344,6 +346,9 @@ def validate(
     as_json: Json = False,
 ) -> None:
     """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named.
+
+    In the table of --out, sigmas is a row's error over its predicted standard deviation, and allowed_sigmas what the
+    largest of all these rows exceeds with probability 0.01.
 
     Exit code 1 if an error is above the limit, the errors are larger than the nominal robot's, or a mistake in the
     measurements is likely.
@@ -483,10 +488,14 @@ def export(
     result: Result,
     urdf: Annotated[File, Option(help="URDF of the nominal robot; corrected origins go to --out.")] = None,
     ur_kinematics: Annotated[File, Option(help="kinematics.yaml of ROS for a Universal Robot, likewise.")] = None,
-    ur_calibration: Annotated[File, Option(help="calibration.conf of a Universal Robot; corrected to --out.")] = None,
+    ur_calibration: Annotated[
+        File, Option(help="calibration.conf copied from a Universal Robot's controller; likewise.")
+    ] = None,
     mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
-    corrections: Annotated[File, Option(help="CSV file to write with the joints' transmission errors.")] = None,
+    corrections: Annotated[
+        File, Option(help="CSV file for the joints' transmission errors: subtract from commands.")
+    ] = None,
     out: Annotated[File, Option(help="File to write; of several sources the folder for them.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
@@ -577,31 +586,41 @@ def design(
     table: Annotated[File, Option(help="A table of candidates instead: q1_deg, ...")] = None,
     point: Annotated[Text, Option(help="For a robot that touches points: x,y,z [mm] of one in its base frame.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
-    augment: Annotated[bool, Option("--augment", help="Choose in addition to the measured configurations.")] = False,
+    augment: Annotated[bool, Option("--augment", help="Add to the measured ones, within their joint ranges.")] = False,
     out: Table = None,
     allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Choose the configurations to measure next, from candidates, by optimal design."""
     with console.progress() as say:
-        from rpim_opt.basics.tables import csv_text
+        from rpim_opt.basics.tables import csv_text, read_columns
+        from rpim_opt.calibration.diagnosis import measured_ranges
         from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
         from rpim_opt.problem.workspace import postures_at, touched_place
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         posed = load(problem).problem
+        where = ""
         if table is not None:
             q = read_candidates(table, posed.robot)
         elif posed.data.blocks[0].measurement.touching:
             q = postures_at(posed, touched_place(posed, point)[None].repeat(candidates, 0), seed)
         else:
-            q = random_candidates(posed.robot, candidates, seed)
+            limits = posed.robot.limits
+            if augment:
+                limits = measured_ranges(posed)[posed.data.blocks[0].robot].T
+                where = "\nThe candidates lie in the measured joint ranges (others: --table)."
+            q = random_candidates(replace(posed.robot, limits=limits), candidates, seed)
         found = choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
     columns = joint_cells(posed.robot, q[found.chosen], found.chosen)
+    if table is not None:
+        label = read_columns(table).get("label")
+        if label is not None:
+            columns["label"] = [str(label[k]) for k in found.chosen]
     text = csv_text(columns, zip(*columns.values(), strict=True))
     document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap}
-    _answer_with_table(found, text, out, {**document, "configurations": columns}, as_json)
+    _answer_with_table(f"{found}{where}", text, out, {**document, "configurations": columns}, as_json)
 
 
 @app.command()

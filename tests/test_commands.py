@@ -315,6 +315,7 @@ def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, 
     assert run(monkeypatch, *arguments) == 0
     said = capsys.readouterr().out
     assert "intervals: 8 (" in said
+    assert "Largest error: row 8, 0." in said
     assert "left out: temperature." in said
 
 
@@ -397,6 +398,8 @@ def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
     assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", str(tmp_path / "calibration.conf"),
                "--out", str(tmp_path / "new.conf")) == 0  # fmt: skip
     assert "alpha1 and a1" in capsys.readouterr().out
+    assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", "none.conf", "--out", "new.conf") == 2
+    assert "copied from its controller" in capsys.readouterr().err
     read, q = (
         ro.robot.read_ur_calibration(tmp_path / "new.conf", nominal),
         np.random.default_rng(0).uniform(-2, 2, (9, 6)),

@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 from typing import Any
 
+import numpy as np
 import pytest
 
+import rpim_opt as ro
 from tests.test_cli import run
 
 
@@ -25,6 +27,27 @@ def test_what_is_measured_already_counts_in_a_design(monkeypatch: pytest.MonkeyP
         assert run(monkeypatch, *asked, *more) == 0
         values.append(json.loads(capsys.readouterr().out))
     assert values[0] != values[1]
+    q = np.degrees(ro.load("position").problem.data.q)
+    new = np.column_stack([np.array(values[1]["configurations"][f"q{i}_deg"], dtype=float) for i in range(1, 7)])
+    assert (new >= q.min(axis=0) - 1e-3).all()
+    assert (new <= q.max(axis=0) + 1e-3).all()
+
+
+def test_a_table_of_candidates_keeps_its_labels(monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any) -> None:
+    lines = ["label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg"]
+    lines += [f"M{k},{10 * k},-{5 * k},{7 * k},{k * k},{30 - k},{3 * k}" for k in range(12)]
+    (tmp_path / "rows.csv").write_text("\n".join(lines))
+    assert run(monkeypatch, "design", "position", "--count", "3", "--table", str(tmp_path / "rows.csv"), "--json") == 0
+    chosen = json.loads(capsys.readouterr().out)["configurations"]
+    assert all(float(q) == 10 * int(label[1:]) for label, q in zip(chosen["label"], chosen["q1_deg"], strict=True))
+
+
+@pytest.mark.parametrize("name", ["UR-10", "Universal Robots UR10"])
+def test_a_robots_trade_name_leads_to_its_own(monkeypatch: pytest.MonkeyPatch, capsys: Any, name: str) -> None:
+    assert run(monkeypatch, "new", "cell", "--robot", name, "--data", "rows.csv") == 2
+    said = capsys.readouterr().err
+    assert "(rpim-opt robots)" in said
+    assert "did you mean ur10 " in said
 
 
 def test_touches_are_designed_at_a_point(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:

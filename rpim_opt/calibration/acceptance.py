@@ -84,7 +84,8 @@ class Region:
                 break
         found = np.concatenate(kept)[:ENOUGH]
         if not len(found):
-            raise InputError("the box", "no configuration of the joint ranges that reaches into it", "one within reach")
+            accepted = "one within reach, in the robot's base frame (not the instrument's)"
+            raise InputError("the box", "no configuration of the joint ranges that reaches into it", accepted)
         return found
 
     def largest(self, q: Array, value: Array, figure: Callable[[Array], Array]) -> Array:
@@ -163,6 +164,8 @@ class Checked:
     ----------
     count, largest
         How many rows measure a length in the region, and the largest error of these [m].
+    instrument
+        The largest part of an error that the instrument may have added to it, with the required confidence [m].
     missing
         Labels of those that miss by more than the limit and what the instrument may add to it.
     rows
@@ -175,6 +178,7 @@ class Checked:
 
     count: int
     largest: float
+    instrument: float
     missing: tuple[str, ...]
     rows: int
     beyond: tuple[str, ...]
@@ -185,10 +189,18 @@ class Checked:
         if not self.count:
             return f"None of the {self.rows} held-out rows is in the region."
         text = f"Held out: {self.rows} rows, {self.count} of them in the region, the largest error there "
-        text += f"{1e3 * self.largest:.3f} mm as the instrument reads it"
+        text += f"{1e3 * self.largest:.3f} mm, of which the instrument may account for {1e3 * self.instrument:.3f} mm"
         if self.coverage is not None:
             text += f"; {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals"
+            text += f" (at least {100 * self.least_coverage:.0f} % are required of so many rows)"
         return f"{text}."
+
+    @property
+    def least_coverage(self) -> float:
+        """Share of lengths in their intervals below which so many rows do not bear these out."""
+        # coordinates of a row are not independent of each other: a row counts once
+        unlikely = bdtr(np.arange(self.rows + 1), self.rows, CONFIDENCE) < UNLIKELY
+        return float(np.sum(unlikely)) / self.rows
 
     def lacking(self) -> list[str]:
         """Return why the rows do not bear the intervals out, a sentence each."""
@@ -200,8 +212,7 @@ class Checked:
                 f"Lacking: valid prediction intervals. Rows outside theirs: "
                 f"{listed(list(self.beyond), MOST)}. Measure again, or find what the model lacks."
             )
-        # coordinates of a row are not independent of each other: a row counts once
-        if self.coverage is not None and bdtr(np.floor(self.coverage * self.rows), self.rows, CONFIDENCE) < UNLIKELY:
+        if self.coverage is not None and self.coverage < self.least_coverage:
             lines.append(
                 f"Lacking: valid prediction intervals. Only {100 * self.coverage:.0f} % of the coordinates lie in "
                 "their 95 % intervals."
@@ -411,6 +422,7 @@ def checked(result: Calibration, region: Region, requirement: Requirement, data:
     return Checked(
         count=int(inside.sum()),
         largest=float(error[inside].max(initial=0.0)),
+        instrument=float(instrument[inside].max(initial=0.0)),
         missing=tuple(apart.label[i] for i in missing),
         rows=len(apart),
         beyond=tuple(apart.label[i] for i in beyond),

@@ -87,7 +87,11 @@ def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
                 break
         found = np.concatenate(inside)[:ALL]
         if len(found) == 0:
-            raise InputError("box", "no configuration of the joint ranges that reaches into it", "a box within reach")
+            raise InputError(
+                "box",
+                "no configuration of the joint ranges that reaches into it",
+                "a box within reach, in the base frame",
+            )
         if len(_FOUND) >= SOME:
             _FOUND.clear()
         _FOUND[key] = found

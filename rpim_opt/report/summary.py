@@ -9,7 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import joined, percent, table
+from rpim_opt.basics.text import counted, joined, listed, percent, table
 from rpim_opt.calibration import words
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -213,6 +213,9 @@ def identifiability(result: Calibration) -> str:
 def warnings(result: Calibration) -> list[str]:
     """Return what a reader must know besides the figures, the worst first."""
     lines = [line for line in words.remarks(result) if line != result.message]
+    excluded = result.record.excluded
+    if excluded:
+        lines.append(f"Excluded before the fit: {counted(len(excluded), 'row')}, {listed(list(excluded))}.")
     validation = result.record.validation
     if validation is not None:
         lines += words.known_points(result.problem.sample(), validation)

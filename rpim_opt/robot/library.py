@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import NamedTuple
 
@@ -45,7 +46,9 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     refused = REFUSED.get(Path(name).suffix.lower())
     if refused:
         raise InputError("key robot", f"'{name}', {refused}", accepted, file)
-    raise InputError("key robot", f"'{name}'", f"{accepted}, or a ready robot: {choices(name, ready)}", file)
+    plain = re.sub(r"[^a-z0-9]", "", (name.split() or [""])[-1].lower())  # UR-10, Universal Robots UR10
+    accepted = f"{accepted}, or a ready robot (rpim-opt robots): {choices(plain, ready)}"
+    raise InputError("key robot", f"'{name}'", accepted, file)
 
 
 def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "") -> Described:

@@ -20,9 +20,11 @@ from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.bayes.transmission import series
+from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
@@ -105,7 +107,8 @@ def export_files(
         Files to write: MDH parameters (.csv, .json, .toml), RoboDK's four numbers a joint (.csv).
     corrections
         CSV file to write with the transmission errors of the calibration as a whole, ``joint``, ``angle_deg`` (of the
-        model), ``correction_mrad``, ``std_mrad``: a joint stands at its angle plus the correction.
+        model), ``correction_mrad``, ``std_mrad``: a joint stands at its angle plus the correction, so that it is
+        subtracted from a command. They belong to the geometry of the whole model, which no other file holds.
     marker
         The reflector that is the tip.
     despite_verdict
@@ -155,6 +158,18 @@ def export_files(
         accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, --corrections, one or several"
         raise InputError("export", "nothing to write", accepted)
     said = write_all(writers, note)
+    requirement = whole.record.requirement
+    if result is not whole:
+        region = requirement or Requirement(limit=1.0)
+        bound = accept(result, region).bound
+        if bound is not None:
+            what = "Expanded uncertainty of the position that a robot of that geometry reaches"
+            notes.append(f"{what}: U = {1e3 * bound:.3f} mm at most; region: {region.where}.")
+    if requirement is not None:
+        verdict = accept(whole)
+        notes.append(
+            " ".join(["Acceptance of the calibration, whole model:", verdict.sentences()[0], *verdict.reasons])
+        )
     return [target for target, _ in writers], [*filter(None, [note]), *notes, *said]
 
 
@@ -218,7 +233,11 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
         rows = zip(np.degrees(q), correction, std, strict=True)
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
     write_text(target, "\n".join(lines) + "\n")
-    return [f"Transmission errors (RMS, mrad): {joined(sizes)}. They belong to the geometry of this result."]
+    return [
+        f"Transmission errors (RMS, mrad): {joined(sizes)}. A joint stands at angle_deg plus the correction: subtract "
+        "it from a command. The corrections belong to the geometry of the whole model (`compensate` uses both), not to "
+        "that of other exported files."
+    ]
 
 
 def export_urdf(

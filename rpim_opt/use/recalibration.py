@@ -56,7 +56,7 @@ SHOWN = 5
 
 
 class Fit(NamedTuple):
-    """Chi-squared of readings about what a prior predicts of them, over how many equations, and its probability."""
+    """Chi-squared of readings about what a prior predicts of them, over how many equations, and its p-value."""
 
     squares: float
     equations: int
@@ -69,7 +69,7 @@ class Fit(NamedTuple):
 
     def __str__(self) -> str:
         """Return the figures."""
-        return f"chi-squared {self.squares:.1f} of {self.equations}, probability {self.probability:.2g}"
+        return f"chi-squared {self.squares:.1f} of {self.equations}, p-value {self.probability:.2g}"
 
 
 class Cause(NamedTuple):
@@ -171,7 +171,7 @@ class Update:
             lines = [f"{count} lie outside the prediction intervals of the last calibration: {self.before}."]
         for cause in self.changes:
             end = ", left out" if cause.kind == "reading" else ""
-            figures = f"chi-squared falls by {cause.gain:.1f}, probability {cause.probability:.2g}"
+            figures = f"chi-squared falls by {cause.gain:.1f}, posterior probability {cause.probability:.2g}"
             lines.append(f"  {cause.kind} {cause.name}: {figures}{end}.")
         if self.moved:
             lines.append(f"Moved since: {joined([str(each) for each in self.moved])}.")
@@ -186,7 +186,7 @@ class Update:
                 "robot; if so, calibrate it without the previous result."
             )
         rows = [[c.name, c.kind, f"{c.gain:.1f}", f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
-        head = ["may have changed", "kind", "chi-squared falls by", "p-value", "probability"]
+        head = ["may have changed", "kind", "chi-squared falls by", "p-value", "posterior"]
         return "\n".join([*lines, "", table(head, rows[:SHOWN]), "", self.result.message])
 
 
@@ -231,7 +231,7 @@ def update(
     >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
     >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40)))
     >>> print(str(found).splitlines()[0])
-    The robot has not changed, as far as 8 readings can tell: chi-squared 25.9 of 24, probability 0.37.
+    The robot has not changed, as far as 8 readings can tell: chi-squared 25.9 of 24, p-value 0.37.
     >>> [earlier.title for earlier in found.result.record.earlier], found.changes
     (['ABB IRB 120-3/0.58'], ())
     """

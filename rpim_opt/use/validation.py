@@ -123,7 +123,10 @@ class Validation:
         if self.touched:
             tables.append(table(HEADER, scatter_rows(self.touched)))
         worse = [worse_sentence(self.nominal, self.error)] if self.worse else []
-        sentences = [*worse, self._judgement(), *self.outside.sentences(), *self.remarks, self.mistake]
+        largest = ""
+        if np.isfinite(self.error).any():
+            largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
+        sentences = [*worse, largest, self._judgement(), *self.outside.sentences(), *self.remarks, self.mistake]
         return "\n".join([*tables, *filter(None, sentences)])
 
     def _judgement(self) -> str:

@@ -99,7 +99,7 @@ def test_a_region_is_where_it_says_and_its_largest_bound_is_searched_for(result)
 
 
 def test_what_no_region_can_be_is_refused(result) -> None:
-    with pytest.raises(ro.InputError, match="within reach"):
+    with pytest.raises(ro.InputError, match="within reach, in the robot's base frame"):
         accept(result, Requirement(1e-4, box=((9.0, 9.1), (0.0, 1.0), (0.0, 1.0))))
     with pytest.raises(ro.InputError, match="joint 9"):
         accept(result, Requirement(1e-4, joints=((9, (0.0, 1.0)),)))

@@ -36,21 +36,22 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     assert "The position reached" not in str(free)
     assert free.content()["bound_mm"] is None
     assert free.content()["typical_mm"] == pytest.approx(0.05)
-    seen = Checked(3, 8e-5, (), 4, (), 0.9)
+    seen = Checked(3, 8e-5, 2e-5, (), 4, (), 0.9)
     whole = Acceptance(LIMIT, "accepted", (), 500, 9e-5, 5e-5, 2e-5, checked=seen)
     assert whole.sentences()[2:] == [
         "Expanded uncertainty of the position reached: U = 0.090 mm at most (worst of 500 configurations and a search "
         "from there), median 0.050 mm.",
-        "Held out: 4 rows, 3 of them in the region, the largest error there 0.080 mm as the instrument reads it; "
-        "90 % of the coordinates lie in their 95 % intervals.",
+        "Held out: 4 rows, 3 of them in the region, the largest error there 0.080 mm, of which the "
+        "instrument may account for 0.020 mm; 90 % of the coordinates lie in their 95 % intervals (at least 50 % are "
+        "required of so many rows).",
     ]
 
 
 def test_rows_that_were_kept_apart_may_say_little() -> None:
-    none = Checked(0, 0.0, (), 4, (), None)
+    none = Checked(0, 0.0, 0.0, (), 4, (), None)
     assert none.sentence() == "None of the 4 held-out rows is in the region."
-    unknown = Checked(2, 1e-4, (), 4, (), None)
-    assert unknown.sentence().endswith("0.100 mm as the instrument reads it.")
+    unknown = Checked(2, 1e-4, 3e-5, (), 4, (), None)
+    assert unknown.sentence().endswith("0.100 mm, of which the instrument may account for 0.030 mm.")
 
 
 def test_a_bound_above_the_limit_says_what_would_lower_it() -> None:
@@ -190,7 +191,9 @@ def test_families_are_compared_with_the_best_model_without_them() -> None:
     assert found.gain("gravity") == 30.0
     assert found.gain("moments") == -2.0
     assert found.gain("compliance") is None
-    assert said(found) == ["Model: geometry with gravity (-2 ln L falls by gravity 30)."]
+    (text,) = said(found)
+    assert text.startswith("Model: geometry with gravity (-2 ln L falls by gravity 30). `compensate` uses the whole")
+    assert "files of controllers hold geometry alone" in text
     alone = learned(trials=(Trial((), 40.0), Trial(("gravity",), 40.2)))
     assert said(alone) == ["Model: the data support no extension."]
 

@@ -105,6 +105,8 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     True
     """
     path = Path(source)
+    if not path.exists():
+        raise InputError("the file", "nothing", "the robot's own file, copied from its controller", path)
     data = read_bytes(path)
     old, places = _deltas(data, path)
     require_same_arm(robot, nominal.mdh, REVOLUTE, path)
