@@ -58,7 +58,7 @@ class TableOptions:
     columns
         The columns' names, instead of a header; a column called ``-`` is left out.
     units
-        Of columns whose name carries none, by dimension or by the columns' stem (`parse_units`).
+        Of columns whose name carries none, ``"rad,m"``, or by dimension or the columns' stem (`parse_units`).
     quaternion
         Order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
     rotation
@@ -75,7 +75,7 @@ class TableOptions:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> options = ro.data.TableOptions(separator="semicolon", units={"angle": "rad", "length": "m"}, quaternion="xyzw")
+    >>> options = ro.data.TableOptions(separator="semicolon", units="rad,m", quaternion="xyzw")
     >>> options.texts()
     {'separator': 'semicolon', 'units': 'rad,m', 'quaternion': 'xyzw'}
     """
@@ -93,6 +93,10 @@ class TableOptions:
     within: float | None = None
     joints: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        if isinstance(self.units, str):
+            object.__setattr__(self, "units", parse_units(self.units))
+
     @classmethod
     def stated(cls, texts: Mapping[str, str]) -> TableOptions:
         """Return the options that texts state, as a problem file's ``[reading]`` has them."""
@@ -102,7 +106,7 @@ class TableOptions:
         found: dict[str, Any] = dict(texts)
         for name in ("columns", "joints"):
             found[name] = tuple(filter(None, texts.get(name, "").split(",")))
-        return cls(**{**found, "units": parse_units(texts.get("units", ""))})
+        return cls(**found)
 
     def texts(self) -> dict[str, str]:
         """Return what is stated as texts, but for the sheet and for how several files are joined."""

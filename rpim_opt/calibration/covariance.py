@@ -197,8 +197,11 @@ class NoiseTest(NamedTuple):
         return self.probability < UNLIKELY and self.ratio < 1
 
 
-def noise_test(squares: float, freedom: float, learned: bool = False) -> NoiseTest:
-    """Compare a sum of squared residuals in sigmas with chi^2; ``learned``: the repeatability is known beside it."""
+def noise_test(squares: float, freedom: float, learned: bool = False, factor: float = 1.0) -> NoiseTest:
+    """Compare a sum of squared residuals in sigmas with chi^2.
+
+    ``learned``: the repeatability is known beside the noise; ``factor``: what is estimated on the stated noise.
+    """
     if freedom < 1:
         return NoiseTest(1.0, 1.0, "No degree of freedom is left to test the stated measurement noise.")
     ratio = float(np.sqrt(squares / freedom))
@@ -209,7 +212,7 @@ def noise_test(squares: float, freedom: float, learned: bool = False) -> NoiseTe
     cause = "noise is larger, rows are wrong, or the model lacks an effect (backlash, elasticity)"
     if upper >= 0.5:
         cause = "it is stated too large"
-        if learned:
+        if learned and factor == 1.0:
             cause += ' (noise = "free" estimates it)'
     elif learned:
         cause = "the difference is the robot's repeatability, or an effect that the model lacks"

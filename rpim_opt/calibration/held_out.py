@@ -48,7 +48,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
-    added = scattered(problem, result.noise_level)
+    added = scattered(problem, result.variance_factor)
     for (block, part), reading, session in zip(parts, added.reading, added.session, strict=True):
         k = len(block.measurement.components)
         r, A = part[:, :, 0], part[:, :, 1:]

@@ -229,7 +229,7 @@ class Outcome:
         problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
         covariance = self.spread.of_positions(J)
-        added = scattered(problem, self.noise_level)
+        added = scattered(problem, self.variance_factor)
         if of == "reached":
             covariance = covariance + added.robot[0]
         freedom: float | Array = self.freedom
@@ -392,7 +392,7 @@ class Outcome:
         return Spread(linear, form, self.penalty_weight, self.z, factor, level, drift)
 
     @property
-    def noise_level(self) -> float:
+    def variance_factor(self) -> float:
         """The noise's variance over the stated one, where it is larger than chance would have it, and otherwise 1."""
         if not self.linear_penalty or self.noise_test().probability >= UNLIKELY:
             return 1.0
@@ -406,12 +406,13 @@ class Outcome:
         'Residuals agree with the stated measurement noise (ratio 1.02).'
         """
         linear, factor = self._squares
-        if self.problem.scatter is None:
+        scatter = self.problem.scatter
+        if scatter is None:
             squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / factor
-        else:
-            bare = self.problem.scattered(None)
-            squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
-        return noise_test(squares, self.spread.spare, self.problem.scatter is not None)
+            return noise_test(squares, self.spread.spare)
+        bare = self.problem.scattered(None)
+        squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
+        return noise_test(squares, self.spread.spare, True, scatter.instrument)
 
     @property
     def freedom(self) -> float:

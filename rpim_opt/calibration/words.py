@@ -81,8 +81,8 @@ def turned_frames(result: Outcome) -> list[str]:
     ]
     if not names:
         return []
-    turn = "turn the frame about the axes of the one before it: no differences of the values beside them"
-    return [f"Deviations of {listed(names)} {turn}."]
+    turn = "the turn from the nominal frame about the axes of the one before it, no difference of the angles"
+    return [f"Deviations of {listed(names)}: {turn}."]
 
 
 def parameter_table(result: Outcome) -> str:

@@ -229,6 +229,12 @@ def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
     except cp.SolverError as error:  # atoms that call a solver when they are made
         found = f"an error of CVXPY: {error}".rstrip(".")
         raise InputError(where, found, "atoms that the installed solvers know") from None
+    except TypeError as error:
+        if error.__traceback__ is None or error.__traceback__.tb_next is not None:  # of the function's own code
+            raise
+        constraint = "z and the parameters, lambda z, p: cp.norm1(z) <= 5"
+        accepted = f"a function of {constraint if len(arguments) == 2 else 'one argument'}"
+        raise InputError(where, str(error), accepted) from None
 
 
 class Term:

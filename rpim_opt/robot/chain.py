@@ -65,7 +65,7 @@ def same_place(one: Array, other: Array) -> bool:
 def placed(place: Array) -> str:
     """Say a frame (6,)."""
     values = [*(1e3 * place[:3]), *np.degrees(place[3:])]
-    return " ".join(f"{name} {value + 0.0:.3f}" for name, value in zip(FRAME, values, strict=True)) + " mm, deg"
+    return " ".join(f"{name} {value:z.3f}" for name, value in zip(FRAME, values, strict=True)) + " mm, deg"
 
 
 def describe(

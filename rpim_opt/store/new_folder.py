@@ -83,7 +83,7 @@ def new_problem(
     robot, data, measurement, options, urdf_base, urdf_tip, dh
         As for `understand_tables`.
     units
-        Units of columns whose name carries none, ``"deg,mm"``, where no options state them.
+        Units of columns whose name carries none, ``"deg,mm"``; beside ``options`` added to theirs.
     validation
         A table of measurements for validation.
     hold_out, seed
@@ -109,12 +109,15 @@ def new_problem(
     folder = Path(folder)
     if folder.exists() or folder.is_symlink():
         raise InputError("the folder", "one that is there", "a new one: nothing is overwritten", folder)
+    options = options or TableOptions()
+    if units:
+        options = replace(options, units={**options.units, **parse_units(units)})
     if validation is not None and hold_out is not None:
         raise InputError("validation", "a table and a part to hold out", "one of them")
     source = find_source(robot)
     arm = read_arm(source.file, urdf_base, urdf_tip, dh)
     paths = [data] if isinstance(data, str | Path) else data
-    found = understand_of(arm, paths, measurement, options or TableOptions(units=parse_units(units)))
+    found = understand_of(arm, paths, measurement, options)
     if understood is not None:
         understood(found)
     board = stated_target(target)

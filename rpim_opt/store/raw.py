@@ -18,7 +18,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
-from rpim_opt.data.tables.joining import together
+from rpim_opt.data.tables.joining import time_column, together
 from rpim_opt.data.tables.orientations import ORDERS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
@@ -217,7 +217,23 @@ def _whole(
         whole = together(tables, arm.robot, kind, options.key, options.within)
     except InputError as error:
         raise error.within(files[0][0] if len(files) == 1 else None) from None
-    return Understanding(kind, whole.columns, tuple(tables), whole.notes, options, str(files[0][0]))
+    shown = tuple(_joined(each, options, whole.notes) for each in tables)
+    return Understanding(kind, whole.columns, shown, whole.notes, options, str(files[0][0]))
+
+
+def _joined(table: Understood, options: TableOptions, notes: Sequence[str]) -> Understood:
+    """Return what was understood of a file, in which the column by which rows were joined is not left out."""
+    used = {name for name in table.raw if any(note.startswith(f"joined by column '{name.lower()}'") for note in notes)}
+    if any(note.startswith("joined by the nearest time") for note in notes):
+        clock = time_column(table.raw) if options.key.lower() in ("", "time") else options.key
+        used = {name for name in table.raw if name.lower() == str(clock).lower()}
+    meant = [
+        each._replace(meaning="joins the files", why="rows of equal keys or of the nearest times")
+        if each.column in used and each.meaning == "left out"
+        else each
+        for each in table.meant
+    ]
+    return replace(table, meant=tuple(meant))
 
 
 def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:

@@ -30,6 +30,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
+from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
@@ -60,8 +61,8 @@ class Compensation:
     nominal, q
         (N, dof) commands of the nominal controller, and the corrected ones [rad or m].
     position_before, orientation_before, position_error, orientation_error
-        (N,) how far the nominal and the corrected command miss the target [m], [rad]; NaN for an orientation that does
-        not count.
+        (N,) how far the nominal and the corrected command miss the target [m], [rad], both by the calibrated model, of
+        which the solution leaves nothing where it is attainable; NaN for an orientation that does not count.
     std
         (N,) standard uncertainty of the position there [m], sqrt(tr J C J' + tr R), with the calibration's covariance
         C, the Jacobian J of the position in the instrument's frame and the repeatability R. Infinite without C.
@@ -73,6 +74,8 @@ class Compensation:
         Corrected commands beyond the joint ranges that the calibration measured.
     note
         Why the robot is not delivered, where it is used all the same.
+    point
+        Which point is moved, with its place in the flange frame, as text.
     """
 
     robot: Robot
@@ -87,15 +90,16 @@ class Compensation:
     status: tuple[str, ...]
     outside: Outside = field(default_factory=Outside)
     note: str = ""
+    point: str = ""
 
     def __str__(self) -> str:
         """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
         rows = {
             "position [mm], nominal command": self.position_before,
-            "position [mm], corrected command": self.position_error,
+            "position [mm], corrected, by the model": self.position_error,
             "position [mm], standard uncertainty": self.std,
             "orientation [mrad], nominal command": self.orientation_before,
-            "orientation [mrad], corrected command": self.orientation_error,
+            "orientation [mrad], corrected, by the model": self.orientation_error,
         }
         figures = []
         for name, values in rows.items():
@@ -114,7 +118,7 @@ class Compensation:
             if at:
                 named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in at])
                 lines.append(f"{status.capitalize()}: {named}.")
-        return "\n".join([*lines, *self.outside.sentences()])
+        return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -143,6 +147,7 @@ class Compensation:
             "outside": [self.label[i] for i in self.outside.rows],
             "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
             "note": self.note,
+            "point": self.point,
         }
 
     def csv(self) -> str:
@@ -203,8 +208,10 @@ def compensate(
     orientation
         Whether orientations count.
     tool
-        (6,) a tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad], that the controller knows as it is. By
-        default the reflector of the calibration, which the controller knows as stated and the robot has as identified.
+        (6,) a tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the robot has
+        exactly there. By default the reflector of the calibration: the controller's robot has it at its nominal place
+        (as stated, or where registration puts it), the real one as identified. The flange frame is that of the DH
+        table, after the last joint.
     marker
         Which reflector, when there are several.
     base
@@ -273,7 +280,8 @@ def compensate(
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     whole["status"] = tuple(whole["status"].tolist())
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
-    return Compensation(arm, targets.label, **whole, outside=result.outside(commands), note=note)
+    outside = result.outside(commands)
+    return Compensation(arm, targets.label, **whole, outside=outside, note=note, point=cell.point(tool is not None))
 
 
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
@@ -438,8 +446,17 @@ class _Cell(NamedTuple):
             C,
             marker,
             position_noise(measured),
-            result.noise_level,
+            result.variance_factor,
         )
+
+    def point(self, stated: bool) -> str:
+        """Say which point is moved, and where the controller's robot has it."""
+        p = self.problem.parameters
+        at = [p.names.index(tool_prefix(self.marker) + c) for c in FRAME]
+        if stated:
+            return f"Moved is the tool as stated, at {placed(p.nominal[at])} in the flange frame."
+        where = f"nominally (stated, or registered) at {placed(p.nominal[at])} in the flange frame"
+        return f"Moved is the reflector, {where}: a controller with another TCP needs --tool."
 
     def compensated(
         self, q: Array | None, poses: Array | None, torque: Array | None, payload: Array | None, largest: float

@@ -29,7 +29,7 @@ from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, write_urdf
-from rpim_opt.robot.kinematics import FRAME
+from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
 from rpim_opt.robot.terms import transmission
 
@@ -255,7 +255,8 @@ def export_urdf(
 
     An identified base or reflector that lies near the file's root or tip is the same frame, known better, and is
     written. Elsewhere it is the instrument's or the reflector's own, and the file's frame stays as it is. Returned is a
-    sentence for each of the two frames that was identified.
+    sentence for each of the two frames that was identified, the place in the frames of the file's links: of the root in
+    the instrument's frame, of the reflector in the tip link's.
 
     Parameters
     ----------
@@ -294,16 +295,28 @@ def export_urdf(
         tool = False
     written: list[Array | None] = []
     notes = []
-    of_frames = (("base", "root", base, arm.base, own.base), ("tool", "tip", tool, arm.tool, own.tool))
-    for name, link, stated, place, of_file in of_frames:
+    root_at = numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))
+    reflector_at = np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)
+    of_frames = (
+        ("base", "root", base, arm.base, own.base, f"the instrument's frame it is at {placed(frame_numbers(root_at))}"),
+        (
+            "tool",
+            "tip",
+            tool,
+            arm.tool,
+            own.tool,
+            f"its frame the reflector is at {placed(frame_numbers(reflector_at))}",
+        ),
+    )
+    for name, link, stated, place, of_file, there in of_frames:
         free = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
         moves = (free and same_place(place, of_file)) if stated is None else stated
         written.append(place if moves else None)
         if moves:
-            notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)}.")
+            where = "the DH table's flange frame" if name == "tool" else "the instrument's frame"
+            notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)} in {where}.")
         elif free:
-            where = f"the identified {name} is not there, but at {placed(place)}"
-            notes.append(f"URDF: its {link} stays where it was; {where}.")
+            notes.append(f"URDF: its {link} link stays where it was; in {there}.")
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, *written)

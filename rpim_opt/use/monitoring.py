@@ -283,7 +283,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     C[n:, n:] = np.diag(own**2)
     m = np.zeros(len(C))
     residual, slopes = problem.slopes(previous_deviations(result, problem))
-    readings = scattered(problem, result.noise_level).reading
+    readings = scattered(problem, result.variance_factor).reading
     rows: dict[int, tuple[slice, Array]] = {}
     start = 0
     for block, V in zip(problem.data.blocks, readings, strict=True):

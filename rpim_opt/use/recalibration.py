@@ -398,7 +398,7 @@ class Misfit:
     """
 
     def __init__(self, result: Calibration, model: LinearModel, prior: Quadratic) -> None:
-        sigma = np.sqrt(result.noise_level)
+        sigma = np.sqrt(result.variance_factor)
         self.freedom = max(result.freedom, 1.0)
         self.m = len(model.b)
         self.A = model.A / sigma
