@@ -527,7 +527,9 @@ def compensate(
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
     units: Units = "",
     position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
-    tool: Annotated[Text, Option(help="Tool instead of the reflector: x,y,z [mm], roll,pitch,yaw [deg].")] = None,
+    tool: Annotated[
+        Text, Option(help="TCP in the flange frame, x,y,z [mm], roll,pitch,yaw [deg]; else the reflector.")
+    ] = None,
     marker: Marker = None,
     base: Annotated[bool, Option("--base", help="Correct for the base, too.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import os
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -23,7 +24,7 @@ from rpim_opt.basics.units import parse_units
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.understanding import understand
-from rpim_opt.robot.kinematics import frame_numbers, numeric_link
+from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.use.validation import validate
 from tests import SHARED
@@ -119,6 +120,16 @@ def rms_mm(difference: np.ndarray) -> float:
 
 
 # --- in order ----------------------------------------------------------------------------------------------
+
+
+def test_a_reflector_that_is_not_the_tip_is_placed_in_the_tip_links_frame(made: Path, cell: Path, tmp_path) -> None:
+    result = ro.load_result(made / "results")
+    root, tip = ro.use.export_urdf(result, cell / "arm.urdf", tmp_path / "out.urdf", base=False, tool=False)
+    there = np.linalg.inv(TOOL) @ numeric_frame(ro.use.identified(result).tool)
+    said = [float(number) for number in re.findall(r"[xyz] (-?[\d.]+)", tip)[:3]]
+    np.testing.assert_allclose(said, 1e3 * there[:3, 3], atol=6e-4)
+    assert "in the instrument's frame" in root
+    assert "needs --tool" in str(ro.use.compensate(result, np.zeros((1, 6))))
 
 
 def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cell, tmp_path) -> None:

@@ -49,6 +49,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "constraints that are a number": (lambda: posed(constraints=3), "constraints: found a int, accepted: functions"),
     "a loss that is a text": (lambda: posed(loss=lambda r: "small"), "a str, accepted: a convex scalar expression"),
     "a loss without a return": (lambda: posed(loss=lambda r: None), "is a 'return' missing?"),
+    "a constraint of z alone": (lambda: posed(constraints=lambda z: z <= 1), "a function of z and the parameters"),
     "a constraint of two concave sides": (
         lambda: posed(constraints=lambda z, p: cp.sqrt(cp.norm(z)) <= 1).solve(1.0), "a program that is not convex"
     ),

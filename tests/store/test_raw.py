@@ -309,6 +309,8 @@ def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys,
     said = capsys.readouterr().out
     assert f"joined by the nearest time: {COUNT} rows of {10 * COUNT} with joints and {COUNT} measured" in said
     assert "times differ by 0.003 s at most, +0.003 s on average" in said
+    assert "joins the files" in said
+    assert "left out" not in said
     data = ro.load(tmp_path / "cell").problem.data
     np.testing.assert_allclose(np.degrees(data.q), [[float(cell) for cell in row] for row in JOINTS], atol=1e-9)
     assert list(data.label) == [name[0] for name in NAMED]
