@@ -42,6 +42,26 @@ def test_a_table_of_candidates_keeps_its_labels(monkeypatch: pytest.MonkeyPatch,
     assert all(float(q) == 10 * int(label[1:]) for label, q in zip(chosen["label"], chosen["q1_deg"], strict=True))
 
 
+def test_numbers_units_and_the_base_are_checked_before_a_folder_is_made(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any
+) -> None:
+    problem = ro.load("position").problem
+    rows = np.column_stack([np.degrees(problem.data.q), 1e3 * problem.data.blocks[0].y])
+    table = [",".join([f"P{k}", *(f"{v:.4f}" for v in row)]) for k, row in enumerate(rows)]
+    file = tmp_path / "raw.csv"
+    arguments = ["new", str(tmp_path / "cell"), "--robot", "irb120", "--data", str(file)]
+    names = ",".join(["Point", *(f"A{i} [deg]" for i in range(1, 7)), "X{0},Y{0},Z{0}"])
+    file.write_text("\n".join([names.format(" [mm]"), *table]))
+    assert run(monkeypatch, *arguments, "--units", "rad,m", "--dry-run") == 0
+    assert "--units m does not apply: the header has 'Z [mm]' in mm." in capsys.readouterr().out
+    file.write_text("\n".join([names.format(""), *table]))
+    assert run(monkeypatch, *arguments, "--units", "deg,m") == 0
+    assert "implausibly far away: are the units right?" in capsys.readouterr().out
+    file.write_text("\n".join([names.format(" [mm]"), *table[:-1], table[-1].rpartition(",")[0] + ",abc"]))
+    assert run(monkeypatch, *arguments, "--dry-run") == 2
+    assert f"row P{len(rows) - 1}, column 'Z [mm]': found 'abc'" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("name", ["UR-10", "Universal Robots UR10"])
 def test_a_robots_trade_name_leads_to_its_own(monkeypatch: pytest.MonkeyPatch, capsys: Any, name: str) -> None:
     assert run(monkeypatch, "new", "cell", "--robot", name, "--data", "rows.csv") == 2

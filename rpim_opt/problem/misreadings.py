@@ -72,6 +72,8 @@ def pose_misfit(robot: Robot, data: Dataset) -> float:
 
 BETTER = 0.2
 """Another reading of the data is reported when it leaves less than this part of the position error."""
+SIBLING, SIBLING_BETTER = 0.1, 0.5
+"""A ready robot whose drawing differs by less than this [m, rad] is reported from this part of the error on."""
 FURTHER = 0.7
 """A second mistake is looked for behind a reading that leaves less than this part."""
 WRONG = 0.02
@@ -95,6 +97,9 @@ LENGTHS = {
     25.4: ("in inches, not mm", "name the columns X [in], ... and use rpim-opt new"),
     10.0: ("in cm, not mm", "name the columns X [cm], ... and use rpim-opt new"),
     1e-2: ("in cm, not m", "name the columns X [cm], ... and use rpim-opt new"),
+    1 / 25.4: ("in mm, not inches", "name the columns X [mm], ... (--units deg,mm)"),
+    0.1: ("in mm, not cm", "name the columns X [mm], ... (--units deg,mm)"),
+    100.0: ("in m, not cm", "name the columns X [m], ... (--units deg,m)"),
 }
 """Factors between units of lengths, what was read wrongly, and what to write."""
 ANGLES = {
@@ -377,8 +382,19 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
             if not left < BETTER * stated:
                 chain, left = _best(robot, points, list(readings(robot)))
     if not left < BETTER * stated or (left > LEFT and not points.seen):
-        return None
+        return None if points.seen else _sibling(robot, points)
     return _compared(robot, chain, points, stated, left)
+
+
+def _sibling(robot: Robot, points: Points) -> Better | None:
+    """Return a ready robot of nearly the same drawing that fits better than the one that is stated, a UR10 a UR10e."""
+    own = misfit(robot, points)
+    for each in _other_robots(robot):
+        if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
+            left = misfit(each.robot, points)
+            if left < SIBLING_BETTER * own:
+                return Better(each.what, each.remedy, own * points.extent, left * points.extent)
+    return None
 
 
 def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:

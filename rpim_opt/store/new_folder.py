@@ -29,14 +29,14 @@ from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import RobotSource, find_source, read_arm
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.store.raw import Understanding, understand_of
+from rpim_opt.store.raw import NOISE, Understanding, rows_of, understand_of
 
-NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
-"""Standard deviations that are written where the data state none."""
 IDENTIFICATION, VALIDATION, TARGET = "identification.csv", "validation.csv", "target.csv"
 """Files of a new folder."""
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
+FARTHEST = 50.0
+"""Distance from the instrument to a base beyond which the units are likely wrong [m]."""
 CAMERA_CLEARLY = 3.0
 """The camera is where the poses fit so many times better."""
 
@@ -124,10 +124,7 @@ def new_problem(
     kind, how = _kind(arm, found, board, measurement)
     noise = {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in kind.noise.items()}
     notes = list(found.sentences)
-    try:
-        rows = read_data(board.under(found.columns), arm.robot, noise, kind)
-    except InputError as error:
-        raise error.within(found.file) from None
+    rows = rows_of(found, board.under(found.columns), arm, kind)
     columns = found.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
@@ -135,10 +132,7 @@ def new_problem(
     said = f'# validation = "{VALIDATION}"   # a table that is used for no choice; none was given'
     if validation is not None:
         other = understand_of(arm, [validation], kind.name, found.options)
-        try:
-            read_data(board.under(other.columns), arm.robot, noise, kind)
-        except InputError as error:
-            raise error.within(validation) from None
+        rows_of(other, board.under(other.columns), arm, kind)
         tables[VALIDATION] = other.columns
         notes += other.sentences
         said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; used for no choice'
@@ -339,6 +333,8 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
         offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
         how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
         return arm.base, how
+    if np.linalg.norm(found[:3]) > FARTHEST:
+        verdict = "implausibly far away: are the units right?"
     return None, f"Guessed: the data put the base at {placed(found)}, {kind.words.frame} ({verdict})."
 
 

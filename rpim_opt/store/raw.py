@@ -13,6 +13,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import Columns
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
@@ -35,6 +36,8 @@ READINGS = {
                  "intrinsic zxy"),
 }  # fmt: skip
 """What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
+NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
+"""Standard deviations where the data state none."""
 Files = Sequence[tuple[Path, RawTable]]
 
 
@@ -164,7 +167,23 @@ def understand_tables(
     >>> found.notes
     ('joined by label: 2 rows of 2 with joints and 2 measured.',)
     """
-    return understand_of(read_arm(find_source(robot).file, urdf_base, urdf_tip, dh), data, measurement, options)
+    arm = read_arm(find_source(robot).file, urdf_base, urdf_tip, dh)
+    found = understand_of(arm, data, measurement, options)
+    if not found.kind.by_camera:  # what it sees is another table
+        rows_of(found, found.columns, arm, found.kind)
+    return found
+
+
+def rows_of(found: Understanding, columns: Columns, arm: Described, kind: Measurement) -> Dataset:
+    """Return the measurements in understood columns; an error names the column as the file does."""
+    noise = {f"{name}_{NOISE[dimension][0]}": NOISE[dimension][1] for name, dimension in kind.noise.items()}
+    try:
+        return read_data(columns, arm.robot, noise, kind)
+    except InputError as error:
+        row, mark, ours = error.where.partition(", column ")
+        own = {each.name: each.column for table in found.tables for each in table.meant}
+        where = f"{row}{mark}'{own[ours]}'" if own.get(ours, ours) != ours else error.where
+        raise InputError(where, error.found, error.accepted, error.file or found.file) from None
 
 
 def understand_of(

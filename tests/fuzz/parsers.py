@@ -26,10 +26,9 @@ from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.new_folder import NOISE
 from rpim_opt.store.prior_file import load_prior, save_prior
 from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
-from rpim_opt.store.raw import understand_of
+from rpim_opt.store.raw import NOISE, understand_of
 from rpim_opt.store.serialize import digest
 
 TWO = ro.robot.Robot("two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]))

@@ -9,6 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.problem.diagnosis import inspect
+from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
 CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axis", "tracker", "scara", "paper_arm")
@@ -48,6 +49,7 @@ MISTAKES = {
     "radians as degrees": ("position", {"q": np.radians}, "radians, not degrees"),
     "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
     "metres as millimetres": ("position", {"y": lambda y: 1e-3 * y}, "a thousand times larger"),
+    "millimetres as inches": ("position", {"y": lambda y: 25.4 * y}, "in mm, not inches"),
     "a frame flipped": ("markers", {"y": lambda y: y * [1, -1, 1]}, "mirrored"),
     "joint 3 the other way": ("seven_axis", {"q": flip(2)}, "joint 3 reversed"),
     "joint 2 from another zero": ("position", {"q": shift(1)}, "zero of joint 2 -90.0 deg"),
@@ -59,6 +61,14 @@ def test_likely_mistakes_are_named(mistake: str) -> None:
     name, change, expected = MISTAKES[mistake]
     warnings = inspect(changed(name, **change)).warnings
     assert any(expected in text and "times better" in text for text in warnings), warnings
+
+
+def test_a_ready_robot_of_nearly_the_same_drawing_is_named() -> None:
+    problem = ro.load("mixed").problem
+    assert problem.robot.name.endswith("UR10e")
+    older = ro.read_robot(find_robot("ur10"))
+    (text,) = [each for each in inspect(replace(problem, robots=older)).warnings if "times better" in each]
+    assert "the ready robot ur10e" in text
 
 
 def test_rows_that_stand_out_are_named() -> None:

@@ -109,7 +109,7 @@ def test_what_was_understood_is_said_before_the_folder_is_made(monkeypatch, caps
     assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
     said = capsys.readouterr()
     assert "measured y" in said.out
-    assert "row P4, column y_mm: found 'x'" in said.err
+    assert "row P4, column 'Y [mm]': found 'x'" in said.err
     assert not (tmp_path / "cell").exists()
 
 

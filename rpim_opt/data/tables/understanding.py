@@ -115,7 +115,8 @@ def understand(
     options = options or TableOptions()
     path = source if isinstance(source, Path) else None
     raw = source if isinstance(source, RawTable) else read_raw(source, options)
-    options = replace(options, units={**raw.units, **options.units})
+    stated = options.units
+    options = replace(options, units={**raw.units, **stated})
     require_rotation(options.rotation)
     known = number_columns(robot, kind)
     try:
@@ -130,6 +131,10 @@ def understand(
             notes += more
     except InputError as error:
         raise error.within(path) from None
+    for each in {dimension_of(m.unit): m for m in meant if "unit in the header" in m.why and m.unit}.values():
+        unit = stated.get(dimension_of(each.unit), each.unit)
+        if unit != each.unit:
+            notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
     return Understood(
         path.name if path else "",
         columns,
