@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 from functools import partial
 
+import numpy as np
+
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.loop import ROUNDS, Ended, Options, State, minimize
@@ -15,6 +17,9 @@ from rpim_opt.problem.blocks import Source
 
 LEVEL = 1e-9
 """Relative fall of the objective over five iterations below which it hardly changes."""
+FAR = 1000.0
+"""Deviations in prior standard deviations beyond which a fit without a penalty is called divergent."""
+DIVERGES = "poorly identifiable combinations diverge without a penalty"
 
 
 def calibrated(
@@ -56,6 +61,8 @@ def ending(ended: Ended, most: int) -> str:
         return f"Converged after {iterations} in {ended.rounds} rounds, positions linear about the solution."
     if ended.converged:
         text = f"Converged after {iterations}."
+        if state.choice.weight == 0 and np.abs(state.z).max(initial=0.0) > FAR:
+            text += f" Deviations exceed {FAR:g} prior standard deviations: {DIVERGES}; add one."
     elif state.outcome == "rest":
         text = f"Not converged: {uncertified(ended.certificate)}"
     elif state.outcome == "stuck":
@@ -87,5 +94,5 @@ def unfinished(state: State, most: int) -> str:
         hardly = "though the objective hardly changes: the data hardly determine the solution; use a larger weight."
         return f"{iterations} not enough, {hardly}"
     if state.choice.weight == 0 and most > 1:
-        return f"{iterations} not enough: poorly identifiable combinations diverge without a penalty; add one."
+        return f"{iterations} not enough: {DIVERGES}; add one."
     return f"{iterations} not enough; allow more (max_iterations)."

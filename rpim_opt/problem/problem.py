@@ -324,7 +324,7 @@ class CalibrationProblem(RobotModel):
             y,
             covariance,
             measurement=measurement,
-            torque=torque,
+            torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
             approach=np.zeros(q.shape) if sided else None,
             columns={name: np.broadcast_to(np.asarray(each, dtype=float), N) for name, each in columns.items()},

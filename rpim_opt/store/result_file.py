@@ -45,7 +45,7 @@ from rpim_opt.store.own_code import is_own, own_object
 from rpim_opt.store.serialize import digest, plain, structured
 
 FORMAT = "rpim-opt result"
-VERSION = 2
+VERSION = 3
 Models = Model | Mapping[str, Model]
 RELATIVE = 1e-4
 """Standard deviations of hardly identifiable directions differ by that much from one processor to another."""

@@ -468,3 +468,15 @@ def test_one_configuration_gives_an_answer_or_one_sentence(rule: Any) -> None:
     else:
         assert np.isfinite(result.x).all()
         assert np.isfinite(result.weight)
+
+
+def test_a_fit_without_a_penalty_that_ran_away_says_so() -> None:
+    result = ro.calibrate(ro.load("rank_deficient").problem, ro.least_squares, 0.0)
+    assert "diverge without a penalty; add one" in result.message
+    assert "diverge" not in ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1.0).message
+
+
+def test_one_configuration_has_its_torques_in_a_row() -> None:
+    result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
+    q, torque = np.full(6, 0.1), np.ones(6)
+    assert np.array_equal(result.forward(q, torque=torque), result.forward(q[None], torque=torque[None]))

@@ -158,7 +158,7 @@ BAD = {
     "truncated": (lambda t: t[: len(t) // 2], "the JSON text: found"),
     "another JSON file": (lambda t: '{"weight": 1}', "no result of rpim-opt"),
     "a list": (lambda t: "[1, 2]", "no result of rpim-opt"),
-    "a newer version": (lambda t: t.replace('"version": 2', '"version": 3', 1), "key version: found 3, accepted: 2"),
+    "a newer version": (lambda t: t.replace('"version": 3', '"version": 4', 1), "key version: found 4, accepted: 3"),
     "a key twice": (lambda t: t.replace('"weight": 1.0', '"weight": 1.0, "weight": 1.0', 1), "the key 'weight' twice"),
     "not a number": (lambda t: t.replace('"weight": 1.0', '"weight": NaN', 1), "parts that do not fit"),
     "a key left out": (lambda t: t.replace('"history"', '"hist"', 1), "something in it was changed"),
