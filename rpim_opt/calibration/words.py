@@ -206,13 +206,15 @@ def _alone(result: Outcome, flags: Sequence[Flag]) -> dict[str, str]:
     from rpim_opt.calibration.leverage import influence
 
     problem = result.problem
+    if not isinstance(problem, CalibrationProblem):
+        return {}
     try:
         found = influence(result)
     except InputError:  # a loss or penalty that is not squared
         return {}
     said = {}
     change = dict(zip(found.configuration.tolist(), found.change, strict=True))
-    for flag in flags if isinstance(problem, CalibrationProblem) else ():
+    for flag in flags:
         row = problem.labels.index(flag.label)
         error = 1e3 * problem.errors(result.x + change[problem.data.configuration[row]])[row]
         if error > CLEARLY_MORE * flag.error_mm:

@@ -52,6 +52,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
         held=held,
         prices=(),
         squared_loss=squared_loss,
+        linear_penalty=False,
         problem=RESULT.problem,
         formulation=ro.tikhonov,
         message="Done.",
