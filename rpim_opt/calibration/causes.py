@@ -112,8 +112,11 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return [*rows_without_values(problem), better.sentence]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
     found = found or list(transmission(problem, result.x))
-    found = found or list(rounded_joints(problem, rms(problem.errors(result.x)[kept_rows(result)])))
-    return found or list(part_way(ordered)) or list(odd_columns(problem))
+    error = rms(problem.errors(result.x)[kept_rows(result)])
+    found = found or list(rounded_joints(problem, error))
+    if found or error < LARGEST["length"]:  # which a robot's own effects may be
+        return found
+    return list(part_way(ordered)) or list(odd_columns(problem))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

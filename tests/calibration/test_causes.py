@@ -230,6 +230,15 @@ def test_misread_orientations_are_named() -> None:
     assert any("the other way round" in text for text in causes), causes
 
 
+def test_a_scattering_arm_with_a_joint_on_one_side_is_not_accused() -> None:
+    problem = simulated_arm("ur5e", count=80)
+    (block,) = problem.data.blocks
+    one_side = problem.on(problem.data.take(np.flatnonzero(block.q[:, 0, 1] > 0)))
+    noise = 5e-4 * np.random.default_rng(6).normal(size=(80, 3))
+    result = ro.calibrate(values(lambda y: y + noise[: len(y)])(one_side))
+    assert not [text for text in likely_causes(result) if text.startswith("Likely")]
+
+
 def test_stroke_and_roll_exchanged_are_named() -> None:
     """A SCARA's millimetres and degrees, each in the other's column."""
     problem = ro.load("scara").problem
