@@ -226,7 +226,7 @@ def new(
 
 
 @app.command()
-def inspect(problem: Problem, variant: Variant = None, as_json: Json = False) -> None:
+def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False, as_json: Json = False) -> None:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
         from rpim_opt.calibration.lack_of_fit import foreseen
@@ -671,6 +671,7 @@ def compare(
     scheduler: Scheduler = None,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the page, the replicates and the figure.")] = None,
+    allow_code: Code = False,
     as_json: Json = False,
 ) -> None:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.

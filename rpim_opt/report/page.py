@@ -53,6 +53,7 @@ STYLE = {
     **dict.fromkeys(INKED, plot.COLORS["ink"]),
     "axes.spines.right": False, "axes.spines.top": False, "axes.grid": True, "grid.color": "#dfe3e8",
     "axes.axisbelow": True, "svg.fonttype": "none", "font.size": 12.5, "savefig.transparent": True,
+    "text.parse_math": False,
 }  # fmt: skip
 
 

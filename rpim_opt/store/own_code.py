@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
@@ -51,13 +52,14 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
     if not _ALLOWED.get():
         accepted = "a name that comes with the package; or --allow-code, which runs that file with your rights"
         raise InputError(where, f"'{name}', code of {source.name}", accepted, file)
-    spec = importlib.util.spec_from_file_location(module, source)
+    spec = importlib.util.spec_from_file_location(f"rpim_opt_own.{module}", source)
     if spec is None or spec.loader is None or not source.is_file():
-        raise InputError(where, f"'{name}', but no file {source.name}", "a file beside this one", file)
+        raise InputError(where, f"'{name}', but no file {source.name}", "a file beside this one: copy it there", file)
     content = importlib.util.module_from_spec(spec)
+    sys.modules[spec.name] = content  # where classes of the file look for their annotations
     try:
         spec.loader.exec_module(content)
-    except Exception as error:  # code of somebody else may raise anything
+    except (Exception, SystemExit) as error:  # code of somebody else may raise anything
         raise InputError(where, f"{type(error).__name__}: {error}", "code that runs", source) from error
     found = getattr(content, attribute, None)
     if not isinstance(found, kind):

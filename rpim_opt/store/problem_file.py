@@ -271,7 +271,7 @@ def read_problem(
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     content = read_toml(path)
-    for kind in filter(is_own, _stated(content, "measurement")):
+    for kind in _own_kinds(content):
         kinds[kind] = replace(own_object(kind, Measurement, "key measurement", path), name=kind)
     table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is asked for
     if variant is not None:
@@ -322,14 +322,14 @@ def read_problem(
     )
 
 
-def _stated(content: Any, key: str) -> Iterator[Any]:
-    """Yield the values of a key, in whichever table it stands."""
-    if isinstance(content, dict):
-        yield from (value for name, value in content.items() if name == key)
-        content = list(content.values())
-    if isinstance(content, list):
-        for each in content:
-            yield from _stated(each, key)
+def _own_kinds(content: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the measurement types of a Python file that a problem file and its variants name."""
+    variants = content.get("variant", {})
+    for table in (content, *(variants.values() if isinstance(variants, dict) else ())):
+        if isinstance(table, dict):
+            observations = table.get("observation", [])
+            listed = [each for each in observations if isinstance(each, dict)] if isinstance(observations, list) else []
+            yield from filter(is_own, (each.get("measurement") for each in (table, *listed)))
 
 
 def _checked(

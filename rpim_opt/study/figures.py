@@ -105,7 +105,7 @@ def _ratios(rows: Rows, summary: Summary, ax: Any) -> None:
     ax.set_ylim(-0.7, top + 0.7)
     ax.set_xscale("log")
     ax.set_xlabel(f"{summary.metric} over that of {summary.reference}, same replicate")
-    ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9, color="0.3")
+    ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
     _round_ticks(ax)
 
 
@@ -138,7 +138,7 @@ def _profiles(rows: Rows, summary: Summary, ax: Any) -> None:
     title = "performance profiles"
     if len(ranked) > len(named):
         title += f" (the best {NAMED_PROFILES}; grey: {len(ranked) - len(named)} others)"
-    ax.set_title(title, fontsize=9, color="0.3")
+    ax.set_title(title, fontsize=9)
     _round_ticks(ax)
 
 

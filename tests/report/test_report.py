@@ -320,6 +320,13 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     assert ("mm, above the limit" in words) == (verdict != "Accepted")
 
 
+def test_labels_are_no_formulas() -> None:
+    """Matplotlib reads texts between dollars as mathematics."""
+    problem = ro.load("position").problem
+    label = (r"$\frac$c0", *problem.data.label[1:])
+    assert r"$\frac$c0" in page(ro.calibrate(problem.on(replace(problem.data, label=label)), weight=1.0))
+
+
 def test_no_verdict_where_nothing_is_demanded(arm) -> None:
     read = Reader(page(arm))
     assert not any("verdict" in str(each.get("class")) for each in read.all("p"))

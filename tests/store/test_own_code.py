@@ -80,6 +80,7 @@ def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path) -> None:
     creep = next(each for each in json.loads(done.stdout)["parameters"] if each["name"] == "creep")
     assert creep["identified"] == pytest.approx(RATE, rel=0.03)  # 0.01 mm of noise, 60 rows over eight hours
 
+    assert command("inspect", folder, "--allow-code").returncode == 0
     assert "--allow-code" in command("report", folder).stderr
     assert command("report", folder, "--allow-code").returncode == 0
     with pytest.raises(ro.InputError, match="allow-code"):
@@ -99,6 +100,7 @@ def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path) -> None:
         (MINE, "other:height", "no file other.py"),
         (MINE, "../mine:height", "the name of a file in the folder"),
         (MINE, "mine:width", "width = None, accepted: a Measurement"),
+        ("raise SystemExit('bye')", "mine:height", "SystemExit: bye"),
     ],
 )
 def test_what_is_wrong_with_own_code_is_one_sentence(folder: Path, text: str, stated: str, said: str) -> None:
@@ -107,3 +109,18 @@ def test_what_is_wrong_with_own_code_is_one_sentence(folder: Path, text: str, st
     with ro.store.allow_code(), pytest.raises(ro.InputError) as refused:
         ro.load(folder)
     assert said in str(refused.value)
+
+
+def test_other_keys_of_that_name_are_no_code(folder: Path) -> None:
+    text = PROBLEM.replace("mine:height", "position").replace('terms = ["mine:creep"]\n', "")
+    (folder / "problem.toml").write_text(text + '[record]\nmeasurement = "Leica: room 2"\n')
+    with pytest.raises(ro.InputError) as refused:
+        ro.load(folder)
+    assert "code of" not in str(refused.value)
+
+
+def test_a_file_may_have_data_classes(folder: Path) -> None:
+    head = "from __future__ import annotations\nfrom dataclasses import dataclass\n"
+    (folder / "mine.py").write_text(head + MINE + "\n@dataclass\nclass Gauge:\n    length: float\n")
+    with ro.store.allow_code():
+        assert ro.load(folder).problem.data.blocks[0].measurement.name == "mine:height"

@@ -205,7 +205,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
     raw = read_table(path)
-    lost = next((note for note in raw.notes if "is no row of the table" in note or "sums others up" in note), "")
+    lost = next((note for note in raw.notes if "is no row of the table" in note or "is a total of others" in note), "")
     if lost:
         raise InputError("the table", lost.rstrip("."), "a row a joint", path)
     columns: dict[str, list[str]] = {}

@@ -90,10 +90,12 @@ def read_urscript(text: str) -> Rows:
     poses = []
     for name, pose, cells in UR.findall(_plain_urscript(text)):
         values = [float(cell) for cell in cells.split(",")]
+        if name.lower() == "set_tcp":
+            continue
         if not pose:
             row = {f"joint_{i} [rad]": repr(value) for i, value in enumerate(values, start=1)}
             joints.append((name.removesuffix("_q"), row))
-        elif name.lower() != "set_tcp":
+        else:
             turn = scipy.spatial.transform.Rotation.from_rotvec(values[3:]).as_quat().tolist()
             row = {f"commanded {axis} [m]": repr(value) for axis, value in zip("xyz", values, strict=False)}
             row |= {f"commanded q{part}": repr(value) for part, value in zip("xyzw", turn, strict=True)}
