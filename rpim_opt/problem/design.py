@@ -187,7 +187,7 @@ def choose(
     if problem.data.blocks[0].measurement.touching:
         # touches of one point, a fixed effect: its place is unknown to `ANYWHERE`
         place = -ANYWHERE * np.linalg.inv(np.linalg.cholesky(np.median(problem.data.blocks[0].covariance, axis=0)))
-        A = np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2)
+        A = np.asarray(np.concatenate([A, np.broadcast_to(place, (len(A), 3, 3))], axis=2), dtype=float)
     n = A.shape[2]
     C = np.eye(n)
     if criterion == "V":
@@ -199,7 +199,7 @@ def choose(
     progress(f"relaxing over {len(A)} candidates")
     if criterion == "E":  # directions that no candidate sees would be the least informed whatever is chosen
         _, s, Vt = np.linalg.svd(A.reshape(-1, n), full_matrices=False)
-        A = A @ Vt[s > RANK_TOLERANCE * s[0]].T
+        A = np.asarray(A @ Vt[s > RANK_TOLERANCE * s[0]].T, dtype=float)
         n = A.shape[2]
         C = np.eye(n)
     weights, bound = _relaxed(A, count, criterion, C, progress)

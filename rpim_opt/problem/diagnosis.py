@@ -704,7 +704,7 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         some = of[what]
         equations = Equations.of(data)
         after = equations.length & (equations.row >= place)
-        change = problem.jacobian(x)[np.ix_(after, some)] @ (free.scale[some] * found.coefficients)
+        change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * found.coefficients)
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
         asked = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
         yield (

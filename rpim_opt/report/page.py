@@ -72,11 +72,12 @@ def chart(draw: Callable[..., Any], title: str, height: float = HEIGHT) -> tuple
     from matplotlib.figure import Figure as Drawing
 
     stream = io.BytesIO()
-    with rc_context({**STYLE, "svg.hashsalt": title}):
+    style: Any = {**STYLE, "svg.hashsalt": title}
+    with rc_context(style):
         drawing = Drawing(figsize=(WIDTH / 72, height / 72), dpi=72, layout="constrained")
         ax = drawing.add_subplot()
         draw(ax=ax)
-        hinted = [artist for artist in ax.get_children() if len(getattr(artist, "hints", ()))]
+        hinted: list[Any] = [artist for artist in ax.get_children() if len(getattr(artist, "hints", ()))]
         for k, artist in enumerate(hinted):
             artist.set_gid(f"hints{k}")
         drawing.savefig(stream, format="svg", dpi=200, metadata={"Date": None})

@@ -306,7 +306,8 @@ def draw_l_curve(curve: Array, chosen: Mapping[str, Array], own: str, ax: Axes =
         (dot,) = ax.plot(*chosen[name].reshape(2, 1), color=f"C{k}", label=name, **style)
         dot.hints = [name]
     if own in chosen:
-        _dots(ax, *chosen[own].reshape(2, 1), "mark", f"chosen: {own}", [f"chosen: {own}"], ms=9.0)
+        x, y = chosen[own].reshape(2, 1)
+        _dots(ax, x, y, "mark", f"chosen: {own}", [f"chosen: {own}"], ms=9.0)
     ax.set(xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior scales]")
     _logarithmic(ax, "x")
     _logarithmic(ax, "y")
@@ -351,7 +352,11 @@ def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | N
     ax = _axes(ax, len(ordered))
     weight = np.array([each.weight for _, each in ordered])
     interior = np.array([each.interior for _, each in ordered])
-    for which, label, style in ((interior, "", {}), (~interior, "at an edge", {"mfc": "none"})):
+    styles: tuple[tuple[Any, str, dict[str, Any]], ...] = (
+        (interior, "", {}),
+        (~interior, "at an edge", {"mfc": "none"}),
+    )
+    for which, label, style in styles:
         at = np.flatnonzero(which)
         if len(at):
             _dots(ax, weight[at], at + 1.0, "after", label, **style)
@@ -425,7 +430,8 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
     above = worst > (np.inf if limit is None else limit)
     for k, over in sorted(set(zip(shade.tolist(), above.tolist(), strict=True))):
         which = (shade == k) & (above == over)
-        text = f"to {mm(levels[k])} mm, above the limit" if over else f"to {mm(min(levels[k], limit or np.inf))} mm"
+        level = float(levels[k])
+        text = f"to {mm(level)} mm, above the limit" if over else f"to {mm(min(level, limit or np.inf))} mm"
         style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "lw": 0, "label": text}
         left, bottom = corners[which].T
         hints = [f"{mm(value)} mm" for value in worst[which]]

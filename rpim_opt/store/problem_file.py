@@ -322,7 +322,7 @@ def read_problem(
     )
 
 
-def _own_kinds(content: Mapping[str, Any]) -> Iterator[str]:
+def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
     """Yield the measurement types of a Python file that a problem file and its variants name."""
     variants = content.get("variant", {})
     for table in (content, *(variants.values() if isinstance(variants, dict) else ())):

@@ -517,7 +517,7 @@ def on_face(
         pivots = np.abs(np.diag(T))
         rank = int((pivots > 1e-11 * pivots.max(initial=0.0)).sum())
         Y, Z, T = Q[:, :rank], Q[:, rank:], T[:rank, :rank]
-        x = near + Y @ solve_triangular(T, (b - A @ near)[order[:rank]], trans="T")
+        x = near + Y @ solve_triangular(T, (b - A @ near)[order[:rank]], trans=1)
         if rank < len(b) and np.abs(A @ x - b).max() > 1e-9 * (1 + np.abs(b).max()):
             return None
     if Z.shape[1]:
@@ -526,7 +526,7 @@ def on_face(
         pivots = np.abs(np.diag(L))
         if len(L) == Z.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
             for _ in range(3):
-                x = x - Z @ solve_triangular(L, solve_triangular(L, Z.T @ gradient(x), trans="T"))
+                x = x - Z @ solve_triangular(L, solve_triangular(L, Z.T @ gradient(x), trans=1))
         else:  # some directions have no curvature: the minimum next to x, unless there is a slope along them
             largest = np.abs(squares.R).max()
             _, values, V = np.linalg.svd(reduced, full_matrices=False)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 import scipy
@@ -126,7 +127,7 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     A = np.concatenate([np.hstack([Z @ R, np.eye(3)]) for R in RA])
     o = np.asarray(start, dtype=float)
     b = measured[:, :3, 3] - transformed(flange, o) @ Z.T
-    t = np.linalg.lstsq(A, b.ravel(), rcond=1e-6)[0]
+    t: Any = np.linalg.lstsq(A, b.ravel(), rcond=1e-6)[0]
     return rigid(Z, t[3:]), rigid(X, o + t[:3])
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -122,7 +122,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
             place[:3] = start.tools[marker][:3, 3]
         else:  # where its positions are least off, seen from the base
             own = rows.take(rows.marker == marker)
-            there = transformed(np.linalg.inv(base @ own.flange), own.measured[:, :3, 3])
+            back: Any = np.linalg.inv(base @ own.flange)
+            there = transformed(back, own.measured[:, :3, 3])
             precision = own.sigma[:, 0] ** -2
             total = place[:3] * TOOL_ERROR**-2 + precision @ there
             place[:3] = total / (TOOL_ERROR**-2 + precision.sum())
