@@ -34,9 +34,22 @@ DEFAULT = {
     "tests/problem/test_blocks.py::test_no_digit_depends_on_the_number_of_cores": ("9000",),
     "tests/bayes/test_groups.py::test_the_most_likely_weights_are_those_of_a_grid": ("0",),
     "tests/study/test_comparison.py::test_intervals_of_other_problems_cover_as_they_say": ("5",),
+    "tests/report/test_report.py::test_every_measurement_has_a_report": ("mixed",),
 }
 """Cases that the default suite takes of a test whose every case is long; the others are slow."""
 LONG = {
+    "tests/calibration/test_causes.py::test_a_mistake_is_named": (
+        "iiwa7-tracker moved by 300 mm",
+        "ur5e-joint 5 frozen",
+        "iiwa7-a column in centimetres",
+        "irb120-values a row too low",
+        "ur5e-joints 4 and 6 exchanged",
+        "irb120-joint 3 coupled to 2",
+    ),
+    "tests/calibration/test_causes.py::test_another_unit_from_halfway_on_is_named": ("",),
+    "tests/calibration/test_causes.py::test_misread_orientations_are_named": ("",),
+    "tests/calibration/test_causes.py::test_an_exchanged_reflector_is_no_moved_foot": ("",),
+    "tests/report/test_report.py::test_a_report_says_what_a_reader_must_know": ("",),
     "tests/convex/test_grid.py::test_a_calibration_ends_where_plain_cvxpy_ends": (
         "Tikhonov, matrix inequality, rank_deficient",
         "parameters in the loss, markers",
@@ -48,7 +61,7 @@ LONG = {
         "matrix inequality, distance, 0.5, Huber",
     ),
 }
-"""Long cases of a test whose others are short."""
+"""Long cases of a test whose others are short, ``""`` for a test without cases."""
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
