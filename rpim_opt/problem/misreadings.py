@@ -411,7 +411,7 @@ def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading
         best = size
     if stated > WRONG and not points.seen and best >= min(BETTER * stated, WRONG):
         readings = _readings(robot, points)
-        for i in np.argsort(_tried(robot, points, readings))[:8]:
+        for i in np.argsort(_tried(robot, points, readings))[:12]:
             changed = readings[i].change(points)
             others = [each for each in _readings(robot, changed) if each.what != readings[i].what]
             second, left = _best(robot, changed, others)
