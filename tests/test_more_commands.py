@@ -63,8 +63,10 @@ def test_numbers_units_and_the_base_are_checked_before_a_folder_is_made(
 
 
 @pytest.mark.parametrize("name", ["UR-10", "Universal Robots UR10"])
-def test_a_robots_trade_name_leads_to_its_own(monkeypatch: pytest.MonkeyPatch, capsys: Any, name: str) -> None:
-    assert run(monkeypatch, "new", "cell", "--robot", name, "--data", "rows.csv") == 2
+def test_a_robots_trade_name_leads_to_its_own(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any, name: str
+) -> None:
+    assert run(monkeypatch, "new", str(tmp_path / "cell"), "--robot", name, "--data", "rows.csv") == 2
     said = capsys.readouterr().err
     assert "(rpim-opt robots)" in said
     assert "did you mean ur10 " in said
