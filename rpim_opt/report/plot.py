@@ -32,7 +32,7 @@ __all__ = [
     "selectors",
 ]  # fmt: skip
 
-Axes = Any  # matplotlib's, which is imported by whoever makes the axes
+Axes = Any  # matplotlib's, imported where axes are made
 
 # --- errors ------------------------------------------------------------------------------------------------
 

@@ -63,6 +63,5 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
         raise InputError(where, f"{type(error).__name__}: {error}", "code that runs", source) from error
     found = getattr(content, attribute, None)
     if not isinstance(found, kind):
-        article = "a" if kind.__name__[0] not in "AEIOU" else "an"
-        raise InputError(where, f"{attribute} = {found!r}"[:80], f"{article} {kind.__name__} of that name", source)
+        raise InputError(where, f"{attribute} = {found!r}"[:80], f"a {kind.__name__} of that name", source)
     return found
