@@ -148,7 +148,6 @@ def test_heavy_libraries_wait_until_they_are_used(code: str) -> None:
 SMALL = "calibrate paper_arm"
 ELSEWHERE = {
     "rpim_opt.calibration.leverage",
-    "rpim_opt.calibration.group_weights",
     "rpim_opt.convex.infeasible",
     "rpim_opt.bayes.population",
     "rpim_opt.convex.tolerances",

@@ -41,7 +41,7 @@ ELSEWHERE = "The stated frames are far from their registration; deviations count
 def calibrate(
     problem: Source,
     formulation: Formulation | str = tikhonov,
-    weight: float | str | Selector | Mapping[str, Any] | None = None,
+    weight: float | str | Selector | None = None,
     *,
     prior: Prior | None = None,
     model: str = "geometry",
@@ -78,8 +78,7 @@ def calibrate(
     weight
         None or ``"learned"``: hyperparameters are estimated. A number, or a selection rule (or its name) over the
         stated scales, which sees identification data only; it is asked anew until the steps become small, then the
-        weight stays. Several weights by patterns, kinds or links of parameters:
-        ``{"alpha? theta?": ro.reml, "a? d?": 3.0}``.
+        weight stays. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
     prior
         Of the deviations, beyond the scales of the parameters.
     model
@@ -149,12 +148,7 @@ def calibrate(
     if weight is None and formulation.penalty is None:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
-    if isinstance(weight, Mapping):
-        from rpim_opt.calibration.group_weights import grouped
-
-        result = grouped(problem, formulation, weight, prior=prior, start=start, options=options)
-        asked = result.asked
-    elif weight is None:
+    if weight is None:
         found = estimate(problem, estimator, model, start)
         formulation = found.stated.penalized(formulation)
         result = calibrated(found.problem, formulation, 1.0, start=found.x, options=options)

@@ -158,9 +158,6 @@ def _one_weight(result: Outcome) -> str:
         return f"Formulation '{name}' has no penalty and needs no weight."
     if result.selection is None:
         return f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."
-    if result.selection.groups:
-        weights = ", ".join(f"{group} {weight:.4g}" for group, weight in result.selection.groups.items())
-        return f"Weights {weights} ({selector(result)}: {result.selection.note}), formulation '{name}'."
     rule = ": ".join(filter(None, [selector(result), result.selection.note]))
     text = f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."
     return " ".join(filter(None, [text, disagreement(result.program)]))

@@ -88,7 +88,7 @@ LEARNED = "learned"
 
 
 def weight_of(stated: Any) -> Any:
-    """Return a weight, a selector, weights of groups, or what a name stands for; None for "learned".
+    """Return a weight, a selector, or what a name stands for; None for "learned".
 
     InputError for a name that no selector has.
     """

@@ -159,10 +159,8 @@ def _selector(label: str, each: Any) -> tuple[str, Any]:
     if callable(each):
         ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
         return label or ready, each
-    if isinstance(each, Mapping) and label:
-        return label, each
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
-        accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}; weights of groups by a name"
+        accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}"
         raise InputError("selectors", f"{each!r}", accepted)
     if isinstance(each, int):
         each = number(each, "selectors")

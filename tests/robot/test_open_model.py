@@ -257,7 +257,7 @@ def test_a_term_is_asked_anew_and_kept_within_a_calibration() -> None:
     assert np.abs(problem.residual(x) - before).max() > 1e-5
 
 
-def test_penalties_groups_scales_and_the_learned_prior_know_its_parameters() -> None:
+def test_scales_and_the_learned_prior_know_its_parameters() -> None:
     _, own = both("ecc2_cos")
     own = measured(own, noise=SIGMA, own2=3e-4)
     scaled = own.parameters.scaled({"own?_mrad": 0.7})
@@ -267,8 +267,6 @@ def test_penalties_groups_scales_and_the_learned_prior_know_its_parameters() -> 
     learned = ro.calibrate(own)
     assert learned.converged
     assert set(learned.learned.sizes) == {"lengths", "angles", "own", "base"}
-    grouped = ro.calibrate(own, ro.tikhonov, weight={"own": 10.0, "alpha a d": 1.0, "tool base": 0.1})
-    assert grouped.converged
     assert " own2 " in words.parameter_table(learned)
 
 

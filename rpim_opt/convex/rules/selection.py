@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from functools import wraps
 from typing import Any
 
@@ -47,8 +47,6 @@ class Selection(Tabled):
         Whether the choice lies inside the weights that were tried. If not, ``note`` says what that means.
     note
         One sentence for the report.
-    groups
-        The weights of groups of parameters, where each has its own: they are in the scales then, and ``weight`` is 1.
 
     Examples
     --------
@@ -72,7 +70,6 @@ class Selection(Tabled):
     score: Array
     interior: bool
     note: str = ""
-    groups: Mapping[str, float] = field(default_factory=dict)
 
     def _short(self) -> str:
         where = "inside" if self.interior else "at an edge of"
