@@ -186,7 +186,7 @@ def test_a_penalty_that_hardly_holds_some_parameters_leaves_the_others_to_the_da
     assert gap(result) < 1e-8
 
 
-@pytest.mark.parametrize("weight", ["reml", None, [1.0], 1j, np.complex128(1), True, -1.0, np.nan])
+@pytest.mark.parametrize("weight", ["reml", None, [1.0], {"a?": 3.0}, 1j, np.complex128(1), True, -1.0, np.nan])
 def test_a_program_takes_a_number_as_weight(model: Any, weight: Any) -> None:
     program = ro.convex.pose(ro.tikhonov, model)
     for ask in (program.solve, program.problem, lambda w: program.path([w])):

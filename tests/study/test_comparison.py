@@ -191,7 +191,7 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"splits": []}, r"splits: found \[\]"),
         ({"selectors": ["reml", ro.reml]}, "'tikhonov, reml' twice"),
         ({"selectors": [lambda _: 1.0, lambda _: 2.0]}, "'tikhonov, <lambda>' twice"),
-        ({"selectors": [{"length": 1.0, "angle": 2.0}]}, "weights of groups by a name"),
+        ({"selectors": [{"length": 1.0}]}, "a number, a selector"),
         ({"formulations": (), "selectors": "reml"}, "formulations: found none"),
         ({"methods": 3}, "methods: found 3"),
         ({"metrics": []}, "metrics: found none"),
