@@ -428,7 +428,7 @@ def _certified(
     if loop.reweigh is not None:
         formulation, _ = in_blocks(formulation, lambda: state.program.model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
-        anew = problem.frozen()
+        anew = in_parts(problem.frozen())
         model = around(anew.linearize(loop.scale * state.z), *about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)

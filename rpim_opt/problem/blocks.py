@@ -31,7 +31,7 @@ ROWS = 4096
 FEW = 1024
 """Rows that are evaluated and reduced together: as many as a core's cache holds."""
 KEPT = 200_000
-"""Equations up to which a problem keeps its rows; beyond, only their QR factor."""
+"""Equations up to which a calibration keeps its rows, wherever they stand; beyond, only their QR factor."""
 Part = Callable[[], Dataset]
 """Reads some of the measurements; whole configurations."""
 
@@ -154,6 +154,23 @@ class PartitionedProblem(RobotModel):
                 yield self.on(replace(data, label=label, configuration=data.configuration + configurations))
                 configurations += int(data.configuration.max()) + 1
 
+    def gathered(self) -> CalibrationProblem | None:
+        """Return the problem with all rows in memory; None where they have more than `KEPT` equations."""
+        parts: list[Dataset] = []
+        equations = 0
+        for part in self.rows():
+            equations += len(part.owners)
+            if equations > KEPT:
+                return None
+            parts.append(part.data)
+        if not parts:
+            raise InputError("data", "no row", "at least one")
+        first = np.cumsum([0, *(len(data) for data in parts)])
+        pairs = zip(parts, first, strict=False)
+        blocks = tuple(replace(block, row=block.row + start) for data, start in pairs for block in data.blocks)
+        labels = tuple(label for data in parts for label in data.label)
+        return self.on(Dataset(blocks, labels, np.concatenate([data.configuration for data in parts])))
+
     @property
     def labels(self) -> tuple[str, ...]:
         """N labels of the rows, ``block:label``, blocks counted from 1."""
@@ -197,9 +214,9 @@ Source = CalibrationProblem | PartitionedProblem
 
 
 def in_parts(problem: Source) -> Source:
-    """Return the problem in blocks of whole configurations where it has more than `KEPT` equations, else as it is."""
+    """Return the problem in memory, or where it has more than `KEPT` equations in blocks of whole configurations."""
     if isinstance(problem, PartitionedProblem):
-        return problem
+        return problem.gathered() or problem
     if sum(index.size for index in equation_numbers(problem.data)) <= KEPT:
         return problem
     parts = [partial(_taken, problem.data, rows) for rows in whole_configurations(problem.data, KEPT // 4)]

@@ -34,6 +34,12 @@ def whole() -> ro.CalibrationProblem:
     return ro.load("blunders").problem
 
 
+@pytest.fixture
+def too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with more equations than are kept in memory."""
+    monkeypatch.setattr(PartitionedProblem, "gathered", lambda self: None)
+
+
 def x_of(problem) -> np.ndarray:
     return 0.3 * problem.parameters.free.scale
 
@@ -73,6 +79,7 @@ def test_errors_of_several_kinds(name: str) -> None:
         np.testing.assert_allclose(np.sort(here), np.sort(there), rtol=1e-12)
 
 
+@pytest.mark.usefixtures("too_many")
 def test_flags_come_from_all_parts_and_are_dropped_in_all(whole: ro.CalibrationProblem) -> None:
     there = ro.calibrate(whole, ro.robust, 1.0)
     here = ro.calibrate(apart(whole), ro.robust, 1.0)
@@ -163,6 +170,7 @@ ROBUST = {
 }
 
 
+@pytest.mark.usefixtures("too_many")
 @pytest.mark.parametrize("formulation", ROBUST)
 @pytest.mark.parametrize(("name", "variant"), [("blunders", None), ("paper_arm", "misprints"), ("pose", None)])
 def test_robust_losses_take_few_passes_more(name: str, variant: str | None, formulation: str) -> None:
@@ -174,6 +182,7 @@ def test_robust_losses_take_few_passes_more(name: str, variant: str | None, form
     assert here.history[-1].objective == pytest.approx(there.history[-1].objective, rel=1e-8)
 
 
+@pytest.mark.usefixtures("too_many")
 def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationProblem) -> None:
     there, here = ro.calibrate(whole, ro.robust, 1.0), ro.calibrate(apart(whole), ro.robust, 1.0)
     assert here.linear.equations == there.linear.equations
@@ -185,6 +194,7 @@ def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationPro
     assert chosen.weight == pytest.approx(ro.reml(squared).weight, rel=1e-2)
 
 
+@pytest.mark.usefixtures("too_many")
 @pytest.mark.parametrize(
     "formulation",
     [ro.minimax, ro.Formulation("limited", penalty=cp.sum_squares, largest=50.0),
@@ -197,6 +207,7 @@ def test_losses_that_are_no_sums_are_refused(whole: ro.CalibrationProblem, formu
         ro.calibrate(apart(whole), formulation, 1.0)
 
 
+@pytest.mark.usefixtures("too_many")
 def test_threads_and_pickled_tasks_give_the_same(whole: ro.CalibrationProblem) -> None:
     def elsewhere(task, parts):
         return [pickle.loads(pickle.dumps(task))(part) for part in parts]
@@ -208,6 +219,7 @@ def test_threads_and_pickled_tasks_give_the_same(whole: ro.CalibrationProblem) -
     assert callable(on_cluster)
 
 
+@pytest.mark.usefixtures("too_many")
 def test_an_own_measurement_in_parts_is_asked_once_a_calibration(monkeypatch) -> None:
     asked = []
 
@@ -269,3 +281,29 @@ def test_functions_of_a_script_are_called_one_after_the_other() -> None:
     assert PartitionedProblem(whole.robot, whole.parameters, own[0](), own).compute is map
     files = ro.problem.partitions(["a.csv", "b.csv"], whole.robot, {"position_mm": 0.03})
     assert PartitionedProblem(whole.robot, whole.parameters, own[0](), files).compute is threads.on_all_cores
+
+
+def test_rows_that_fit_are_those_of_one_table(whole: ro.CalibrationProblem) -> None:
+    """So that every rule and every loss see the same, wherever the rows stand."""
+    table = whole.on(whole.data.take(np.concatenate(thirds(whole))))
+    there, here = (problem.linearize(x_of(whole)) for problem in (table, in_parts(apart(whole))))
+    assert np.array_equal(here.A, there.A)
+    assert np.array_equal(here.b, there.b)
+    assert len(np.unique(here.group)) == len(np.unique(there.group))
+
+
+@pytest.mark.parametrize("count", [2, 7])
+@pytest.mark.parametrize(
+    ("formulation", "rule"),
+    [("minimax", "l_curve"), ("sum_of_norms", "leave_one_out"), ("lasso", "k_fold"), ("robust", "two_step"),
+     ("group_lasso", "corner"), ("tikhonov", "ncp")],
+)  # fmt: skip
+def test_storage_decides_nothing(formulation: str, rule: str, count: int) -> None:
+    table = ro.load("position").problem
+    parts = [partial(table.data.take, rows) for rows in np.array_split(np.arange(40), count)]
+    with ThreadPoolExecutor(2) as pool:
+        blocks = PartitionedProblem(table.robot, table.parameters, table.data, parts, pool.map)
+        there, here = ro.calibrate(table, formulation, rule), ro.calibrate(blocks, formulation, rule)
+    assert here.converged == there.converged
+    assert here.weight == pytest.approx(there.weight, rel=1e-5)  # sums in another order, through an interior point
+    np.testing.assert_allclose(here.z, there.z, rtol=0, atol=1e-6)

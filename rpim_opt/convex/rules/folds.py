@@ -85,6 +85,8 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
         return _least(program, "k_fold", _error_of_folds(program, _division(groups, parts)))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
+    place = np.unique(program.model.group, return_index=True)[1]
+    groups = groups[np.argsort(place)]  # by their rows: numbers depend on where the rows stand
     parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
     return _least(program, "k_fold", _error_of_folds(program, parts))
 
