@@ -125,6 +125,48 @@ def region_of(result: Outcome, requirement: Requirement) -> Region:
     return Region(machine, None if requirement.box is None else np.array(requirement.box), marker)
 
 
+@dataclass(frozen=True, eq=False)
+class Workspace:
+    """Expanded uncertainty (N,) [m] of the positions reached (N, 3) [m] at configurations q (N, dof) of a region.
+
+    The last configuration is the worst that a search from the worst of the others found.
+    """
+
+    requirement: Requirement
+    region: Region
+    q: Array
+    position: Array
+    expanded: Array
+
+    @property
+    def count(self) -> int:
+        """How many were drawn."""
+        return len(self.q) - 1
+
+    @property
+    def largest(self) -> float:
+        """The largest one [m]."""
+        return float(self.expanded[-1])
+
+    @property
+    def typical(self) -> float:
+        """The median of those that were drawn [m]."""
+        return float(np.median(self.expanded[:-1]))
+
+
+def workspace(result: Outcome, requirement: Requirement, region: Region, q: Array) -> Workspace:
+    """Return the expanded uncertainty at configurations q (N, dof) of a region and at the worst that a search finds.
+
+    InputError for a formulation without covariance.
+    """
+
+    def bound(q: Array) -> Array:
+        return reaching(result, region, q, requirement.confidence)[1]
+
+    q = np.vstack([q, region.largest(q, bound(q), bound)])
+    return Workspace(requirement, region, q, *reaching(result, region, q, requirement.confidence))
+
+
 def reaching(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
     """Return where the robot will be at configurations (N, dof), (N, 3) [m], and bounds (N,) on how far off it is."""
     found = Uncertainty(result, confidence).predict(q, region.marker, of="reached")
@@ -243,12 +285,10 @@ class Acceptance:
         repeatability at its least is above the limit. ``"undecided"``: something is lacking.
     reasons
         What rejects it, or what is lacking, a sentence each.
-    count, bound, typical
-        How many configurations of the region were drawn; the largest bound, and the median of those drawn [m].
+    workspace
+        The bounds at configurations of the region; None where there are none.
     scatter
         What would be left of the largest bound if all parameters were known [m].
-    worst, place
-        (dof,) joint values [rad or m] and predicted position (3,) [m] of the largest bound.
     checked
         The held-out rows, beside the limit.
 
@@ -264,13 +304,14 @@ class Acceptance:
     requirement: Requirement
     verdict: Verdict
     reasons: tuple[str, ...]
-    count: int = 0
-    bound: float | None = None
-    typical: float | None = None
+    workspace: Workspace | None = None
     scatter: float | None = None
-    worst: Array | None = None
-    place: Array | None = None
     checked: Checked | None = None
+
+    @property
+    def bound(self) -> float | None:
+        """The largest bound [m]."""
+        return None if self.workspace is None else self.workspace.largest
 
     def sentences(self) -> list[str]:
         """Return the verdict and what it rests on, sentence by sentence."""
@@ -280,10 +321,11 @@ class Acceptance:
             f"{said}: limit {limit} with {percent(self.requirement.confidence)} at every configuration of the region."
         ]
         lines.append(f"Region: {self.requirement.where}.")
-        if self.bound is not None and self.typical is not None and np.isfinite(self.bound):
+        found = self.workspace
+        if found is not None and np.isfinite(found.largest):
             lines.append(
-                f"Expanded uncertainty of the position reached: U = {1e3 * self.bound:.3f} mm at most (worst of "
-                f"{self.count} configurations and a search from there), median {1e3 * self.typical:.3f} mm."
+                f"Expanded uncertainty of the position reached: U = {1e3 * found.largest:.3f} mm at most (worst of "
+                f"{found.count} configurations and a search from there), median {1e3 * found.typical:.3f} mm."
             )
         if self.checked is not None:
             lines.append(self.checked.sentence())
@@ -295,7 +337,7 @@ class Acceptance:
 
     def content(self) -> dict[str, Any]:
         """Return the same as a document [mm]."""
-        r = self.requirement
+        r, found = self.requirement, self.workspace
         box = None
         if r.box is not None:
             box = {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
@@ -305,12 +347,12 @@ class Acceptance:
             "confidence": r.confidence,
             "region": r.where,
             "box_mm": box,
-            "configurations": self.count,
-            "bound_mm": _milli(self.bound),
-            "typical_mm": _milli(self.typical),
+            "configurations": 0 if found is None else found.count,
+            "bound_mm": _milli(found and found.largest),
+            "typical_mm": _milli(found and found.typical),
+            "worst": found and found.q[-1].tolist(),
+            "place_mm": found and (1e3 * found.position[-1]).tolist(),
             "scatter_mm": _milli(self.scatter),
-            "worst": None if self.worst is None else self.worst.tolist(),
-            "place_mm": None if self.place is None else (1e3 * self.place).tolist(),
             "checked": self.checked and self.checked.content(),
             "reasons": list(self.reasons),
         }
@@ -363,34 +405,22 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     if data is not None:
         refuse_misread(result, data)
     region = region_of(result, requirement)
-    confidence = requirement.confidence
     q = region.drawn()
     seen = checked(result, region, requirement, data)
     against = list(result.verdict.reasons)
     lacking = _lacking(result, region, seen)
     try:
-        drawn = reaching(result, region, q, confidence)[1]
+        mapped = workspace(result, requirement, region, q)
     except InputError as error:
         reasons = (*against, *lacking, f"No bound: {error}")
-        return Acceptance(requirement, "rejected" if against else "undecided", reasons, len(q), checked=seen)
-    worst = region.largest(q, drawn, lambda q: reaching(result, region, q, confidence)[1])
-    place, bounds = reaching(result, region, worst[None], confidence)
-    bound = float(bounds[0])
-    scatter, least = scatter_bounds(result, region, worst, confidence)
+        return Acceptance(requirement, "rejected" if against else "undecided", reasons, checked=seen)
+    scatter, least = scatter_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += _against(requirement, least, seen)
-    lacking += _wide(requirement.limit, bound, scatter)
-    return Acceptance(
-        requirement,
-        "rejected" if against else "undecided" if lacking else "accepted",
-        tuple(against or lacking),
-        count=len(q),
-        bound=bound,
-        typical=float(np.median(drawn)),
-        scatter=scatter,
-        worst=worst,
-        place=place[0],
-        checked=seen,
-    )
+    lacking += _wide(requirement.limit, mapped.largest, scatter)
+    verdict: Verdict = "accepted"
+    if against or lacking:
+        verdict = "rejected" if against else "undecided"
+    return Acceptance(requirement, verdict, tuple(against or lacking), mapped, scatter, seen)
 
 
 def checked(result: Calibration, region: Region, requirement: Requirement, data: Dataset | None) -> Checked | None:

@@ -22,8 +22,6 @@ SAME_SEARCH = float(np.log(SAME_WEIGHT))
 """The same of weights from a search."""
 SAME_ROBUST = 1e-6
 """The same of a robust loss, whose weight does not depend on how the measurements are stored."""
-RUNAWAY = 0.1
-"""A lower end of weights below this share of the last one has run away."""
 MOST_ANSWERS = 10
 """How many different answers a rule may give in turn."""
 
@@ -32,16 +30,15 @@ MOST_ANSWERS = 10
 class WeightChoice:
     """The weight of an iteration, and what is known of its choice.
 
-    ``rule`` is None for a number; ``answers`` are all of its answers in turn, ``selection`` the last one, ``inside``
-    the last that was inside the weights that it tried. ``settled``: the weight stays while the loop comes to rest;
-    ``final``: for good. ``robust``: the loss is a sum over rows, but no square.
+    ``rule`` is None for a number; ``answers`` are all of its answers in turn, ``selection`` the last one.
+    ``settled``: the weight stays while the loop comes to rest; ``final``: for good. ``robust``: the loss is a sum over
+    rows, but no square.
     """
 
     rule: Selector | None
     weight: float = 0.0
     selection: Selection | None = None
     answers: tuple[float, ...] = ()
-    inside: Selection | None = None
     settled: bool = False
     final: bool = False
     note: str = ""
@@ -74,15 +71,9 @@ class WeightChoice:
         if not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"selector {selection.name}", f"weight {weight}", "a number, zero or more")
         chosen = replace(self, weight=weight, selection=selection, answers=(*self.answers, weight))
-        if selection.interior:
-            chosen = replace(chosen, inside=selection)
-        if program.closed_form:
-            return chosen._checked()
-        ended = self._ended(selection)
-        if ended is not None:
-            return ended
-        # whose paths are dear: the next answer is asked for where this one leads
-        return replace(chosen, settled=True)._checked()
+        if not program.closed_form:  # whose paths are dear: the next answer is asked for where this one leads
+            chosen = replace(chosen, settled=True)
+        return chosen._checked()
 
     def after(self, step: float) -> WeightChoice:
         """Return the choice after a step of that length, relative to the solution."""
@@ -113,22 +104,6 @@ class WeightChoice:
             return self._settled_between(last[-2], last[-1])
         return self
 
-    def _ended(self, selection: Selection) -> WeightChoice | None:
-        """End a rule that left an answer inside its weights for their lower end, and then does not stay there."""
-        if self.inside is None or self.selection is None or not _lowest(self.selection):
-            return None
-        before = self.selection.weight
-        if _same(selection.weight, self.inside.weight):
-            return replace(self._settled_between(selection.weight, before), selection=selection)
-        if not _lowest(selection) or selection.weight > RUNAWAY * before:
-            return None
-        weight = self.inside.weight
-        note = (
-            f"The rule {selection.name} decreases the weight at every iteration, {before:.2g} and then "
-            f"{selection.weight:.2g}: its last choice inside the range of weights, {weight:.2g}, is used."
-        )
-        return replace(self, weight=weight, selection=self.inside, settled=True, final=True, note=note)
-
     def _settled_between(self, one: float, other: float) -> WeightChoice:
         low, high = sorted((one, other))
         name = self.selection.name if self.selection else "selector"
@@ -156,11 +131,6 @@ def _resolution(selection: Selection | None) -> float:
         return SAME
     between = 0.5 * float(np.log(order[place + 1] / order[place - 1]))
     return float(np.clip(between, SAME, SAME_SEARCH))
-
-
-def _lowest(selection: Selection) -> bool:
-    """Whether an answer is the smallest weight that was tried, as that is where the search ended."""
-    return not selection.interior and selection.weight <= np.min(selection.weights)
 
 
 def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:

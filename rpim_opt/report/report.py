@@ -18,7 +18,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
-from rpim_opt.calibration.acceptance import Acceptance
+from rpim_opt.calibration.acceptance import Acceptance, Workspace
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -69,7 +69,7 @@ class Content:
 
     result: Calibration
     accepted: Acceptance | None
-    map: summary.Workspace | None
+    map: Workspace | None
     composition: list[str]
     embedded: dict[str, Any]
 
@@ -83,7 +83,11 @@ def page(result: Calibration) -> str:
     if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
         warnings = [" ".join(composition), *warnings]
         composition = []
-    content = Content(result, summary.acceptance(result), summary.workspace(result), composition, {})
+    accepted = summary.acceptance(result)
+    found = summary.workspace(result) if accepted is None else accepted.workspace
+    if found is not None and not np.isfinite(found.expanded).all():
+        found = None
+    content = Content(result, accepted, found, composition, {})
     return render(
         f"Calibration: {heading}",
         f"Robot calibration report, {result.record.made[:10]}",
@@ -122,9 +126,10 @@ def _headline(content: Content) -> Iterator[Block]:
         ("Maximum error, identified", "after", mm(after["max_mm"]), f"of {after['count']} rows"),
     ]
     if content.map is not None:
-        largest = content.map.expanded.max()
         sure = percent(content.map.requirement.confidence)
-        cards.append(("Expanded uncertainty U", "after", mm(1e3 * largest), f"{sure}, maximum over the region"))
+        cards.append(
+            ("Expanded uncertainty U", "after", mm(1e3 * content.map.largest), f"{sure}, maximum over the region")
+        )
     yield "cards", cards
 
 
@@ -180,9 +185,9 @@ def _accuracy(content: Content) -> Iterator[Block]:
 
 def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
     lines = found.sentences()[1:]
-    if found.worst is not None:
+    if found.workspace is not None:
         units = joint_columns(result.problem.robot.joint_dimensions)
-        values = [f"{value / si:.1f}" for value, si in zip(found.worst, units.values(), strict=True)]
+        values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]
         named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
         lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
     if found.scatter is not None and not found.reasons:
@@ -199,7 +204,7 @@ def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure
     ]
 
 
-def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block]:
+def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     notes = [
         "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
         "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
@@ -209,7 +214,7 @@ def _uncertainty(map_: summary.Workspace, result: Calibration) -> Iterator[Block
     if result.record.requirement is not None:
         limit = 1e3 * map_.requirement.limit
     else:
-        notes.insert(0, map_.sentence())
+        notes.insert(0, summary.workspace_sentence(map_))
     yield "text", notes
     box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.machine, map_.q, map_.region.marker)

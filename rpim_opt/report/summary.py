@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
@@ -20,7 +20,7 @@ from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
 
 if TYPE_CHECKING:
-    from rpim_opt.calibration.acceptance import Acceptance, Region
+    from rpim_opt.calibration.acceptance import Acceptance, Workspace
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
@@ -107,45 +107,26 @@ def cells(rows: Sequence[Mapping[str, Any]], unit: Unit = "mm") -> list[list[str
     ]
 
 
-class Workspace(NamedTuple):
-    """Region, configurations (N, dof), and expanded uncertainty (N,) [m] of the position reached at each.
-
-    The last configuration is the worst that a search from the worst of the others found, as in `accept`.
-    """
-
-    region: Region
-    q: Array
-    expanded: Array
-    requirement: Requirement
-
-    def sentence(self) -> str:
-        """Return its maximum and median in a sentence."""
-        return (
-            f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
-            f"{mm(1e3 * self.expanded.max())} mm (worst of {len(self.q) - 1} configurations and a search from there), "
-            f"median {mm(1e3 * float(np.median(self.expanded)))} mm; region: {self.requirement.where}."
-        )
-
-
 def workspace(result: Calibration) -> Workspace | None:
     """Return the expanded uncertainty over the region; None for several robots, or a formulation without covariance."""
-    from rpim_opt.calibration.acceptance import reaching, region_of
+    from rpim_opt.calibration.acceptance import region_of, workspace
 
     requirement = result.record.requirement or ANYWHERE
     try:
         region = region_of(result, requirement)
-
-        def bound(q: Array) -> Array:
-            return reaching(result, region, q, requirement.confidence)[1]
-
-        q = region.drawn()
-        expanded = bound(q)
-        if not np.isfinite(expanded).all():
-            return None
-        q = np.vstack([q, region.largest(q, expanded, bound)])
-        return Workspace(region, q, np.append(expanded, bound(q[-1:])), requirement)
+        found = workspace(result, requirement, region, region.drawn())
     except InputError:
         return None
+    return found if np.isfinite(found.expanded).all() else None
+
+
+def workspace_sentence(found: Workspace) -> str:
+    """Return maximum and median of an expanded uncertainty in a sentence."""
+    return (
+        f"Expanded uncertainty of the position reached (U, {percent(found.requirement.confidence)}): at most "
+        f"{mm(1e3 * found.largest)} mm (worst of {found.count} configurations and a search from there), "
+        f"median {mm(1e3 * found.typical)} mm; region: {found.requirement.where}."
+    )
 
 
 def acceptance(result: Calibration) -> Acceptance | None:
@@ -257,7 +238,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     accepted = acceptance(result)
     uncertainty = workspace(result) if accepted is None else None  # an acceptance test states it, too
     remarks = [
-        *([] if uncertainty is None else [uncertainty.sentence()]),
+        *([] if uncertainty is None else [workspace_sentence(uncertainty)]),
         *words.weight_lines(result),
         identifiability(result),
         *words.noise_sentence(result),

@@ -94,8 +94,8 @@ def test_a_region_is_where_it_says_and_its_largest_bound_is_searched_for(result)
     found = accept(result, required)
     bound = reaching(result, region, q, 0.95)[1]
     assert found.bound >= bound.max()
-    assert region.inside(found.worst[None])[0]
-    assert found.typical == pytest.approx(np.median(bound))
+    assert region.inside(found.workspace.q[-1:])[0]
+    assert found.workspace.typical == pytest.approx(np.median(bound))
 
 
 def test_what_no_region_can_be_is_refused(result) -> None:

@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Checked, _wide, scatter_bounds
+from rpim_opt.calibration.acceptance import Acceptance, Checked, Workspace, _wide, scatter_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.covariance import require_interval as interval
 from rpim_opt.calibration.lack_of_fit import Autocorrelation, Effect, LackOfFit, autocorrelation
@@ -24,6 +24,13 @@ LIMIT = Requirement(1e-4)
 # --- acceptance ----------------------------------------------------------------------------------------------------
 
 
+def expanded(count: int, largest: float, typical: float) -> Workspace:
+    """The uncertainty at so many configurations and at the worst."""
+    region: Any = None
+    values = np.append(np.full(count, typical), largest)
+    return Workspace(LIMIT, region, np.zeros((count + 1, 6)), np.zeros((count + 1, 3)), values)
+
+
 def test_an_acceptance_says_what_it_rests_on() -> None:
     bare = Acceptance(LIMIT, "undecided", ("Lacking: rows.",))
     assert bare.sentences() == [
@@ -32,12 +39,12 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
         "Lacking: rows.",
     ]
     assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "scatter", "box")] == [None] * 4
-    free = Acceptance(LIMIT, "undecided", (), 500, np.inf, 5e-5, 2e-5)
+    free = Acceptance(LIMIT, "undecided", (), expanded(500, np.inf, 5e-5), 2e-5)
     assert "The position reached" not in str(free)
     assert free.content()["bound_mm"] is None
     assert free.content()["typical_mm"] == pytest.approx(0.05)
     seen = Checked(3, 8e-5, 2e-5, (), 4, (), 0.9)
-    whole = Acceptance(LIMIT, "accepted", (), 500, 9e-5, 5e-5, 2e-5, checked=seen)
+    whole = Acceptance(LIMIT, "accepted", (), expanded(500, 9e-5, 5e-5), 2e-5, checked=seen)
     assert whole.sentences()[2:] == [
         "Expanded uncertainty of the position reached: U = 0.090 mm at most (worst of 500 configurations and a search "
         "from there), median 0.050 mm.",
