@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
 from scipy.special import chdtrc, chdtri, fdtrc, pdtrc
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.quadratic import Quadratic
-from rpim_opt.convex.trust import RARE
+from rpim_opt.convex.quadratic import Quadratic, ridge
+from rpim_opt.convex.trust import RARE, kept_equations
 from rpim_opt.data.dataset import Block
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
@@ -36,8 +37,8 @@ NEIGHBOURS, ALIKE = 3, 0.7
 WIDE = 30.0
 """Factor on prior scales, so that no prior alone makes an outlier. Chosen on 300 simulated arms with ten good
 configurations, of which 7 have an outlier then, and 40 without this test; on 300 others 7 and 41. Meant are 3."""
-LOOSE = 1e-9
-"""Part of the largest singular value below which the other equations do not decide a direction."""
+UNDECIDED = 1e-5
+"""Share of a configuration's slopes along directions that the others do not decide, from which on they cannot tell."""
 
 
 def by_block(problem: CalibrationProblem, values: Array) -> Iterator[tuple[Block, Array]]:
@@ -207,51 +208,34 @@ def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels
 def contradicted(
     model: LinearModel, penalty: Quadratic | None, weight: float, width: Array, groups: np.ndarray
 ) -> np.ndarray:
-    """Return which of some configurations (g,) the others contradict.
+    """Return which of some configurations (g,) of these numbers the others contradict.
 
     A robust loss may fit half of few equations at the expense of the other half, of which none is wrong. So all the
     possible outliers together are left out, and each is compared with what the rest predicts, by the false rate of
-    flags::
+    flags; the penalty has its weight, and ``width`` (n,) are prior scales in units of the stated ones::
 
         e' (sigma^2 (I + A_i H^-1 A_i'))^-1 e,    H = A' A + weight L' L of the rest,    e = b_i - A_i z
-
-    Parameters
-    ----------
-    model
-        All equations, linearized at the solution, in units of their noise.
-    penalty, weight
-        |L z - c|^2 and its weight; None where there is none.
-    width
-        (n,) prior scales of deviations, in units of the stated ones.
-    groups
-        (g,) numbers of the configurations.
     """
-    rest = ~np.isin(model.group, groups)
-    A, b = model.A[rest], model.b[rest]
-    n = A.shape[1]
-    L, c = np.zeros((0, n)), np.zeros(0)
-    if penalty is not None and weight > 0:
-        L = np.sqrt(weight) * penalty.matrix / (WIDE * width)
-        c = np.sqrt(weight) * penalty.c
-    U, s, V = np.linalg.svd(np.vstack([A, L]), full_matrices=False)
-    seen = s > LOOSE * s[0]
-    root = V[seen].T / s[seen]  # H^-1 = root root'
-    z = root @ (U[:, seen].T @ np.concatenate([b, c]))
-    spare = len(b) - float(np.sum((A @ root) ** 2))
+    rest = kept_equations(model, ~np.isin(model.group, groups), 1.0)
+    if penalty is not None:
+        penalty = replace(penalty, L=penalty.matrix / (WIDE * width))
+    form = ridge(rest, penalty)
+    z = form.minima(np.array([weight]))[0]
+    C = form.noise(weight) + form.prior(weight)
+    undecided = form.undecided(weight)
+    spare = len(rest.b) - form.degrees_of_freedom(weight)
     sigma2 = 1.0
     if spare > 1:
-        sigma2 = max(1.0, float(np.sum((A @ z - b) ** 2)) / spare)
-    undecided = np.eye(n) - V[seen].T @ V[seen]
+        sigma2 = max(1.0, float(np.sum((rest.A @ z - rest.b) ** 2)) / spare)
     rare = RARE / len(np.unique(model.group))
     found = []
     for number in groups:
-        rows = model.group == number
-        a = model.A[rows]
-        e = a @ z - model.b[rows]
-        squares = float(e @ np.linalg.solve(np.eye(len(a)) + (a @ root) @ (a @ root).T, e)) / sigma2
-        chance = chdtrc(len(a), squares)
+        A = model.A[model.group == number]
+        e = A @ z - model.b[model.group == number]
+        squares = float(e @ np.linalg.solve(np.eye(len(A)) + A @ C @ A.T, e)) / sigma2
+        chance = chdtrc(len(A), squares)
         if sigma2 > 1:  # it was estimated: Fisher's F
-            chance = fdtrc(len(a), spare, squares / len(a))
-        decided = np.linalg.norm(a @ undecided) <= np.sqrt(LOOSE) * np.linalg.norm(a)
+            chance = fdtrc(len(A), spare, squares / len(A))
+        decided = np.linalg.norm(A @ undecided) <= UNDECIDED * np.linalg.norm(A)
         found.append(bool(decided and chance < rare))
     return np.array(found, dtype=bool)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -120,20 +120,8 @@ def compare(
     ways = {split.label: split for split in splits_of(splits)}
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
-    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
-        if seeds > MOST_DRAWS:
-            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
-        seeds = range(max(int(seeds), 0))
-    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
+    numbered = _seeds(seeds)
     figured = metrics_of(metrics)
-    cases: list[Row] = []
-    for source, split, count, factor in product(sources.values(), ways.values(), sizes, factors):
-        random = source.drawn or split.label != FOLDER or count is not None or factor > 1
-        drawn = numbered if random else numbered[:1]
-        for seed, fold, method in product(drawn, range(1, split.folds + 1), compared.values()):
-            case = {"problem": source.label, "method": method.label, "formulation": method.formulation}
-            case |= {"selector": method.selector, "split": split.label, "fold": fold, "count": count}
-            cases.append({**case, "noise_factor": float(factor), "seed": seed})
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
         return partial(
@@ -141,17 +129,10 @@ def compare(
         )
 
     made = provenance()
-    code: dict[str, str] = {}
-    path = None
-    if journal is not None:
-        require_package("joblib", "journal")
-        from rpim_opt.study.content_hash import content_hash
-
-        path = Path(journal)
-        stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
-        code = {**package_code(), **{f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}}
-        with refused(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+    cases = list(_cases(product(sources.values(), ways.values(), sizes, factors), numbered, compared.values()))
+    stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
+    path = None if journal is None else Path(journal)
+    code = {} if path is None else _journal_code(path, stated)
     with progress_bar("comparing", progress) as say:
         rows = run_cases(cases, work, workers, scheduler, say, path, code, resume)
     axes = {
@@ -167,6 +148,44 @@ def compare(
     asked = {name: ", ".join(values) for name, values in axes.items() if values}
     families = frozenset(label for label, source in sources.items() if source.drawn)
     return Comparison(tuple(rows), tuple(figured), families, asked, made)
+
+
+def _cases(grid: Iterable[Any], seeds: Sequence[int], methods: Iterable[Method]) -> Iterator[Row]:
+    """Yield the cases of a grid of source, split, count and noise factor; what no seed changes is there once."""
+    for source, split, count, factor in grid:
+        random = source.drawn or split.label != FOLDER or count is not None or factor > 1
+        for seed, fold, method in product(seeds if random else seeds[:1], range(1, split.folds + 1), methods):
+            yield {
+                "problem": source.label,
+                "method": method.label,
+                "formulation": method.formulation,
+                "selector": method.selector,
+                "split": split.label,
+                "fold": fold,
+                "count": count,
+                "noise_factor": factor,
+                "seed": seed,
+            }
+
+
+def _journal_code(path: Path, stated: Mapping[str, Any]) -> dict[str, str]:
+    """Return digests of all that replicates follow from, and make the journal's folder."""
+    require_package("joblib", "journal")
+    from rpim_opt.study.content_hash import content_hash
+
+    code = {**package_code(), **{f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}}
+    with refused(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    return code
+
+
+def _seeds(stated: Any) -> list[int]:
+    """Return which seeds there are, of a number of them or of several."""
+    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
+        if stated > MOST_DRAWS:
+            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
+        stated = range(max(int(stated), 0))
+    return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:

@@ -35,15 +35,10 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method returns: deviations x (n,) [SI], a calibration, or positions (N, 3) [m] of joint values (N, dof).
+    """What a method returns: the errors (N,) of data by dimension [m or rad], and its calibration if it is one."""
 
-    ``problem`` is the one that x belongs to, where that identifies other parameters.
-    """
-
-    x: Array | None = None
+    errors: Callable[[Dataset, str], Array]
     result: Calibration | None = None
-    predict: Callable[[Array], Array] | None = None
-    problem: CalibrationProblem | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,29 +57,43 @@ def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
     Instead of x alone it may be a problem that identifies other parameters, and x; InputError for anything else.
     """
     where = f"method {label}"
-    own = None
     match returned:
-        case (CalibrationProblem() as own, returned):
-            problem = own
+        case (CalibrationProblem() as problem, returned):
+            pass
     n = len(problem.parameters.free)
     accepted = f"{n} finite deviations [SI], or a function from joint values (N, dof) to positions (N, 3) [m]"
     if isinstance(returned, Calibration):
-        return Answer(returned.x, returned)
+        return Answer(returned.errors, returned)
     if callable(returned):
-        predict: Any = returned  # what it returns is checked where it is asked
-        return Answer(predict=predict)
+        return Answer(partial(_predicted, returned))
     try:
         x = np.asarray(getattr(returned, "x", returned), dtype=float)
     except (TypeError, ValueError):
         raise InputError(where, f"a {type(returned).__name__}", accepted) from None
     if x.shape != (n,) or not np.isfinite(x).all():
         raise InputError(where, f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}", accepted)
-    return Answer(x, problem=own)
+    return Answer(lambda data, dimension: problem.on(data).errors(x, dimension))
+
+
+def _predicted(predict: Callable[[Array], Any], data: Dataset, dimension: str) -> Array:
+    """Return the errors (N,) [m] of predicted positions; NaN of orientations."""
+    if dimension != "length":
+        return np.full(len(data), np.nan)
+    if len(data.blocks) != 1 or data.blocks[0].measurement.name != "position":
+        kinds = ", ".join(f"{block.measurement.name} {' '.join(block.markers)}".strip() for block in data.blocks)
+        raise InputError("predicted positions", kinds, "data of the positions of one reflector")
+    block = data.blocks[0]
+    predicted = np.asarray(predict(block.q[:, 0]), dtype=float)
+    if predicted.shape != block.y.shape:
+        raise InputError("predicted positions", f"shape {predicted.shape}", f"{block.y.shape} [m]")
+    errors = np.empty(len(data))
+    errors[block.row] = np.linalg.norm(block.y - predicted, axis=1)
+    return errors
 
 
 def _calibrate(instance: Instance, stated: Mapping[str, Any]) -> Answer:
     result = instance.calibrate(**stated)
-    return Answer(result.x, result)
+    return Answer(result.errors, result)
 
 
 def _apply(instance: Instance, function: Callable[[CalibrationProblem], Any], label: str) -> Answer:
@@ -182,7 +191,7 @@ class Fitted:
     held_out
         The rows that were not.
     answer
-        The method's: ``x`` (n,) [SI], ``result``, ``predict``, whichever it has.
+        The method's: its errors of data, and the ``result`` of a calibration.
     seconds
         Its time.
 
@@ -206,29 +215,11 @@ class Fitted:
 
     def errors(self, dimension: str = "length") -> Array:
         """Return the errors (N,) of the rows that were held out, in m, or in rad for ``"angle"``; NaN without any."""
-        return self._errors(self.held_out, dimension)
+        return self.answer.errors(self.held_out, dimension)
 
     def fit_errors(self) -> Array:
         """Return those (N,) [m] of the rows that were fitted."""
-        return self._errors(self.problem.data, "length")
-
-    def _errors(self, data: Dataset, dimension: str) -> Array:
-        if self.answer.result is not None:
-            return self.answer.result.errors(data, dimension)
-        if self.answer.x is not None:
-            return (self.answer.problem or self.problem).on(data).errors(self.answer.x, dimension)
-        if dimension != "length":
-            return np.full(len(data), np.nan)
-        if self.answer.predict is None or len(data.blocks) != 1 or data.blocks[0].measurement.name != "position":
-            kinds = ", ".join(f"{block.measurement.name} {' '.join(block.markers)}".strip() for block in data.blocks)
-            raise InputError("predicted positions", kinds, "data of the positions of one reflector")
-        block = data.blocks[0]
-        predicted = np.asarray(self.answer.predict(block.q[:, 0]), dtype=float)
-        if predicted.shape != block.y.shape:
-            raise InputError("predicted positions", f"shape {predicted.shape}", f"{block.y.shape} [m]")
-        errors = np.empty(len(data))
-        errors[block.row] = np.linalg.norm(block.y - predicted, axis=1)
-        return errors
+        return self.answer.errors(self.problem.data, "length")
 
 
 def _rms(errors: Array) -> float:

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.methods import METRICS, Answer, Fitted, answer_of, measure, methods_of
+from rpim_opt.study.methods import METRICS, Fitted, answer_of, measure, methods_of
 
 POSITION = ro.load("position")
 OWN = ro.Formulation("squares", penalty=cp.sum_squares)
-GROUPS = {"length": 1.0, "angle": 2.0}
 
 
 def by_hand(problem: ro.CalibrationProblem) -> float:
@@ -33,7 +32,7 @@ def test_methods_are_called_as_a_person_calls_them() -> None:
         "least_squares",
     ]
     assert labels("tikhonov", [ro.reml, by_hand]) == ["tikhonov, reml", "tikhonov, by_hand"]
-    assert labels({"mine": OWN}, {"by groups": GROUPS}, {"own": by_hand}) == ["mine, by groups", "own"]
+    assert labels({"mine": OWN}, {"heavy": 2.0}, {"own": by_hand}) == ["mine, heavy", "own"]
     assert labels((), (), [by_hand, "nominal"]) == ["by_hand", "nominal"]
 
 
@@ -41,7 +40,7 @@ def test_what_a_method_predicts_is_measured_as_what_it_calibrates() -> None:
     result = POSITION.calibrate(weight=1.0)
     held_out = POSITION.validation
     assert held_out is not None
-    predicts = Answer(predict=lambda q: result.forward(q)[:, :3, 3])
+    predicts = answer_of(lambda q: result.forward(q)[:, :3, 3], result.problem, "")
     of = {
         name: measure(POSITION, answer, 2.0, METRICS)
         for name, answer in {"calibrates": answer_of(result, result.problem, ""), "predicts": predicts}.items()
@@ -62,11 +61,11 @@ def test_what_is_no_answer_is_refused(returned: Any) -> None:
 
 def test_predictions_have_the_shape_of_positions() -> None:
     assert POSITION.validation is not None
-    wrong = Fitted(POSITION.problem, POSITION.validation, Answer(predict=lambda q: q), 0.0)
+    wrong = Fitted(POSITION.problem, POSITION.validation, answer_of(lambda q: q, POSITION.problem, ""), 0.0)
     with pytest.raises(ro.InputError, match="predicted positions"):
         wrong.errors()
     pose = ro.load("pose")
     assert pose.validation is not None
-    other = Fitted(pose.problem, pose.validation, Answer(predict=lambda q: q[:, :3]), 0.0)
+    other = Fitted(pose.problem, pose.validation, answer_of(lambda q: q[:, :3], pose.problem, ""), 0.0)
     with pytest.raises(ro.InputError, match="one reflector"):
         other.errors()
