@@ -21,7 +21,7 @@ from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box_sides, nearest
 from rpim_opt.convex.solvers.separable import Rows
-from rpim_opt.convex.solvers.solve import Warm, minimum
+from rpim_opt.convex.solvers.solve import INACTIVE, Warm, minimum
 from rpim_opt.convex.structure import Structure, structure
 from rpim_opt.convex.trust import Trusted
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
@@ -528,6 +528,24 @@ class Program(Brief):
         moves = V[rank:].T[p.at]
         U, values, _ = np.linalg.svd(moves, full_matrices=False)
         return U[:, values > TOUCHING]
+
+    def idle(self, weight: float) -> np.ndarray:
+        """Return the configurations (k,) whose equations do not pull at the minimum: a maximum rests on few of them.
+
+        None of a loss that is a square or a sum over rows, in which every row counts.
+        """
+        loss, rows, groups = self.structure.loss, self._rows, self.model.group
+        if loss is None or loss.separable or self.structure.joint:
+            return groups[:0]
+        try:
+            found = minimum(loss, rows, self._warm, weight, self._squares)
+        except Unsolved:
+            return groups[:0]
+        if found.slope is None or len(found.slope) < len(groups):
+            return groups[:0]
+        order, _ = self.structure.by_configuration or (np.arange(len(groups)), None)
+        pulls = np.abs(found.slope) > INACTIVE * np.abs(found.slope).max()
+        return np.setdiff1d(groups, groups[order[pulls]])
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -78,6 +80,27 @@ def test_held_out_error_is_that_of_fits_without_the_configuration() -> None:
         total += np.sum((m.A[out] @ z - m.b[out]) ** 2)
     expected = np.sqrt(total / len(m.b))
     assert held_out_error(ro.convex.pose(ro.tikhonov, m), np.array([weight]))[0] == pytest.approx(expected, rel=1e-9)
+
+
+def tail(r: Any) -> Any:
+    threshold = cp.Variable()
+    return threshold + cp.sum(cp.pos(cp.abs(r) - threshold)) / (0.1 * r.size)
+
+
+@pytest.mark.parametrize(
+    "formulation", [ro.minimax, ro.Formulation("tail", loss=tail, penalty=cp.sum_squares)], ids=lambda f: f.name
+)
+def test_what_rests_on_few_configurations_is_solved_without_these_alone(formulation: ro.Formulation) -> None:
+    problem = ro.load("position").problem
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    program = ro.convex.pose(formulation, model)
+    assert 0 < len(program.idle(10.0)) < 40
+    expected = []
+    for k in range(40):
+        out = model.group == k
+        z = ro.convex.pose(formulation, model.scaled(np.where(out, 0.0, 1.0))).solve(10.0).z
+        expected.append(np.linalg.norm(model.A[out] @ z - model.b[out]))
+    assert held_out_error(program, np.array([10.0]))[0] == pytest.approx(np.median(expected), rel=1e-5)
 
 
 def test_two_step_ends_below_the_corner_with_ten_held_out_errors() -> None:

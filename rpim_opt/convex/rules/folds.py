@@ -28,6 +28,8 @@ DROPPED = 1e-13
 """Pivots below this belong to what nothing else decides."""
 MEMORY = 500_000_000
 """Bytes of equations that are kept for all folds together; of more, a fold is made when it is asked for."""
+SAME = 1e-7
+"""Relative difference of objectives that is the solver's."""
 MANY = 1_000_000
 """Residuals that are in memory together, of many weights."""
 
@@ -322,13 +324,24 @@ class Folds:
 
     def norms(self, weights: Array) -> Array:
         """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
-        model = self._whole.model
+        whole, model = self._whole, self._whole.model
+        idle = [whole.idle(weight) for weight in weights]
+        solved = whole.path(weights) if any(map(len, idle)) else []
         found = []
         for k, out in enumerate(self._rows):
             program = self._kept[k] if self._kept else self._without(out)
-            Z = np.array([estimate.z for estimate in program.path(weights)])
+            left_out = model.group[out]
+            same: dict[float, Array] = {}
+            for there, at_rest in zip(solved, idle, strict=False):
+                if not np.isin(left_out, at_rest).all():
+                    continue
+                if program.objective(there.z, there.weight) <= there.objective * (1 + SAME):  # zero residuals cost none
+                    same[there.weight] = there.z
+            others = program.path([weight for weight in weights if weight not in same])
+            same |= {estimate.weight: estimate.z for estimate in others}
+            Z = np.array([same[weight] for weight in weights])
             squares = (Z @ model.A[out].T - model.b[out]) ** 2
-            _, which = np.unique(model.group[out], return_inverse=True)
+            _, which = np.unique(left_out, return_inverse=True)
             sums = np.zeros((which.max() + 1, len(weights)))
             np.add.at(sums, which, squares.T)
             found.append(np.sqrt(sums.T))
