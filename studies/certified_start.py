@@ -64,7 +64,7 @@ def run(seed: int) -> dict[str, float | str]:
     seconds = time.process_time() - begin
     good = np.setdiff1d(np.arange(N), wrong)
     information = _information(flange[good], measured[good], base, tool, sigma)
-    own = start.bases[""], start.tools[""]
+    own = start.base, start.tool
     found: dict[str, float | str] = {
         "scene": scene,
         "poses": N,

@@ -16,10 +16,8 @@ from .problem import CalibrationProblem as CalibrationProblem
 from .registration.camera import view_pose as view_pose
 from .registration.certified import CertifiedStart as CertifiedStart
 from .registration.certified import certified_hand_eye as certified_hand_eye
-from .registration.certified import certified_motions as certified_motions
 from .registration.closed_forms import hand_eye as hand_eye
 from .registration.closed_forms import register as register
-from .registration.closed_forms import tool_from_distances as tool_from_distances
 from .registration.frames import fitted_frames as fitted_frames
 from .registration.frames import problem_from as problem_from
 from .registration.frames import starting_parameters as starting_parameters

@@ -71,7 +71,7 @@ def form(rng: np.random.Generator, count: int, shared: int) -> np.ndarray:
     return Q
 
 
-@pytest.mark.parametrize(("count", "shared"), [(1, 1), (2, 1), (2, 2), (3, 1), (3, 2), (4, 1)])
+@pytest.mark.parametrize(("count", "shared"), [(1, 1), (2, 1), (2, 2)])
 def test_the_solver_is_given_what_is_stated(count: int, shared: int) -> None:
     Q = form(np.random.default_rng(count), count, shared)
     C = rotation_constraints(count)
@@ -148,39 +148,16 @@ def test_the_second_derivative_is_that_of_the_value() -> None:
     assert np.abs(np.array(numeric) / 4e-6 - 2 * found.information).max() < 1e-4 * np.abs(found.information).max()
 
 
-@pytest.mark.parametrize("seed", range(4))
-def test_several_instruments_and_markers_are_found_together(seed: int) -> None:
-    rng, flange, Z, X = poses(seed, 16)
-    others = frame(rng, 2.0), frame(rng, 0.1)
-    instrument = np.array(["left", "right"])[np.arange(16) // 8]
-    marker = np.array(["A", "B"])[np.arange(16) % 2]
-    base = np.where((instrument == "left")[:, None, None], Z, others[0])
-    tool = np.where((marker == "A")[:, None, None], X, others[1])
-    measured = base @ flange @ tool
-    measured[marker == "B", :3, :3] = np.nan  # a reflector: its position alone is measured
-    start = ro.problem.certified_hand_eye(flange, measured, marker=marker.tolist(), instrument=instrument.tolist())
-    assert start.certified
-    assert np.abs(start.bases["left"] - Z).max() < 1e-9
-    assert np.abs(start.bases["right"] - others[0]).max() < 1e-9
-    assert np.abs(start.tools["A"] - X).max() < 1e-9
-    assert np.abs(start.tools["B"][:3, 3] - others[1][:3, 3]).max() < 1e-9
-    np.testing.assert_array_equal(start.tools["B"][:3, :3], np.eye(3))
-
-
-@pytest.mark.parametrize("scaled", [False, True])
 @pytest.mark.parametrize("turned", [False, True])
-def test_base_tool_and_scale_of_poses_and_of_positions(scaled: bool, turned: bool) -> None:
+def test_base_and_tool_of_poses_and_of_positions(turned: bool) -> None:
     _, flange, Z, X = poses(7)
     measured = Z @ flange @ X
-    unit = 0.025 if scaled else 1.0
-    measured[:, :3, 3] /= unit
     if not turned:
         measured = measured[:, :3, 3]
-    start = ro.problem.certified_hand_eye(flange, measured, scaled=scaled)
+    start = ro.problem.certified_hand_eye(flange, measured)
     assert start.certified, start.reason
-    assert start.scale == pytest.approx(unit, rel=1e-9)
-    assert np.abs(start.bases[""] - Z).max() < 1e-9
-    assert np.abs(start.tools[""][:3, 3] - X[:3, 3]).max() < 1e-9
+    assert np.abs(start.base - Z).max() < 1e-9
+    assert np.abs(start.tool[:3, 3] - X[:3, 3]).max() < 1e-9
 
 
 @pytest.mark.parametrize("loss", ["squares", "truncated"])
@@ -190,7 +167,7 @@ def test_the_cost_is_what_the_docstring_says(loss: str) -> None:
     measured = noisy(Z @ flange @ X, rng, sigma)
     measured[3, :3, 3] += 0.05
     start = ro.problem.certified_hand_eye(flange, measured, sigma=sigma, loss=loss)
-    T = start.bases[""] @ flange @ start.tools[""]
+    T = start.base @ flange @ start.tool
     turns = np.sum((measured - T)[:, :3, :3] ** 2, axis=(1, 2)) / (2 * sigma[1] ** 2)
     squares = np.sum((measured - T)[:, :3, 3] ** 2, axis=1) / sigma[0] ** 2 + turns
     lost = squares if loss == "squares" else np.minimum(squares, chi2.ppf(0.99, 6))
@@ -198,24 +175,6 @@ def test_the_cost_is_what_the_docstring_says(loss: str) -> None:
     assert start.bound <= start.cost
     assert start.certified
     assert (start.weights[3] < 0.5) == (loss != "squares")
-
-
-def test_motions_give_the_tool() -> None:
-    rng, flange, _, X = poses(13)
-    A = np.linalg.inv(flange[:-1]) @ flange[1:]
-    exact = ro.problem.certified_motions(A, np.linalg.inv(X) @ A @ X)
-    assert exact.certified
-    assert np.abs(exact.tools[""] - X).max() < 1e-9
-    sigma = 1e-3, 1e-3
-    B = noisy(np.linalg.inv(X) @ A @ X, rng, sigma)
-    B[:2] = [frame(rng, 0.5), frame(rng, 0.5)]
-    B[:, :3, 3] /= 0.2
-    found = ro.problem.certified_motions(A, B, sigma=(5e-3, 1e-3), scaled=True, loss="truncated")
-    assert found.certified
-    assert found.scale == pytest.approx(0.2, rel=0.01)
-    assert turned_by(found.tools[""], X) < 5e-3
-    assert set(np.flatnonzero(found.weights == 0)) >= {0, 1}
-    assert found.weights.sum() >= 8  # a good one in a hundred is left out, too
 
 
 def test_turns_about_one_axis_are_not_certified() -> None:
@@ -232,11 +191,11 @@ def test_turns_about_one_axis_are_not_certified() -> None:
         hand_eye(flange, Z @ flange @ X)
     start = ro.problem.certified_hand_eye(flange, Z @ flange @ X)
     assert start.certified
-    assert np.abs(start.bases[""] - Z)[:3, :3].max() < 1e-9
-    assert np.abs(start.tools[""] - X)[:3, :3].max() < 1e-9
+    assert np.abs(start.base - Z)[:3, :3].max() < 1e-9
+    assert np.abs(start.tool - X)[:3, :3].max() < 1e-9
     # along the axis base and tool are one; that stays where it is expected
-    assert abs(start.tools[""][2, 3]) < 1e-6
-    assert np.abs(start.tools[""] - X)[:2, 3].max() < 1e-9
+    assert abs(start.tool[2, 3]) < 1e-6
+    assert np.abs(start.tool - X)[:2, 3].max() < 1e-9
 
 
 def test_starts_that_fit_as_well_are_not_certified() -> None:
@@ -246,7 +205,7 @@ def test_starts_that_fit_as_well_are_not_certified() -> None:
         start = ro.problem.certified_hand_eye(flange, (Z @ flange @ X)[:, :3, 3])
         assert start.cost < 1e-6
         assert not start.certified
-        assert start.radius > turned_by(start.bases[""], Z)
+        assert start.radius > turned_by(start.base, Z)
 
 
 def test_outliers_that_are_as_many_are_not_certified() -> None:
@@ -273,8 +232,8 @@ def test_a_few_that_agree_are_certified_where_no_others_can(count: int, wrong: i
     start = ro.problem.certified_hand_eye(flange, measured, sigma=sigma, loss="truncated")
     assert start.certified, start.reason
     np.testing.assert_array_equal(start.weights, np.arange(count) >= wrong)
-    assert turned_by(start.bases[""], Z) < 0.05
-    assert turned_by(start.tools[""], X) < 0.05
+    assert turned_by(start.base, Z) < 0.05
+    assert turned_by(start.tool, X) < 0.05
 
 
 def test_three_poses_with_two_answers_are_not_certified() -> None:
@@ -291,7 +250,6 @@ def test_three_poses_with_two_answers_are_not_certified() -> None:
     [
         ({"loss": "l1"}, "loss: found 'l1', accepted: squares, truncated"),
         ({"sigma": (0.0, 1.0)}, "sigma: found a number that is not positive"),
-        ({"marker": ["A"]}, "marker: found 1 names, accepted: one for each of 12 poses"),
         ({"measured": np.zeros((12, 2))}, "transforms: found shapes"),
         ({"measured": np.zeros((12, 4, 4))}, "pose 1: found a matrix that misses R R' = 1 by 1"),
         ({"measured": np.full((12, 3), np.nan)}, "transforms: found numbers that are not finite"),
@@ -304,13 +262,6 @@ def test_what_cannot_be_used_is_refused(change: dict, message: str) -> None:
         ro.problem.certified_hand_eye(**given)
     with pytest.raises(ro.InputError, match="poses: found 2, accepted: 3 or more"):
         ro.problem.certified_hand_eye(flange[:2], flange[:2])
-
-
-def test_a_scale_that_places_do_not_show_is_refused() -> None:
-    rng = np.random.default_rng(31)
-    flange = np.array([frame(rng, 0.0) for _ in range(5)])
-    with pytest.raises(ro.InputError, match="do not determine translations and scale"):
-        ro.problem.certified_hand_eye(flange, flange, scaled=True)
 
 
 def check_study(rows: list[dict]) -> None:
@@ -362,7 +313,7 @@ def test_a_real_camera_is_certified() -> None:
     assert start.certified
     assert start.gap < 1e-6
     assert start.rank_ratio < 1e-6
-    assert np.abs(start.tools[""][:3, 3] - [0.0909, -0.0121, 0.0438]).max() < 2e-3
+    assert np.abs(start.tool[:3, 3] - [0.0909, -0.0121, 0.0438]).max() < 2e-3
 
 
 @pytest.mark.parametrize(
@@ -388,14 +339,3 @@ def test_rotations_of_four_digits_agree() -> None:
     measured[:, :3, :3] = measured[:, :3, :3].round(4)
     start = ro.problem.certified_hand_eye(flange, measured, sigma=(1e-3, 1e-3), loss="truncated")
     assert (start.weights == 1).all()
-
-
-def test_outliers_among_motions_are_found() -> None:
-    rng = np.random.default_rng(9)
-    tool = frame(rng, 0.1)
-    A = np.array([frame(rng, 0.3) for _ in range(7)])
-    B = np.linalg.inv(tool) @ A @ tool
-    B[4:] = [frame(rng, 0.3) for _ in range(3)]
-    start = ro.problem.certified_motions(A, B, sigma=(1e-3, 1e-3), loss="truncated")
-    assert start.certified
-    np.testing.assert_array_equal(start.weights, np.arange(7) < 4)

@@ -10,8 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.registration import frames as located
-from rpim_opt.problem.registration.closed_forms import hand_eye, register, tool_from_distances
+from rpim_opt.problem.registration.closed_forms import hand_eye, register
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.simulate import ARM, simulated
@@ -72,16 +71,6 @@ def test_degenerate_points_are_refused(points: np.ndarray, found: str) -> None:
         register(points, points)
 
 
-def test_a_tool_offset_from_distances_needs_no_base() -> None:
-    rng = np.random.default_rng(2)
-    flange = ro.robot.forward_kinematics(ARM, rng.uniform(-2, 2, (30, 6)))
-    offset, T = np.array([0.03, -0.05, 0.12]), transform(3)
-    points = (flange[:, :3, :3] @ offset + flange[:, :3, 3]) @ T[:3, :3].T + T[:3, 3]
-    assert np.abs(tool_from_distances(flange, points) - offset).max() < 1e-9
-    with pytest.raises(ro.InputError, match="configurations: found 1"):
-        tool_from_distances(flange[:1], points[:1])
-
-
 @pytest.mark.parametrize("seed", range(5))
 def test_hand_eye_finds_base_and_tool(seed: int) -> None:
     flange = ro.robot.forward_kinematics(ARM, np.random.default_rng(seed).uniform(-2, 2, (6, 6)))
@@ -140,8 +129,7 @@ def test_anchors_and_spheres_are_located_where_none_is_stated(tmp_path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["position", "pose"])
-def test_of_many_markers_some_place_the_base_and_the_others_follow(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nearly where all of them would put it; and every marker where it is."""
+def test_of_many_markers_one_places_the_base_and_the_others_follow(kind: str) -> None:
     rng = np.random.default_rng(3)
     markers, each, place = 12, 6, [0.4, -0.3, 0.2, 0.1, -0.2, 0.5]
     tools = {f"M{k}": np.array([*rng.uniform(-0.1, 0.1, 3), *rng.uniform(-0.5, 0.5, 3)]) for k in range(markers)}
@@ -159,15 +147,11 @@ def test_of_many_markers_some_place_the_base_and_the_others_follow(kind: str, mo
     data = ro.read_data(table, ARM, noise, MEASUREMENTS[kind])
     off = np.array([1e-3, -1e-3, 5e-4, 0, 0, 0])
     stated = {name: tool + off for name, tool in tools.items()}
-    whole = locate(ARM, data, stated)
-    monkeypatch.setattr(located, "MOST_PLACING", 5)
-    some = locate(ARM, data, stated)
-    for found in (whole, some):
-        assert found.how.startswith("certified")
-        assert found.base == pytest.approx(place, abs=2e-4)
-        for name, tool in tools.items():
-            assert found.tools[name][:known] == pytest.approx(tool[:known], abs=2e-4)
-    assert not np.array_equal(some.base, whole.base)
+    found = locate(ARM, data, stated)
+    assert found.how.startswith("certified")
+    assert found.base == pytest.approx(place, abs=3e-4)
+    for name, tool in tools.items():
+        assert found.tools[name][:known] == pytest.approx(tool[:known], abs=3e-4)
 
 
 def once_each(markers: int, each: int) -> tuple[ro.Dataset, dict[str, np.ndarray]]:
@@ -182,14 +166,11 @@ def once_each(markers: int, each: int) -> tuple[ro.Dataset, dict[str, np.ndarray
     return ro.read_data(table, ARM, {"position_mm": 0.05}), tools
 
 
-def test_where_some_markers_do_not_tell_the_base_all_are_asked(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Two of one configuration leave a turn about the line between them."""
+def test_where_no_marker_tells_the_base_all_are_fitted() -> None:
     data, tools = once_each(24, 3)
-    whole = locate(ARM, data, tools)
-    assert "registration" not in whole.how
-    monkeypatch.setattr(located, "MOST_PLACING", 2)
-    some = locate(ARM, data, tools)
-    assert np.array_equal(some.base, whole.base)
+    found = locate(ARM, data, {name: tool + 0.02 for name, tool in tools.items()})
+    assert found.how.startswith("by registration of positions")
+    assert found.base == pytest.approx([0.4, -0.3, 0.2, 0.1, -0.2, 0.5], abs=0.02)
 
 
 def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:

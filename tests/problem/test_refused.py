@@ -78,9 +78,6 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: declared_noise({"tracker": {"range_um": 5.0}}, ro.load("distance").problem.data.blocks[0].measurement),
         "a table, for positions and poses",
     ),
-    "motions without turns": (
-        lambda: ro.problem.certified_motions(straight(), straight()[:, :3, 3]), "rotations of all motions"
-    ),
     "nothing to identify": (
         lambda: problem().with_parameters(problem().parameters.identify([])), "key identify: found no parameter"
     ),

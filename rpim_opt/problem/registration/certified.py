@@ -1,19 +1,21 @@
-"""Certified registration: base and tool from closed loops, with a proof that none fit better."""
+"""Certified registration: base and tool from closed loops, outliers or not, with a proof that none fit better."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from bisect import bisect_left
+from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.linalg import solve_triangular
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye, rigid
-from rpim_opt.problem.registration.loops import LOSSES, Loops, Solved, of_motions, of_poses, solve
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye, proper, rigid
+from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, smallest
 
 GAP = 1e-3
 """What cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer."""
@@ -23,6 +25,21 @@ FAR = 0.5
 """Angle [rad] within which all starts have to be that fit as well, for there to be one."""
 AS_WELL = 1e-4
 """Probability that the truth fits worse than what counts as fitting as well."""
+RIDGE = 1e-6
+"""How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
+LOSSES = ("squares", "truncated")
+QUANTILE = 0.99
+"""Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
+FEWEST = 3
+"""Measurements that have to have a weight."""
+MOST_PAIRED = 2000
+"""Measurements up to which all pairs are compared."""
+TRIED, FEW = 40, 10
+"""Measurements, evenly spread, whose compatible sets are tried, and the most sets that are."""
+SURPRISE = 1e-4
+"""Probability that a good measurement is off by more than counts as good."""
+LINEAR = 6
+"""Unknowns that are eliminated exactly: the translations t of the tool and u of the base."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +49,7 @@ class CertifiedStart:
     ::
 
         cost   = sum_i loss(|r_i|) + |t - expected|^2 / spread^2,   r_i in standard deviations
-        bound <= cost of any bases, tools and scale whatever
+        bound <= cost of any base and tool whatever
         gap    = (cost - bound) / (1 + cost)
 
     Angles are in rad; ``bound`` and ``radius`` are proven. Where outliers are left out, the bound is that of the sum of
@@ -46,13 +63,12 @@ class CertifiedStart:
     >>> arm = ro.load("paper_arm").problem
     >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
     >>> start = ro.problem.certified_hand_eye(flange, flange)
-    >>> bool(start.gap < 1e-6), bool(np.abs(start.tools[""] - np.eye(4)).max() < 1e-6)
+    >>> bool(start.gap < 1e-6), bool(np.abs(start.tool - np.eye(4)).max() < 1e-6)
     (True, True)
     """
 
-    bases: Mapping[str, Array]  # (4, 4) transform of the robot's base in each instrument's frame [m], by instrument
-    tools: Mapping[str, Array]  # (4, 4) of each target in the flange frame, by marker; not turned by positions alone
-    scale: float  # the metre's part that the instrument calls one; 1 unless it is estimated
+    base: Array  # (4, 4) transform of the robot's base in the instrument's frame [m]
+    tool: Array  # (4, 4) of the target in the flange frame; not turned by positions alone
     cost: float
     bound: float
     gap: float
@@ -64,67 +80,25 @@ class CertifiedStart:
     reason: str  # why it is certified or not, in a sentence
 
 
-def _judged(
-    solved: Solved, loops: Loops, bases: Mapping[str, Array], tools: Mapping[str, Array], scale: float
-) -> CertifiedStart:
-    """Return the start with its proof, or what it lacks."""
-    best = solved.smallest
-    excess = best.value - best.bound
-    gap = excess / (1 + solved.cost)
-    weakest = float(np.linalg.eigvalsh(best.information)[0])
-    uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
-    radius = best.radius(float(chdtri(loops.unknowns, AS_WELL)))
-    full = int(np.sum(solved.weights))
-    several = solved.weights.min() < 1 and not solved.alone
-    causes = {
-        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
-            uncertainty > UNKNOWN
-        ),
-        f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
-        f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell": radius > FAR,
-        "the measurements do not determine the scale": scale <= 0,
-        "the weights of the loss did not converge": not solved.settled,
-        f"{full} of {len(solved.weights)} measurements agree, and as many others may agree with another start": several,
-    }
-    cause = next((text for text, true in causes.items() if true), "")
-    return CertifiedStart(
-        bases=bases,
-        tools=tools,
-        scale=float(scale),
-        cost=solved.cost,
-        bound=solved.cost - excess,
-        gap=gap,
-        rank_ratio=best.rank_ratio,
-        uncertainty=uncertainty,
-        radius=radius,
-        weights=solved.weights,
-        certified=not cause,
-        reason=cause or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
-    )
-
-
 @one_blas_thread
 def certified_hand_eye(
     flange: Array,
     measured: Array,
     *,
-    marker: Sequence[str] | None = None,
-    instrument: Sequence[str] | None = None,
     sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
-    expected: Mapping[str, Place] | None = None,
+    expected: Place = (0, 0, 0),
     spread: float = np.inf,
-    scaled: bool = False,
     loss: str = "squares",
 ) -> CertifiedStart:
-    """Return bases Z and tools X of A X = Z B, measured_i = Z flange_i X, with a proof that none are better.
+    """Return base Z and tool X of A X = Z B, measured_i = Z flange_i X, with a proof that none are better.
 
     ::
 
         minimize  sum_i loss(|r_i|),   |r_i|^2 = |Z_R'y_i - A_R,i t - A_t,i - u|^2 / sigma_position^2
                                                + |B_R,i X_R' - Z_R A_R,i|^2 / (2 sigma_orientation^2)
 
-    over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t of several instruments and markers, all at once. The
-    translations are eliminated exactly; the rotations are relaxed to a moment matrix (`relaxation.relax`).
+    over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t. The translations are eliminated exactly; the
+    rotations are relaxed to a moment matrix (`relaxation.relax`).
 
     Parameters
     ----------
@@ -132,16 +106,12 @@ def certified_hand_eye(
         (N, 4, 4) transforms of the flange in the robot's base [m].
     measured
         (N, 4, 4) of the tool in the instrument's frame, NaN for rotations that were not measured; or positions (N, 3).
-    marker, instrument
-        (N,) names of what was seen (reflector, target) and by what (camera); by default one of each.
     sigma
         Standard deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of
         the robot, which differs from the nominal one.
     expected, spread
-        (3,) where markers are in the flange frame [m], and the standard deviation of that [m]. A direction that the
+        (3,) where the tool is in the flange frame [m], and the standard deviation of that [m]. A direction that the
         measurements do not show stays there in any case.
-    scaled
-        Whether the unit of the instrument's lengths is unknown.
     loss
         "squares", or "truncated", which leaves outliers out.
 
@@ -161,98 +131,58 @@ def certified_hand_eye(
     >>> seen = base @ flange @ tool
     >>> seen[0, 0, 3] += 0.5  # one of them is wrong
     >>> start = ro.problem.certified_hand_eye(flange, seen, loss="truncated")
-    >>> bool(np.abs(start.bases[""] - base).max() < 1e-6), bool(np.abs(start.tools[""] - tool).max() < 1e-6)
+    >>> bool(np.abs(start.base - base).max() < 1e-6), bool(np.abs(start.tool - tool).max() < 1e-6)
     (True, True)
     >>> start.certified, int(np.sum(start.weights == 0))
     (True, 1)
     """
     flange, measured, turned = _checked(flange, measured, loss)
-    N = len(flange)
-    markers, which = _numbered(marker, N, "marker")
-    instruments, where = _numbered(instrument, N, "instrument")
-    places = np.array([np.asarray((expected or {}).get(name, (0, 0, 0)), dtype=float)[:3] for name in markers])
-    loops = of_poses(flange, measured, turned, where, which, _deviations(sigma, N), places, spread, scaled)
+    deviations = np.stack([np.broadcast_to(np.asarray(each, dtype=float), len(flange)) for each in sigma], axis=1)
+    if not (np.isfinite(deviations).all() and (deviations > 0).all()):
+        raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
+    loops = _loops(flange, measured, turned, deviations, np.asarray(expected, dtype=float)[:3], spread)
     candidates = []
-    if len(markers) == len(instruments) == 1 and turned.all():
+    if turned.all():
         with suppress(InputError):
             Z, X = hand_eye(flange, measured)
             candidates.append(np.stack([Z[:3, :3], X[:3, :3].T]))
-    solved = solve(loops, loss, candidates)
-    R = solved.smallest.rotations
-    count = len(instruments)
-    scale = 1 / solved.v[loops.linear - 1] if scaled else 1.0
-    t = solved.v[: loops.linear - scaled].reshape(-1, 3) * scale
-    turns = dict(zip(np.unique(which[turned]).tolist(), R[count:].swapaxes(1, 2), strict=True))
-    bases = {name: rigid(R[i], R[i] @ t[len(markers) + i]) for i, name in enumerate(instruments)}
-    tools = {name: rigid(turns.get(k, np.eye(3)), t[k]) for k, name in enumerate(markers)}
-    return _judged(solved, loops, bases, tools, scale)
+    solved = _solve(loops, loss, candidates)
+    best = solved.smallest
+    first, *last = best.rotations
+    t, u = solved.v[:LINEAR].reshape(2, 3)
+    excess = best.value - best.bound
+    gap = excess / (1 + solved.cost)
+    weakest = float(np.linalg.eigvalsh(best.information)[0])
+    uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
+    radius = best.radius(float(chdtri(LINEAR + 3 * len(best.rotations), AS_WELL)))
+    full = int(np.sum(solved.weights))
+    several = solved.weights.min() < 1 and not solved.alone
+    causes = {
+        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
+            uncertainty > UNKNOWN
+        ),
+        f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
+        f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell": radius > FAR,
+        "the weights of the loss did not converge": not solved.settled,
+        f"{full} of {len(solved.weights)} measurements agree, and as many others may agree with another start": several,
+    }
+    cause = next((text for text, true in causes.items() if true), "")
+    return CertifiedStart(
+        base=rigid(first, first @ u),
+        tool=rigid(last[0].T if last else np.eye(3), t),
+        cost=solved.cost,
+        bound=solved.cost - excess,
+        gap=gap,
+        rank_ratio=best.rank_ratio,
+        uncertainty=uncertainty,
+        radius=radius,
+        weights=solved.weights,
+        certified=not cause,
+        reason=cause or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
+    )
 
 
-@one_blas_thread
-def certified_motions(
-    A: Array,
-    B: Array,
-    *,
-    sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
-    expected: Place = (0, 0, 0),
-    spread: float = np.inf,
-    scaled: bool = False,
-    loss: str = "squares",
-) -> CertifiedStart:
-    """Return the tool X of A X = X B, motions of the flange and of what is on it, with a proof that none is better.
-
-    ::
-
-        minimize  sum_i loss(|r_i|),   |r_i|^2 = |X_R B_t,i - A_R,i t + t - A_t,i|^2 / sigma_position^2
-                                               + |A_R,i X_R - X_R B_R,i|^2 / (2 sigma_orientation^2)
-
-    Parameters
-    ----------
-    A
-        (N, 4, 4) motions of the flange, flange_i^-1 flange_j [m].
-    B
-        (N, 4, 4) motions of the tool or camera in its own frame.
-    sigma
-        Standard deviations of a motion's translation [m] and rotation [rad], each a number or (N,).
-    expected, spread
-        (3,) where the tool is in the flange frame [m], and the standard deviation of that [m].
-    scaled
-        Whether the unit of lengths in B is unknown (a single camera).
-    loss
-        "squares" or "truncated".
-
-    Raises
-    ------
-    InputError
-        For fewer than two motions, and what is no transform.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> arm = ro.load("paper_arm").problem
-    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
-    >>> tool = np.eye(4)
-    >>> tool[:3, 3] = [0.0, 0.02, 0.06]
-    >>> A = np.linalg.inv(flange[:-1]) @ flange[1:]
-    >>> B = np.linalg.inv(tool) @ A @ tool
-    >>> B[:, :3, 3] *= 20  # in units of five centimetres
-    >>> start = ro.problem.certified_motions(A, B, scaled=True)
-    >>> bool(np.abs(start.tools[""] - tool).max() < 1e-6), round(start.scale, 9)
-    (True, 0.05)
-    """
-    A, B, turned = _checked(A, B, loss, 2)
-    if not turned.all():
-        raise InputError("B", "motions without a rotation", "rotations of all motions")
-    place = np.asarray(expected, dtype=float)
-    loops = of_motions(A, B, _deviations(sigma, len(A)), place, spread, scaled)
-    solved = solve(loops, loss)
-    scale = 1 / solved.v[3] if scaled else 1.0
-    tool = rigid(solved.smallest.rotations[0], solved.v[:3] * scale)
-    return _judged(solved, loops, {}, {"": tool}, scale)
-
-
-def _checked(flange: Array, measured: Array, loss: str, fewest: int = 3) -> tuple[Array, Array, np.ndarray]:
+def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, np.ndarray]:
     """Return transforms and which were measured to turn; refuse what is none."""
     flange = np.asarray(flange, dtype=float)
     measured = np.asarray(measured, dtype=float)
@@ -263,8 +193,8 @@ def _checked(flange: Array, measured: Array, loss: str, fewest: int = 3) -> tupl
         raise InputError(
             "transforms", f"shapes {flange.shape}, {measured.shape}", "(N, 4, 4) both, or positions (N, 3)"
         )
-    if fewest > N:
-        raise InputError("poses", f"{N}", f"{fewest} or more")
+    if N < FEWEST:
+        raise InputError("poses", f"{N}", f"{FEWEST} or more")
     points = measured if measured.ndim == 2 else measured[:, :3, 3]
     poses = rigid(np.eye(3), points)
     turned = np.zeros(N, dtype=bool)
@@ -283,17 +213,240 @@ def _checked(flange: Array, measured: Array, loss: str, fewest: int = 3) -> tupl
     return flange, poses, turned
 
 
-def _numbered(names: Sequence[str] | None, N: int, what: str) -> tuple[list[str], np.ndarray]:
-    if names is None:
-        return [""], np.zeros(N, dtype=int)
-    if len(names) != N:
-        raise InputError(what, f"{len(names)} names", f"one for each of {N} poses")
-    known, number = np.unique(np.asarray(names, dtype=str), return_inverse=True)
-    return known.tolist(), number
+# --- closed loops -------------------------------------------------------------------------------------------------
 
 
-def _deviations(sigma: tuple[float | Array, float | Array], N: int) -> Array:
-    both = np.stack([np.broadcast_to(np.asarray(each, dtype=float), N) for each in sigma], axis=1)
-    if not (np.isfinite(both).all() and (both > 0).all()):
-        raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
-    return both
+@dataclass(frozen=True, eq=False)
+class _Loops:
+    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first.
+
+    ``first`` and ``second`` (N, 3, 3) are orientations B_i = Z A_i X up to errors of ``sigma`` (N,) [rad], where
+    ``turned`` (N,) says that they were measured: A_i'A_j and B_i'B_j turn by the same angle.
+    """
+
+    rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
+    prior: Array  # (3, n) residuals of what is expected of t
+    equations: Array  # (N,) of a measurement: 3 of a position, 6 of a pose
+    first: Array
+    second: Array
+    sigma: Array
+    turned: np.ndarray
+
+    def triangle(self, weights: Array) -> Array:
+        """Return T (n, n), upper, with |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2."""
+        n = self.rows.shape[2]
+        rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
+        return np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
+
+    def squares(self, v: Array) -> Array:
+        """Return |J_i v|^2 (N,)."""
+        return np.asarray(np.sum((self.rows @ v) ** 2, axis=1))
+
+    def completed(self, triangle: Array, x: Array) -> Array:
+        """Return v (n,) with the translations that are best for x."""
+        T = triangle[:LINEAR]
+        y = solve_triangular(T[:, :LINEAR], -T[:, LINEAR:] @ x)
+        return np.concatenate([np.asarray(y, dtype=float), x])
+
+
+def _loops(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float) -> _Loops:
+    """Return the loops ``measured = base flange tool`` of flanges A and measured poses B with their positions y.
+
+    ::
+
+        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
+        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
+
+    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
+    """
+    N = len(flange)
+    eye = np.eye(3)
+    A = flange[:, :3, :3]
+    B = measured[:, :3, :3]
+    one = LINEAR
+    of_base = slice(LINEAR + 1, LINEAR + 10)
+    J = np.zeros((N, 12, LINEAR + 1 + 9 * (1 + turned.any())))
+    J[:, :3, :3] = -A
+    J[:, :3, 3:6] = -eye
+    J[:, :3, one] = -flange[:, :3, 3]
+    J[:, :3, of_base] = np.einsum("nb,ac->nabc", measured[:, :3, 3], eye).reshape(N, 3, 9)
+    if turned.any():
+        J[:, 3:, of_base] = -np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
+        J[:, 3:, of_base.stop :] = np.einsum("nai,bj->nabij", B, eye).reshape(N, 9, 9)
+    J[:, :3] /= sigma[:, 0, None, None]
+    J[:, 3:] *= (turned / (np.sqrt(2) * sigma[:, 1]))[:, None, None]
+    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2))))
+    prior = np.zeros((3, J.shape[2]))
+    prior[:, :3] = certainty * eye
+    prior[:, one] = -certainty * expected
+    return _Loops(J, prior, np.where(turned, 6, 3), A, B, sigma[:, 1], turned)
+
+
+# --- which measurements can agree ---------------------------------------------------------------------------------
+
+
+def _compatible(loops: _Loops, beyond: Array) -> np.ndarray:
+    """Return which two measurements (N, N) can both have squared residuals up to these (N,), for some frames.
+
+    ::
+
+        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
+
+    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
+    """
+    N = len(beyond)
+    if N > MOST_PAIRED:
+        return np.ones((N, N), dtype=bool)
+    angles = []
+    rough = np.zeros(N)
+    for given in (loops.first, loops.second):
+        rotations = proper(given)
+        rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
+        flat = rotations.reshape(-1, 9)
+        angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
+    chord = loops.sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
+    off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
+    known = np.outer(loops.turned, loops.turned)
+    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~known
+
+
+def _core(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
+
+    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
+    ICRA, find outliers so).
+    """
+    left = np.ones(len(pairs), dtype=bool)
+    while True:
+        kept = left & (np.sum(pairs[:, left], axis=1) >= count)
+        if np.array_equal(kept, left):
+            return left
+        left = kept
+
+
+def _likeliest(pairs: np.ndarray) -> np.ndarray:
+    """Return the core (N,) of the largest count that leaves any."""
+    counts = range(len(pairs) + 2)
+    return _core(pairs, bisect_left(counts, True, key=lambda count: not _core(pairs, count).any()) - 1)
+
+
+def _alone(loops: _Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
+    """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else.
+
+    They cannot if fewer are left over than would have to, or if no other is in a core of that size. One whose square
+    (N,) a good one may have is no other.
+    """
+    count = int(np.sum(agreeing))
+    if count >= len(agreeing) // 2 + 2:
+        return True
+    strange = ~agreeing & (squares > chdtri(loops.equations, SURPRISE))
+    return count > 1 and not (_core(_compatible(loops, beyond), count) & strange).any()
+
+
+# --- losses -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Where a loss of closed loops is least."""
+
+    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
+    smallest: Smallest  # of the last weighted problem
+    weights: Array  # (N,) that the loss gives the measurements; one for a square
+    squares: Array  # (N,) squared residuals
+    cost: float  # the loss, summed, and what is expected of translations
+    settled: bool = True  # whether the weights are those of the residuals
+    alone: bool = True  # whether no other measurements than those of full weight can be as many that agree
+
+
+def _solve(loops: _Loops, loss: str, candidates: Sequence[Array] = ()) -> _Solved:
+    """Return the least of a loss of r = |J_i v|, global where it is the sum of squares and the bound meets it.
+
+    ::
+
+        squares    r^2
+        truncated  min(r^2, c^2)        c^2 a quantile of chi-squared
+
+    The truncated loss begins with the largest core of measurements that turn alike, and if not all of that agree, with
+    all of them and parts of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
+    """
+    every = np.ones(len(loops.rows), dtype=bool)
+    if loss == "squares":
+        return _Solver(loops, np.full(len(every), np.inf)).weighted(every.astype(float), candidates)
+    beyond = chdtri(loops.equations, 1 - QUANTILE)
+    solver = _Solver(loops, beyond)
+    pairs = _compatible(loops, beyond)
+    first = _likeliest(pairs)
+    found = [solver.graduated(first), *filter(None, map(solver.begun, candidates))]
+    if not np.array_equal(found[0].weights > 0, first):
+        found.append(solver.graduated(every))
+    most = max(each.weights.sum() for each in found)
+    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
+        members = np.flatnonzero(first)
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
+        parts = [_likeliest(some) for some in around]
+        if len(members) <= FEW:  # turning alike, one may be wrong all the same
+            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
+        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
+        found += [solver.graduated(part) for part in distinct if part.sum() >= FEWEST]
+    least = min(each.cost for each in found)
+    best = next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
+    return replace(best, alone=_alone(loops, best.squares, best.weights > 0, beyond))
+
+
+@dataclass(frozen=True, eq=False)
+class _Solver:
+    """Weighted sums of squares of loops, and the truncated loss by them; ``beyond`` (N,) are the c^2."""
+
+    loops: _Loops
+    beyond: Array
+
+    def weighted(self, weights: Array, candidates: Sequence[Array] = (), near: Array | None = None) -> _Solved:
+        """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps from rotations."""
+        triangle = self.loops.triangle(weights)
+        L = triangle[LINEAR:, LINEAR:]  # |L x|^2 is the least over translations (a Schur complement)
+        best = smallest(L, candidates) if near is None else nearest(L, near)
+        v = self.loops.completed(triangle, lifted(best.rotations))
+        squares = self.loops.squares(v)
+        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.loops.prior @ v) ** 2))
+        return _Solved(v, best, weights, squares, cost)
+
+    def repeated(self, solved: _Solved) -> _Solved:
+        """Return the fixed point of weights and solution, the last of which is the relaxation's."""
+        for _ in range(100):
+            weights = (solved.squares <= self.beyond).astype(float)
+            same = np.array_equal(weights, solved.weights)
+            bounded = bool(np.isfinite(solved.smallest.bound))
+            if weights.sum() < FEWEST or (same and bounded):
+                break
+            near = None if same else solved.smallest.rotations
+            solved = self.weighted(weights, [solved.smallest.rotations], near)
+        if not np.isfinite(solved.smallest.bound):
+            solved = self.weighted(solved.weights, [solved.smallest.rotations])
+        return replace(solved, settled=np.array_equal(solved.squares <= self.beyond, solved.weights))
+
+    def graduated(self, among: np.ndarray) -> _Solved:
+        """Return a least of the truncated loss by graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127).
+
+        Losses of some measurements (N,) from squares to the truncated one, each from the last: that of parameter mu has
+        weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them sqrt(mu (mu + 1) c^2 / r^2) - mu.
+        """
+        solved = self.weighted(among.astype(float))
+        mu = 1 / max(2 * float(np.max(among * solved.squares / self.beyond)) - 1, 1e-3)
+        for _ in range(100):
+            between = np.sqrt(mu * (mu + 1) * self.beyond / np.maximum(solved.squares, 1e-300)) - mu
+            weights = among * np.clip(between, 0.0, 1.0)
+            if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
+                break
+            solved = self.weighted(weights, near=solved.smallest.rotations)
+            mu *= 1.6
+        return self.repeated(solved)
+
+    def begun(self, rotations: Array) -> _Solved | None:
+        """Return the least of the truncated loss near rotations; None where fewer than three measurements are near."""
+        triangle = self.loops.triangle(np.ones(len(self.beyond)))
+        squares = self.loops.squares(self.loops.completed(triangle, lifted(rotations)))
+        weights = (squares <= self.beyond).astype(float)
+        if weights.sum() < FEWEST:
+            return None
+        return self.repeated(self.weighted(weights, [rotations]))

@@ -1,4 +1,4 @@
-"""Closed forms of registration: point sets, tool offsets from distances, hand and eye (AX = ZB)."""
+"""Closed forms of registration: point sets, hand and eye (AX = ZB)."""
 
 from __future__ import annotations
 
@@ -51,43 +51,6 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
     p, r = q @ source / q.sum(), q @ target / q.sum()
     R = proper((target - r).T @ (q[:, None] * (source - p)))
     return rigid(R, r - R @ p)
-
-
-def tool_from_distances(flange: Array, points: Array, start: Place = (0, 0, 0), spread: float = np.inf) -> Array:
-    """Return the reflector's offset in the flange frame, (3,) [m], without knowing the base (paper, Eqs. 18 to 23).
-
-    Minimizes the differences of measured and modelled distances, | |y_j - y_i| - |p_j - p_i + (R_j - R_i) o| |^2,
-    over pairs of configurations, by Levenberg-Marquardt from ``start``.
-
-    ``flange`` are (N, 4, 4) transforms [m], ``points`` (N, 3) measured positions in any frame [m]; ``start`` (3,) is
-    where the offset is expected, and ``spread`` the standard deviation of that against errors of the distances of 5 mm
-    [m]: a direction that the configurations do not show stays there. Refused are fewer than two configurations.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> arm = ro.load("paper_arm").problem
-    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
-    >>> points = flange[:, :3, :3] @ [0.02, 0.0, 0.06] + flange[:, :3, 3]
-    >>> ro.problem.tool_from_distances(flange, points + [5.0, 0.0, 1.0]).round(9) + 0.0  # wherever it stands
-    array([0.02, 0.  , 0.06])
-    """
-    N = len(points)
-    if N < 2:
-        raise InputError("configurations", f"{N}", "two or more for a distance")
-    steps = np.unique(np.geomspace(1, N - 1, 10).astype(int))
-    i = np.concatenate([np.arange(N - step) for step in steps])
-    j = i + np.concatenate([np.full(N - step, step) for step in steps])
-    measured = np.linalg.norm(points[j] - points[i], axis=1)
-    first = np.asarray(start, dtype=float)
-    ridge = NOMINAL_ERROR / spread * np.sqrt(len(i) / N)  # a configuration counts once, in however many pairs
-
-    def residual(o: Array) -> Array:
-        p = transformed(flange, o)
-        return np.append(np.linalg.norm(p[j] - p[i], axis=1) - measured, ridge * (o - first))
-
-    return scipy.optimize.least_squares(residual, first, method="lm", xtol=1e-15, ftol=1e-15, gtol=1e-15).x
 
 
 def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[Array, Array]:

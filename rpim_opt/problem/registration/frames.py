@@ -20,7 +20,7 @@ from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
-from rpim_opt.problem.registration.certified import CertifiedStart, certified_hand_eye
+from rpim_opt.problem.registration.certified import certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import (
     NOMINAL_ERROR,
     TOOL_ERROR,
@@ -45,10 +45,6 @@ MISFIT = 3.0
 """Nominal errors of a robot up to which positions agree with a registration in closed form."""
 FREE = 0.1
 """Standard deviation of a rotation [rad] from which closed forms are tried: they refuse what is not determined."""
-MOST_PLACING = 30
-"""Markers that place the base, where there are more: the others follow from the base."""
-MOST_TURNING = 4
-"""Markers whose orientations place the base, where more turn: those of the others follow from the base."""
 
 
 class Located(NamedTuple):
@@ -104,61 +100,36 @@ class _Rows(NamedTuple):
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
 
-    All of them together by `certified_hand_eye`; of many reflectors some, from which the others follow. Where that does
-    not determine the rotations, positions are fitted with reflectors near where they are stated.
+    By `certified_hand_eye`; of several reflectors by that with the most poses, or positions, from which the others
+    follow. Where it does not determine the rotations, all positions are fitted with reflectors near where they are
+    stated.
     """
     rows = _Rows.of(robot, data, ENOUGH)
     if rows is None:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
     places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
+    count = Counter(rows.marker[rows.turned].tolist() or rows.marker.tolist())
+    marker = count.most_common(1)[0][0]
+    own = rows.take(rows.marker == marker)
     try:
-        start = _certified(rows, places)
+        sigma = own.sigma[:, 0], own.sigma[:, 1]
+        start = certified_hand_eye(own.flange, own.measured, sigma=sigma, expected=places[marker], spread=TOOL_ERROR)
+        if start.uncertainty > FREE or (len(count) > 1 and not start.certified):
+            raise InputError("the data", start.reason, "turns about two axes")
     except InputError as error:
         base, found, _ = _fitted(robot, rows, places)
         return Located(base, found, f"by registration of positions: {error.found}")
-    base = start.bases[""]
-    for marker, place in places.items():
-        if marker in start.tools:
-            place[:3] = start.tools[marker][:3, 3]
-        else:  # where its positions are least off, seen from the base
-            own = rows.take(rows.marker == marker)
-            back: Any = np.linalg.inv(base @ own.flange)
-            there = transformed(back, own.measured[:, :3, 3])
-            precision = own.sigma[:, 0] ** -2
-            total = place[:3] * TOOL_ERROR**-2 + precision @ there
-            place[:3] = total / (TOOL_ERROR**-2 + precision.sum())
-    _turn(places, base, rows)
+    places[marker][:3] = start.tool[:3, 3]
+    for other in places.keys() - {marker}:  # where their positions are least off, seen from the base
+        own = rows.take(rows.marker == other)
+        back: Any = np.linalg.inv(start.base @ own.flange)
+        there = transformed(back, own.measured[:, :3, 3])
+        precision = own.sigma[:, 0] ** -2
+        total = places[other][:3] * TOOL_ERROR**-2 + precision @ there
+        places[other][:3] = total / (TOOL_ERROR**-2 + precision.sum())
+    _turn(places, start.base, rows)
     verdict = "certified" if start.certified else "not certified"
-    return Located(frame_numbers(base), places, f"{verdict}: {start.reason}")
-
-
-def _certified(rows: _Rows, places: Mapping[str, Array]) -> CertifiedStart:
-    """Return the certified start, reflectors where they are stated up to `TOOL_ERROR`; refuse it where it is free.
-
-    From some markers, of some with their orientations; from all where every configuration shows other markers.
-    """
-    turning = [marker for marker, _ in Counter(rows.marker[rows.turned].tolist()).most_common(MOST_TURNING)]
-    some = [marker for marker, _ in Counter(rows.marker.tolist()).most_common(MOST_PLACING)]
-    tries = [turning + some]
-    if len(places) > MOST_PLACING:
-        tries.append(list(places))
-    reason = ""
-    for placing in tries:
-        chosen = rows.take(np.isin(rows.marker, placing))
-        chosen.measured[~np.isin(chosen.marker, turning), :3, :3] = np.nan
-        sigma = chosen.sigma[:, 0], chosen.sigma[:, 1]
-        names = chosen.marker.tolist()
-        try:
-            start = certified_hand_eye(
-                chosen.flange, chosen.measured, marker=names, sigma=sigma, expected=places, spread=TOOL_ERROR
-            )
-        except InputError as error:
-            reason = error.found
-            continue
-        if start.uncertainty <= FREE:
-            return start
-        reason = start.reason
-    raise InputError("the data", reason, "turns about two axes")
+    return Located(frame_numbers(start.base), places, f"{verdict}: {start.reason}")
 
 
 def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:

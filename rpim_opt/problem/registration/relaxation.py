@@ -17,9 +17,6 @@ from rpim_opt.problem.registration.closed_forms import proper
 TOLERANCE, FINE = 1e-8, 1e-12
 """Of gap and feasibility, the form being of size one: what follows refines rotations and multipliers; the finer one
 where moments are those of several rotations."""
-NEGLIGIBLE = 1e-14
-"""Entries of a form that are rounding, relative to the largest: without them Clarabel sees which cliques it falls into
-(Agler et al. 1988, Linear Algebra and its Applications 107:101), and time grows with the number of tools alone."""
 SPREAD = 1e-3
 """Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
 CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))
@@ -87,8 +84,7 @@ def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
     C = np.concatenate([first, rotation_constraints((n - 1) // 9)])
     A = scipy.sparse.csc_matrix((root * C[:, rows, columns]).T)
     size = float(np.abs(Q).max()) or 1.0
-    scaled = Q[rows, columns] / size
-    b = root * np.where(np.abs(scaled) > NEGLIGIBLE, scaled, 0.0)
+    b = root * Q[rows, columns] / size
     q = np.zeros(A.shape[1])
     q[0] = -1.0
     settings = clarabel.DefaultSettings()
