@@ -583,7 +583,7 @@ def simulate(
 def design(
     problem: Problem,
     count: Annotated[int, Option(help="How many configurations to choose.")] = 30,
-    criterion: Annotated[str, Option(help="V (predicted positions), D, A or E.")] = "V",
+    criterion: Annotated[str, Option(help="V (predicted positions), D or A.")] = "V",
     candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within limits.")] = 1000,
     table: Annotated[File, Option(help="A table of candidates instead: q1_deg, ...")] = None,
     point: Annotated[Text, Option(help="For a robot that touches points: x,y,z [mm] of one in its base frame.")] = None,

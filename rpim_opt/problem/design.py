@@ -16,16 +16,16 @@ from rpim_opt.basics.units import UNITS, joint_columns, with_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.linear import RANK_TOLERANCE, reduced_rows
+from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
-CRITERIA = ("D", "A", "E", "V")
-SMOOTH = 12
-"""Power of the smooth least eigenvalue, (tr M^-p)^(-1/p)."""
+CRITERIA = ("D", "A", "V")
 ANYWHERE = 1.0
 """Standard deviation of where a touched point is [m]."""
+MOST_STEPS, MOST_PASSES = 4000, 20
+"""Of the relaxation, and of exchanges over all chosen."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,7 +39,7 @@ class Design(Brief):
     weights
         (M,) what the relaxation gives every candidate, from 0 to 1.
     criterion
-        ``D``, ``A``, ``E`` or ``V``.
+        ``D``, ``A`` or ``V``.
     value, bound
         The criterion of the chosen set (ln det M for D, [m^2] for V), and what no set of that size can exceed (fall
         below, for A and V).
@@ -68,7 +68,7 @@ class Design(Brief):
 
     def __str__(self) -> str:
         """Return the choice in a sentence."""
-        names = {"D": "det^(1/n)", "A": "mean variance", "E": "least information", "V": "predicted variance"}
+        names = {"D": "det^(1/n)", "A": "mean variance", "V": "predicted variance"}
         count = f"{len(self.chosen)} of {len(self.weights)} configurations"
         what = f"{count}, {self.criterion}-optimal ({names[self.criterion]})"
         if self.gap > 1:
@@ -127,7 +127,6 @@ def choose(
     candidates: Array,
     count: int,
     criterion: str = "V",
-    predicted: Array | None = None,
     progress: Callable[[str], None] = lambda text: None,
     measured: Dataset | None = None,
 ) -> Design:
@@ -138,15 +137,13 @@ def choose(
 
         D   maximize ln det M
         A   minimize tr M^-1
-        E   maximize the least eigenvalue of M
-        V   minimize the mean variance of predicted positions, the axes' sum [m^2]
+        V   minimize the mean variance of the candidates' positions, the axes' sum [m^2]
 
     Of a problem whose rows touch points, the candidates are postures at one point (`postures_at`); V counts positions
     of the tool.
 
     The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
-    any set can reach; E counts directions that some candidate sees. The largest weights are rounded and improved by
-    exchanges (Fedorov 1972).
+    any set can reach. The largest weights are rounded and improved by exchanges (Fedorov 1972).
 
     Parameters
     ----------
@@ -157,13 +154,11 @@ def choose(
     count
         How many to choose.
     criterion
-        One of ``D``, ``A``, ``E``, ``V``.
-    predicted
-        (K, dof) where positions are to be predicted (V); the candidates by default.
+        One of ``D``, ``A``, ``V``.
     progress
         Told what goes on.
     measured
-        Rows that are there already, which M then counts, too; D, A and V alone.
+        Rows that are there already, which M then counts, too.
 
     Raises
     ------
@@ -191,17 +186,12 @@ def choose(
     n = A.shape[2]
     C = np.eye(n)
     if criterion == "V":
-        P = _rows(problem, candidates if predicted is None else np.atleast_2d(predicted), whitened=False)
+        P = _rows(problem, candidates, whitened=False)
         C = np.zeros((n, n))
         C[: P.shape[2], : P.shape[2]] = np.einsum("kin,kim->nm", P, P) / len(P)
     if measured is not None:
-        A, C = _beside(A, C, problem.on(measured), criterion)
+        A, C = _beside(A, C, problem.on(measured))
     progress(f"relaxing over {len(A)} candidates")
-    if criterion == "E":  # directions that no candidate sees would be the least informed whatever is chosen
-        _, s, Vt = np.linalg.svd(A.reshape(-1, n), full_matrices=False)
-        A = np.asarray(A @ Vt[s > RANK_TOLERANCE * s[0]].T, dtype=float)
-        n = A.shape[2]
-        C = np.eye(n)
     weights, bound = _relaxed(A, count, criterion, C, progress)
     progress("rounding")
     rng, value, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
@@ -210,12 +200,12 @@ def choose(
         if trial:
             share = np.maximum(weights, 1e-6)
             start = rng.choice(len(A), count, replace=False, p=share / share.sum())
-        picked = np.sort(_exchanged(A, start, criterion, C, weights))
+        picked = np.sort(_exchanged(A, start, criterion, C))
         score, _ = _criterion(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
         if score > value:
             value, chosen = score, picked
     gap = np.exp((bound - value) / n) - 1 if criterion == "D" else max(bound / value, value / bound) - 1
-    sign = 1.0 if criterion in "DE" else -1.0
+    sign = 1.0 if criterion == "D" else -1.0
     return Design(chosen, weights, criterion, sign * value, sign * bound, float(max(gap, 0.0)))
 
 
@@ -237,14 +227,14 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
     return rows if whitened else rows[:, [i for i, d in enumerate(kind.components.values()) if d == "length"]]
 
 
-def _beside(A: Array, C: Array, there: CalibrationProblem, criterion: str) -> tuple[Array, Array]:
+def _beside(A: Array, C: Array, there: CalibrationProblem) -> tuple[Array, Array]:
     """Return rows and criterion in coordinates in which what is measured already, with the prior, is the identity.
 
     With L L' = 1 + sum of A_i' A_i over those rows, M = L (1 + sum B_i' B_i) L' for B = A L'^-1: ln det but for a
     constant, and tr M^-1 C = tr (1 + ...)^-1 (L^-1 C L'^-1).
     """
-    if criterion == "E" or there.data.blocks[0].measurement.touching:
-        raise InputError("measured", f"criterion {criterion} of these measurements", "D, A or V, of a row at a time")
+    if there.data.blocks[0].measurement.touching:
+        raise InputError("measured", "touches of points", "measurements of a row at a time")
     known = there.linearize(np.zeros(len(there.parameters.free))).A
     L = np.linalg.cholesky(np.eye(A.shape[2]) + known.T @ known)
     B = np.linalg.solve(L, A.reshape(-1, A.shape[2]).T).T.reshape(A.shape)
@@ -254,34 +244,27 @@ def _beside(A: Array, C: Array, there: CalibrationProblem, criterion: str) -> tu
 
 def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
     """Return the value, to be maximized, and Z: tr(A_i Z A_i') is what the relaxed criterion gains from candidate i."""
-    if criterion == "E":
-        values, vectors = np.linalg.eigh(M)
-        power = (values[0] / values) ** (SMOOTH + 1)
-        return float(values[0]), np.asarray((vectors * (power / power.sum())) @ vectors.T, dtype=float)
     inverse = np.asarray(np.linalg.inv(M), dtype=float)
     if criterion == "D":
         return float(np.linalg.slogdet(M)[1]), inverse
     return -float(np.sum(inverse * C.T)), inverse @ C @ inverse
 
 
-def _relaxed(
-    A: Array, count: int, criterion: str, C: Array, progress: Callable[[str], None], most: int = 4000
-) -> tuple[Array, float]:
+def _relaxed(A: Array, count: int, criterion: str, C: Array, progress: Callable[[str], None]) -> tuple[Array, float]:
     """Maximize over {0 <= w <= 1, sum w = count} by multiplicative steps; weights and a bound on the optimum.
 
-    The criteria are concave, so that the slope at any weights bounds them all: for E because the least eigenvalue is at
-    most tr(Z M) for every Z of trace one, here that of a smooth least eigenvalue.
+    The criteria are concave, so that the slope at any weights bounds them all.
     """
-    n, w = A.shape[2], np.full(len(A), count / len(A))
+    n = A.shape[2]
+    w = np.full(len(A), count / len(A))
     bound = np.inf
     flat = A.reshape(-1, n)
-    power = {"D": 1.0, "E": 1.0 / (SMOOTH + 1)}.get(criterion, 0.5)
-    for k in range(most):
+    power = 1.0 if criterion == "D" else 0.5
+    for k in range(MOST_STEPS):
         M = np.eye(n) + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
         value, Z = _criterion(M, criterion, C)
         gain = np.sum((flat @ Z) * flat, axis=1).reshape(len(A), -1).sum(axis=1)
-        top = np.sum(Z * M) if criterion == "E" else value
-        bound = min(bound, float(top + np.sort(gain)[-count:].sum() - gain @ w))
+        bound = min(bound, float(value + np.sort(gain)[-count:].sum() - gain @ w))
         off = (bound - value) / (n if criterion == "D" else abs(value))
         if off <= 2e-3:
             break
@@ -300,26 +283,19 @@ def _filled(v: Array, count: int) -> Array:
     return np.minimum(1.0, mu[np.argmax(mu * v[order[:count]] <= 1)] * v)
 
 
-def _exchanged(A: Array, chosen: np.ndarray, criterion: str, C: Array, weights: Array, passes: int = 20) -> np.ndarray:
+def _exchanged(A: Array, chosen: np.ndarray, criterion: str, C: Array) -> np.ndarray:
     """Exchange single configurations while that improves the criterion."""
-    picked, n = [int(k) for k in chosen], A.shape[2]
+    picked = [int(k) for k in chosen]
+    n = A.shape[2]
     eye = np.eye(A.shape[1])
-    for _ in range(passes):
+    for _ in range(MOST_PASSES):
         changed = False
         for place in range(len(picked)):
             others = [c for c in picked if c != picked[place]]
-            M = np.eye(n) + np.einsum("kin,kim->nm", A[others], A[others])
-            inverse = np.linalg.inv(M)
+            inverse = np.linalg.inv(np.eye(n) + np.einsum("kin,kim->nm", A[others], A[others]))
             small = np.einsum("kin,nm,kjm->kij", A, inverse, A, optimize=True) + eye
             if criterion == "D":
                 score = np.linalg.slogdet(small)[1]
-            elif criterion == "E":
-                score = np.full(len(A), -np.inf)
-                likely = np.argsort(-weights)[: 3 * len(picked)]
-                vector = np.linalg.eigh(M)[1][:, 0]
-                likely = np.union1d(likely, np.argsort(-np.sum((A @ vector) ** 2, axis=1))[:20])
-                for k in np.append(likely, picked[place]):
-                    score[k] = np.linalg.eigvalsh(M + A[k].T @ A[k])[0]
             else:
                 middle = np.einsum("kin,nm,kjm->kij", A, inverse @ C @ inverse, A, optimize=True)
                 score = np.trace(np.linalg.solve(small, middle), axis1=1, axis2=2)
@@ -414,15 +390,11 @@ class Observability(Brief):
         }
 
 
-def observe(problem: Source, x: Array | None = None) -> Observability:
-    """Return how well the data of a problem show its identified parameters.
+def observe(problem: Source) -> Observability:
+    """Return how well the data of a problem, in memory or in blocks, show its identified parameters.
 
-    Parameters
-    ----------
-    problem
-        In memory or in blocks. Measured values do not matter, configurations, scales and covariance do.
-    x
-        (n,) deviations [SI] to linearize at; nominal by default, where redundancies are exact.
+    It is linearized at nominal, where redundancies are exact. Measured values do not matter, configurations, scales
+    and covariance do.
 
     Examples
     --------
@@ -432,7 +404,7 @@ def observe(problem: Source, x: Array | None = None) -> Observability:
     '20 of 26 directions are seen, condition 2.87e+03'
     """
     free = problem.parameters.free
-    x = np.zeros(len(free)) if x is None else x
+    x = np.zeros(len(free))
     model = problem.linearize(x)
     s = model.svd[1]
     A, rank = model.triangle[: len(x), : len(x)], model.rank

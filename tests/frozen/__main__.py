@@ -30,6 +30,10 @@ INTENDED = {
     "paper_arm:parallel_axes": CONDITIONAL,
     "constrained:drawing": ("x",),  # cones: an interior point is exact to 1e-10 of the objective, not of x
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
+    # x counts from where registration puts the base, which is exact to the root of rounding
+    "seven_axis": ("x",),
+    "tracker": ("x",),
+    "markers": ("x", "objective", "std", "hyperparameters"),  # one of three reflectors places the base, not all of them
     "paper_arm:misprints": ("x", "weight", "objective", "std"),  # what a rule sees of a robust loss is decided anew
 }
 """What may differ by more, and why."""
