@@ -239,8 +239,13 @@ def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False,
         found = inspect(instance.problem, instance.validation)
         say("analysing the residuals of a quick fit")
         lacking = foreseen(instance.problem)
-    document = {"title": instance.title, "source": instance.source, **found.content(), "lack_of_fit": None}
-    head = "\n".join(filter(None, [instance.title, instance.source]))
+    document = {
+        "title": instance.record.title,
+        "source": instance.record.source,
+        **found.content(),
+        "lack_of_fit": None,
+    }
+    head = "\n".join(filter(None, [instance.record.title, instance.record.source]))
     text = f"{head}\n\n{found}"
     if lacking is not None:
         document["lack_of_fit"] = lacking.content()
@@ -282,7 +287,8 @@ def calibrate(
 
         say("reading the problem")
         instance = load(problem, variant)
-        instance = replace(instance, requirement=console.required(limit, box, instance.requirement))
+        requirement = console.required(limit, box, instance.record.requirement)
+        instance = replace(instance, record=replace(instance.record, requirement=requirement))
         with clock() as running:
             result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
             times = dict(running.rows())

@@ -27,7 +27,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.record import Record, Requirement
+from rpim_opt.data.record import Record
 from rpim_opt.data.tables.reading import read_data, robodk_columns
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import identified_of
@@ -64,26 +64,16 @@ class Instance(Tabled):
 
     Parameters
     ----------
-    title, source
-        What it is, and where every figure comes from.
-    problem, validation
-        Robot, parameters and identification data, and measurements that no step of the calibration may see.
+    problem
+        Robot, parameters and identification data.
     formulation, weight, prior, model, noise
         As for `calibrate`; weight None where hyperparameters are estimated.
+    record
+        What a saved result and its report say of the data; validation data, which no step of the calibration may see.
     published
         Mean errors [mm] that the source prints for the same table, by role (identification, validation) and method.
     reference
         Figures that a run must reproduce, by name: (value, tolerance).
-    simulation
-        How the tables were simulated; empty for real measurements.
-    files
-        SHA-256 of the files that were read, by name.
-    excluded
-        Rows that the folder leaves out, label to reason.
-    details, requirement
-        Who measured, when, with which instrument; tolerance and region of the acceptance test, or None.
-    reading
-        How the tables that it was made from were read.
     held_out
         Whether the validation data were drawn from the same table: once they have validated, all rows are used.
 
@@ -92,39 +82,35 @@ class Instance(Tabled):
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = instance.calibrate()
-    >>> instance.record.title, instance.excluded["T8-7"], instance.published["validation"]["RPIM"]
+    >>> instance.record.title, instance.record.excluded["T8-7"], instance.published["validation"]["RPIM"]
     ("The paper's cooperative manipulator", 'z misprinted, off by 15.0 mm', 0.468)
     """
 
-    title: str
-    source: str
     problem: CalibrationProblem
-    validation: Dataset | None
     formulation: Formulation
     weight: float | Selector | None
     prior: Prior = field(default_factory=Prior)
-    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    simulation: Mapping[str, Any] = field(default_factory=dict)
-    files: Mapping[str, str] = field(default_factory=dict)
-    excluded: Mapping[str, str] = field(default_factory=dict)
     model: str = "geometry"
     noise: str = "robot"
-    details: Mapping[str, str] = field(default_factory=dict)
-    requirement: Requirement | None = None
-    reading: Mapping[str, str] = field(default_factory=dict)
-    terms: Sequence[str] = ()
+    record: Record = field(default_factory=Record)
+    published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     held_out: bool = False
 
+    @property
+    def validation(self) -> Dataset | None:
+        """Measurements that no step of the calibration may see."""
+        return self.record.validation
+
     def _short(self) -> str:
-        return f"'{shortened(self.title)}' {self.problem._short()}"
+        return f"'{shortened(self.record.title)}' {self.problem._short()}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         """Return the identified parameters."""
         return self.problem.parameters.free._frame_rows()
 
     def _notes(self) -> list[str]:
-        return [self.source]
+        return [self.record.source]
 
     def calibrate(self, **changes: Any) -> Calibration:
         """Return the calibration as the folder wants it, with its record.
@@ -144,22 +130,6 @@ class Instance(Tabled):
         asked = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
         asked |= {"model": self.model, "noise": self.noise}
         return replace(identify.calibrate(self.problem, **{**asked, **changes}), record=self.record)
-
-    @property
-    def record(self) -> Record:
-        """What a saved result and its report say of the data: title, source, validation data, files, excluded rows."""
-        return Record(
-            self.title,
-            self.source,
-            self.validation,
-            self.files,
-            self.excluded,
-            bool(self.simulation),
-            details=self.details,
-            requirement=self.requirement,
-            reading=self.reading,
-            terms=tuple(self.terms),
-        )
 
 
 def load(
@@ -216,25 +186,28 @@ def load(
     for key, pair in table.reference.items():
         if len(pair) != 2:
             raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
-    return Instance(
+    record = Record(
         title=table.title,
         source=table.source,
-        problem=problem,
         validation=validation,
-        formulation=formulation,
-        weight=named_weight(table.selector, path),
-        prior=prior,
-        published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
-        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
-        simulation=table.simulation,
         files=_hashes(stated, files),
         excluded=table.exclude,
-        model=table.model,
-        noise=table.scatter if isinstance(table.scatter, str) else "declared",
+        simulated=bool(table.simulation),
         details=details,
         requirement=requirement,
         reading=table.reading,
-        terms=table.terms if model is None else (),
+        terms=tuple(table.terms) if model is None else (),
+    )
+    return Instance(
+        problem=problem,
+        formulation=formulation,
+        weight=named_weight(table.selector, path),
+        prior=prior,
+        model=table.model,
+        noise=table.scatter if isinstance(table.scatter, str) else "declared",
+        record=record,
+        published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
+        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         held_out=table.held_out,
     )
 

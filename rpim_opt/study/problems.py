@@ -13,6 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.program import Program
 from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.record import Record
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.instances import Instance, load
 from rpim_opt.study.arms import SimulatedArm
@@ -79,7 +80,7 @@ def _sources(problems: Any, label: str = "") -> Iterator[Source]:
     elif instance is not None:
         title = "problem"
         if isinstance(problems, Instance | CalibrationProblem):
-            title = problems.title if isinstance(problems, Instance) else problems.robot.name
+            title = problems.record.title if isinstance(problems, Instance) else problems.robot.name
         elif isinstance(problems, SimulatedArm):
             title = "SimulatedArm"
         yield Source(label or title, instance)
@@ -111,12 +112,16 @@ def _instance(given: Any, label: str) -> Instance | None:
         case Instance():
             return given
         case SimulatedArm():
-            return Instance(label, "", given.problem, given.true, tikhonov, None)
+            return _bare(given.problem, given.true, label)
         case CalibrationProblem():
-            return Instance(label, "", given, None, tikhonov, None)
+            return _bare(given, None, label)
         case (CalibrationProblem() as problem, Dataset() as validation):
-            return Instance(label, "", problem, validation, tikhonov, None)
+            return _bare(problem, validation, label)
     return None
+
+
+def _bare(problem: CalibrationProblem, validation: Dataset | None, title: str) -> Instance:
+    return Instance(problem, tikhonov, None, record=Record(title, validation=validation))
 
 
 # --- what is held out ------------------------------------------------------------------------------------------------
@@ -180,7 +185,7 @@ def divide(instance: Instance, split: Split, fold: int, count: int | None, noise
         data = data.configurations(count, seed)
     if noise > 1:
         data = add_noise(data, noise, seed)
-    return replace(instance, problem=instance.problem.on(data), validation=held_out)
+    return replace(instance, problem=instance.problem.on(data), record=replace(instance.record, validation=held_out))
 
 
 def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:

@@ -266,7 +266,7 @@ def stated(folder: Path, text: str) -> Path:
 def test_a_problem_file_states_who_and_what_for(folder) -> None:
     loaded = ro.load(stated(folder, STATED))
     assert loaded.record.details == {"by": "A. Person", "when": "2026-05-12", "robot_serial": "4711"}
-    assert loaded.requirement == Requirement(2e-4, joints=((1, (np.radians(-30.0), np.radians(30.0))),))
+    assert loaded.record.requirement == Requirement(2e-4, joints=((1, (np.radians(-30.0), np.radians(30.0))),))
 
 
 @pytest.mark.parametrize(

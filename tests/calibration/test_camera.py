@@ -179,7 +179,7 @@ def test_a_board_may_come_from_a_table(tmp_path: Path) -> None:
     found = ro.load(copied(tmp_path, **{stated: 'target = "board.csv"'}))
     x = np.zeros(len(found.problem.parameters.free))
     assert found.problem.residual(x) == pytest.approx(ro.load("camera").problem.residual(x), abs=1e-9)
-    assert "board.csv" in found.files
+    assert "board.csv" in found.record.files
 
 
 def test_results_keep_what_a_camera_saw(tmp_path: Path) -> None:

@@ -175,7 +175,7 @@ def test_a_folder_takes_an_earlier_result_as_its_prior(folder: Path, tmp_path: P
     ro.store.save_prior(a_prior(), folder / "prior.json")
     found = with_prior(folder, '[prior]\nfrom = "earlier.json"\ninflate = 2\nwithout = ["base_*"]')
     assert found.prior == Prior.from_result(result, 2.0, ("base_*",))
-    assert "earlier.json" in found.files
+    assert "earlier.json" in found.record.files
     assert with_prior(folder, '[prior]\nfrom = "prior.json"').prior == a_prior()
 
 

@@ -40,7 +40,7 @@ def test_the_set_is_complete() -> None:
 def test_a_simulated_problem_reproduces_its_reference(name: str) -> None:
     instance, result = calibrated(name)
     assert result.converged
-    assert instance.source.startswith("Simulated")
+    assert instance.record.source.startswith("Simulated")
     found = {
         "nominal_mm": result.nominal_errors(instance.validation),
         "validation_mm": result.errors(instance.validation),
