@@ -6,6 +6,7 @@ import csv
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -53,7 +54,8 @@ def make_desk(folder: Path) -> None:
     shutil.copy(cell / "robot.toml", folder / "robot.toml")
     shutil.copy(cell / "identification.csv", folder / "table.csv")
     instance = ro.load(cell)
-    ro.store.save_result(ro.calibrate(instance.problem, ro.tikhonov, 1.0), folder / "result.json", instance.record)
+    result = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
+    ro.store.save_result(replace(result, record=instance.record), folder / "result.json")
     shutil.copytree(problems_folder() / "scara", folder / "sim")
     (folder / "arm.urdf").write_text(URDF)
     ro.robot.write_robot(ro.read_robot(find_robot("irb120")), folder / "arm.csv")

@@ -12,17 +12,11 @@ import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from glob import escape
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError, choices
-
-try:
-    import fcntl
-except ImportError:  # Windows: what a kill leaves there stays
-    fcntl = None
 
 LARGEST_TEXT = 2**24
 """Bytes that a description may have: a hundred times what the largest public ones need."""
@@ -170,7 +164,7 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write several files: all of them, or none, also after a power failure.
+    """Write several files: all of them, or none.
 
     A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A device
     or pipe gets the bytes as they are. Nothing is put in its place before the bytes of all are on the disk; when one
@@ -205,8 +199,6 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 renames.callback(old.replace, place) if known else renames.callback(place.unlink)
         for path, data in streams.items():
             path.write_bytes(data)
-        for folder in {place.parent for place in made}:
-            _settle(folder)
 
 
 @contextmanager
@@ -254,47 +246,11 @@ def _keep_mode(handle: int, place: Path) -> None:
         os.fchmod(handle, stat.S_IMODE(known.st_mode))
 
 
-def _settle(folder: Path) -> None:
-    """Wait until a folder's new names are on the disk."""
-    with suppress(OSError):  # some file systems do not know that
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
-
-
 @contextmanager
 def scratch_folder(place: Path) -> Iterator[Path]:
-    """Make a folder beside ``place`` for what will be moved there, and remove it in the end.
-
-    A kill leaves it, and the next one for the same place removes it: a lock tells which ones somebody still uses.
-    """
-    for left in place.parent.glob(f".{escape(place.name)}.*{ENDING}"):
-        with ExitStack() as stack:
-            if _lock(left, stack, wait=False):
-                shutil.rmtree(left, ignore_errors=True)
-    with ExitStack() as stack:
-        folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
-        stack.callback(lambda: shutil.rmtree(folder, ignore_errors=True))
-        _lock(folder, stack, wait=True)
-        while not folder.exists():  # somebody took it for one that was left
-            folder = Path(tempfile.mkdtemp(ENDING, f".{place.name}.", place.parent))
-            _lock(folder, stack, wait=True)
-        yield folder
-
-
-def _lock(folder: Path, stack: ExitStack, wait: bool) -> bool:
-    """Lock a folder until the stack ends; return whether that succeeded, which not all systems know."""
-    if fcntl is None:
-        return False
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_NOFOLLOW | os.O_DIRECTORY)
-        stack.callback(os.close, handle)
-        fcntl.flock(handle, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError:
-        return False
-    return True
+    """Make a folder beside ``place`` for what will be moved there, and remove it in the end."""
+    with tempfile.TemporaryDirectory(ENDING, f".{place.name}.", place.parent, ignore_cleanup_errors=True) as folder:
+        yield Path(folder)
 
 
 def write_json(path: Path, content: Any) -> None:

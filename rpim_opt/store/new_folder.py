@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import make_folder, read_text, scratch_folder, undoing, write_text
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
-from rpim_opt.basics.units import UNITS, parse_units
+from rpim_opt.basics.units import UNITS
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
@@ -63,7 +63,6 @@ def new_problem(
     data: str | Path | Sequence[str | Path],
     *,
     measurement: str | None = None,
-    units: str = "",
     options: TableOptions | None = None,
     validation: str | Path | None = None,
     hold_out: float | None = None,
@@ -82,8 +81,6 @@ def new_problem(
         A new one.
     robot, data, measurement, options, urdf_base, urdf_tip, dh
         As for `understand_tables`.
-    units
-        Units of columns whose name carries none, ``"deg,mm"``; beside ``options`` added to theirs.
     validation
         A table of measurements for validation.
     hold_out, seed
@@ -110,8 +107,6 @@ def new_problem(
     if folder.exists() or folder.is_symlink():
         raise InputError("the folder", "one that is there", "a new one: nothing is overwritten", folder)
     options = options or TableOptions()
-    if units:
-        options = replace(options, units={**options.units, **parse_units(units)})
     if validation is not None and hold_out is not None:
         raise InputError("validation", "a table and a part to hold out", "one of them")
     source = find_source(robot)

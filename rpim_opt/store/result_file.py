@@ -14,7 +14,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import read_json, write_json
-from rpim_opt.basics.text import version_of
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.certificate import Certificate
@@ -74,17 +73,15 @@ MAKERS: dict[str, Callable[..., Any]] = {
 }
 
 
-def save_result(result: Calibration, path: str | Path, record: Record | None = None) -> None:
+def save_result(result: Calibration, path: str | Path) -> None:
     """Write a calibration to one JSON file, which `load_result` reads; the file is whole or not written at all.
 
     Parameters
     ----------
     result
-        The calibration.
+        The calibration; its record has title, validation data and input files.
     path
         The file, or a folder for ``result.json``.
-    record
-        Title, validation data and input files, as in ``load(...).record``; the calibration's own by default.
 
     Raises
     ------
@@ -94,16 +91,13 @@ def save_result(result: Calibration, path: str | Path, record: Record | None = N
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> instance = ro.load("paper_arm")
-    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=1e-3)
-    >>> ro.store.save_result(result, "result.json", instance.record)
+    >>> result = ro.load("paper_arm").calibrate(weight=1e-3)
+    >>> ro.store.save_result(result, "result.json")
     >>> ro.load_result("result.json").record.title
     "The paper's cooperative manipulator"
     """
     if not result.problem.keeps_rows:
         raise InputError("save_result", "data in blocks", "data in memory, which the file repeats")
-    if record is not None:
-        result = replace(result, record=record)
     write_json(_result_path(path), content(result))
 
 
@@ -111,7 +105,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     """Return the calibration that a file holds.
 
     A digest tells whether anything was changed since it was written: by error, that is, and not by somebody who also
-    writes a new digest. Figures are computed anew from the data, and those that the file states are compared with them.
+    writes a new digest. The errors of all rows are computed anew and compared with those that the file states.
     A formulation with functions of a script's own is there by its name: it cannot be solved again, everything else
     works.
 
@@ -133,9 +127,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> instance = ro.load("paper_arm")
-    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
-    >>> ro.store.save_result(result, "result.json", instance.record)
+    >>> ro.store.save_result(ro.load("paper_arm").calibrate(), "result.json")
     >>> again = ro.load_result("result.json")  # without the problem's folder
     >>> print(f"{1e3 * again.errors(again.record.validation).mean():.3f} mm")
     0.032 mm
@@ -152,10 +144,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         if model is None:
             model = Model([own_object(term, Term, "key record.terms", path) for term in file.record.terms])
         result = _calibration(file, known, model)
-        found = derived(result)
-        if file.record.versions.get("rpim-opt", version_of("rpim-opt")) != version_of("rpim-opt"):
-            found = {"rows": found["rows"]}  # another version may define figures differently
-        _require_agreement(stored, found, "key")
+        _require_agreement(file.rows, result)
         result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
     except InputError as error:
         raise error.within(path) from None
@@ -303,7 +292,8 @@ def content(result: Calibration) -> dict[str, Any]:
         "format": FORMAT,
         "version": VERSION,
         "title": result.record.title,
-        **derived(result),
+        **figures(result),
+        "nominal": {name: statistics(result.nominal_errors(data)) for name, data in _sets(result).items()},
         **plain(stored),
         "acceptance": None if result.record.requirement is None else accept(result).content(),
     }
@@ -334,12 +324,6 @@ def figures(result: Calibration) -> dict[str, Any]:
         "flagged": result.doubted,
         "parameters": result.parameter_rows(),
     }
-
-
-def derived(result: Calibration) -> dict[str, Any]:
-    """Return the figures that follow from data and parameters, computed anew where a file is read."""
-    nominal = {name: statistics(result.nominal_errors(data)) for name, data in _sets(result).items()}
-    return {**figures(result), "nominal": nominal, "rows": plain(_rows(result))}
 
 
 def _sets(result: Calibration) -> dict[str, Dataset]:
@@ -551,19 +535,16 @@ def _kept(file: Stored, program: Program) -> Kept:
     return Kept(file.held, equations, factor, tuple(file.trust.left_out), file.prices)
 
 
-def _require_agreement(stated: Any, found: Any, where: str) -> None:
-    """Refuse stated figures that are not the computed ones, to their rounding; other keys of the file do not matter."""
-    agree = type(stated) is type(found) and stated == found
-    if isinstance(found, Mapping) and isinstance(stated, Mapping):
-        for key, value in found.items():
-            _require_agreement(stated.get(key), value, f"{where}{' ' if where == 'key' else '.'}{key}")
-        return
-    if isinstance(found, list | tuple) and isinstance(stated, list) and len(stated) == len(found):
-        for number, (each, value) in enumerate(zip(stated, found, strict=True), start=1):
-            _require_agreement(each, value, f"{where} {number}")
-        return
-    if isinstance(found, float) and isinstance(stated, int | float):
-        agree = math.isclose(stated, found, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
-    if not agree:
-        accepted = f"{repr(found)[:60]}, which follows from the file's data, terms and measurement models"
-        raise InputError(where, repr(stated)[:60], accepted)
+def _require_agreement(stated: Mapping[str, Sequence[RowErrors]], result: Calibration) -> None:
+    """Refuse a script's terms or measurement models with which rows have other errors than the file states."""
+    for name, rows in _rows(result).items():
+        for before, now in zip(stated.get(name, ()), rows, strict=True):
+            if not all(_agree(a, b) for a, b in zip(before, now, strict=True)):
+                accepted = f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
+                raise InputError(f"key rows.{name}, row {before.label}", f"{before.identified_mm} mm", accepted)
+
+
+def _agree(stated: str | float | None, found: str | float | None) -> bool:
+    if isinstance(stated, float) and isinstance(found, float):
+        return math.isclose(stated, found, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
+    return stated == found

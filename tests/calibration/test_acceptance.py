@@ -216,7 +216,7 @@ def test_nothing_kept_apart_is_refused(instance) -> None:
 def test_a_file_keeps_the_record(everything, tmp_path: Path) -> None:
     required = Requirement(1e-4, box=((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9)), joints=((1, (-0.5, 0.5)),), confidence=0.9)
     record = replace(everything.record, requirement=required, details={"by": "A. Person", "temperature": "21"})
-    ro.store.save_result(everything, tmp_path / "result.json", record)
+    ro.store.save_result(replace(everything, record=record), tmp_path / "result.json")
     again = ro.load_result(tmp_path)
     assert again.record.requirement == required
     assert again.record.details == record.details

@@ -249,7 +249,7 @@ def result(data: bytes, folder: Path) -> None:
             path.write_text(json.dumps({**content, "digest": digest(content)}))
     found = ro.load_result(path)
     require(bool(np.isfinite(found.x).all()), "finite parameters")
-    ro.store.save_result(found, path, found.record)
+    ro.store.save_result(found, path)
     require(same(ro.load_result(path).x, found.x), "the same parameters")
 
 

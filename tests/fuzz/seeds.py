@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 
@@ -117,7 +118,7 @@ def _results() -> list[str]:
         for formulation, weight in ((ro.bounded, 0.1), (ro.tikhonov, ro.l_curve)):
             result = ro.calibrate(instance.problem, formulation, weight)
             path = Path(folder) / "result.json"
-            ro.store.save_result(result, path, instance.record)
+            ro.store.save_result(replace(result, record=instance.record), path)
             texts.append(path.read_text(encoding="utf-8"))
     return texts
 

@@ -31,19 +31,16 @@ def test_registration_finds_a_motion(seed: int, flat: bool) -> None:
     p[:, 2] *= not flat
     q = p @ T[:3, :3].T + T[:3, 3]
     assert np.abs(register(p, q) - T).max() < 1e-12
-    q[0] += 1.0
-    weights = np.append(0.0, rng.uniform(0.5, 2.0, 7))
-    assert np.abs(register(p, q, weights) - T).max() < 1e-12
 
 
-def test_registration_minimizes_the_weighted_sum_of_squares() -> None:
+def test_registration_minimizes_the_sum_of_squares() -> None:
     rng = np.random.default_rng(1)
-    p, q, w = rng.normal(size=(6, 3)), rng.normal(size=(6, 3)), rng.uniform(0.1, 3.0, 6)
+    p, q = rng.normal(size=(6, 3)), rng.normal(size=(6, 3))
 
     def cost(T: np.ndarray) -> float:
-        return float(w @ np.sum((p @ T[:3, :3].T + T[:3, 3] - q) ** 2, axis=1))
+        return float(np.sum((p @ T[:3, :3].T + T[:3, 3] - q) ** 2))
 
-    best = register(p, q, w)
+    best = register(p, q)
     assert np.linalg.det(best[:3, :3]) == pytest.approx(1.0)
     for k in range(200):
         near = best.copy()
@@ -60,7 +57,7 @@ def test_mirrored_points_get_a_proper_rotation() -> None:
 @pytest.mark.parametrize(
     ("points", "found"),
     [
-        (np.zeros((2, 3)), "2 with a weight"),
+        (np.zeros((2, 3)), "points: found 2"),
         (np.ones((5, 3)), "points on a line, or all in one place"),
         (np.outer(np.arange(5.0), [1.0, 2.0, 3.0]), "points on a line, or all in one place"),
         (np.zeros((4, 2)), "shapes"),

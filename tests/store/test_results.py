@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import cvxpy as cp
@@ -18,7 +19,7 @@ from tests.test_cli import run
 def saved(
     tmp_path: Path, result: ro.calibration.Calibration, record: ro.data.Record | None = None
 ) -> ro.calibration.Calibration:
-    ro.store.save_result(result, tmp_path, record)
+    ro.store.save_result(result if record is None else replace(result, record=record), tmp_path)
     return ro.load_result(tmp_path)
 
 
@@ -150,7 +151,8 @@ def test_a_measurement_of_a_script_is_passed_again(tmp_path: Path) -> None:
 def text(tmp_path_factory: pytest.TempPathFactory) -> str:
     path = tmp_path_factory.mktemp("result") / "result.json"
     instance = ro.load("paper_arm")
-    ro.store.save_result(ro.calibrate(instance.problem, ro.tikhonov, 1.0), path, instance.record)
+    result = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
+    ro.store.save_result(replace(result, record=instance.record), path)
     return path.read_text()
 
 

@@ -107,7 +107,7 @@ def test_problems_come_in_every_form(tmp_path: Path) -> None:
     assert found.problems == tuple(every)
     assert len({row["rms_mm"] for row in found.rows}) == 1
     assert ro.compare(tmp_path, selectors=1.0, progress=False).problems == ("a", "b")
-    assert ro.compare([POSITION], selectors=1.0, progress=False).problems == (POSITION.title,)
+    assert ro.compare([POSITION], selectors=1.0, progress=False).problems == (POSITION.record.title,)
 
 
 def test_without_validation_data_a_row_says_so() -> None:

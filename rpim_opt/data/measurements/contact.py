@@ -208,9 +208,7 @@ def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
     )
 
 
-def touches(
-    q: Array, point: Sequence[str], sigma: float | Array, label: tuple[str, ...] = (), planes: bool = False
-) -> Dataset:
+def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool = False) -> Dataset:
     """Return touches of unmeasured points or planes.
 
     Parameters
@@ -221,8 +219,6 @@ def touches(
         N names: rows with the same one touched the same point.
     sigma
         Standard deviation of a touch [m], or covariances (3, 3) or (N, 3, 3) [m^2].
-    label
-        N row labels; numbers from 1 by default.
     planes
         Whether planes were touched.
 
@@ -234,7 +230,7 @@ def touches(
     >>> data.configuration.tolist()
     [0, 1, 0, 1]
     """
-    data = Dataset.of(q, np.empty((len(q), 0)), sigma, label, revisit_plane if planes else revisit)
+    data = Dataset.of(q, np.empty((len(q), 0)), sigma, measurement=revisit_plane if planes else revisit)
     if len(point) != len(data):
         raise InputError("point", f"{len(point)} names", f"{len(data)}, one a touch")
     names = np.array([str(name) for name in point], dtype=object)[:, None]

@@ -17,13 +17,13 @@ NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
 """What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
 
 
-def register(source: Array, target: Array, weights: Array | None = None) -> Array:
-    """Return the rigid motion T (4, 4) that minimizes sum q_i |R source_i + t - target_i|^2 (paper, Eq. 17).
+def register(source: Array, target: Array) -> Array:
+    """Return the rigid motion T (4, 4) that minimizes sum |R source_i + t - target_i|^2 (paper, Eq. 17).
 
     The rotation is proper (det R = 1), by singular value decomposition (Umeyama 1991, IEEE PAMI 13:376).
 
-    ``source`` and ``target`` are N points (N, 3) [m], ``weights`` (N,) q_i, 1 by default. Refused are fewer than three
-    points, points that coincide, and points on a line: their rotation is arbitrary.
+    ``source`` and ``target`` are N points (N, 3) [m]. Refused are fewer than three points, points that coincide, and
+    points on a line: their rotation is arbitrary.
 
     Examples
     --------
@@ -37,31 +37,27 @@ def register(source: Array, target: Array, weights: Array | None = None) -> Arra
            [ 0.,  0.,  1.,  0.]])
     """
     source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
-    q = np.ones(len(source)) if weights is None else np.asarray(weights, dtype=float)
-    if source.shape != target.shape or source.shape[1:] != (3,) or q.shape != (len(source),) or not (q >= 0).all():
-        raise InputError(
-            "points", f"shapes {source.shape}, {target.shape}, {q.shape}", "N points, N points, N weights >= 0"
-        )
-    if np.count_nonzero(q) < 3:
-        raise InputError("points", f"{np.count_nonzero(q)} with a weight", "three or more, not on a line")
+    if source.shape != target.shape or source.shape[1:] != (3,):
+        raise InputError("points", f"shapes {source.shape}, {target.shape}", "N points, N points")
+    if len(source) < 3:
+        raise InputError("points", f"{len(source)}", "three or more, not on a line")
     for points, what in ((source, "source"), (target, "target")):
-        spread = np.linalg.svd(np.sqrt(q)[:, None] * (points - q @ points / q.sum()), compute_uv=False)
+        spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[1] <= 1e-6 * spread[0]:
             raise InputError(f"{what} points", "points on a line, or all in one place", "points that span a plane")
-    p, r = q @ source / q.sum(), q @ target / q.sum()
-    R = proper((target - r).T @ (q[:, None] * (source - p)))
+    p, r = source.mean(axis=0), target.mean(axis=0)
+    R = proper((target - r).T @ (source - p))
     return rigid(R, r - R @ p)
 
 
-def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[Array, Array]:
+def hand_eye(flange: Array, measured: Array) -> tuple[Array, Array]:
     """Return base Z and tool X, (4, 4) each, with measured_i = Z flange_i X: the problem A X = Z B, A = flange^-1.
 
     Rotations by the Kronecker product and one singular value decomposition (Shah 2013, J. Mechanisms and
-    Robotics 5:031007), translations by linear least squares, the tool's as near to ``start`` as the data allow.
+    Robotics 5:031007), translations by linear least squares, of the least norm.
 
     ``flange`` and ``measured`` are (N, 4, 4) transforms of the flange in the base, and of the tool in the instrument's
-    frame; ``start`` (3,) is the expected offset of the tool [m]. Refused are fewer than three poses, and rotations
-    about one axis only.
+    frame. Refused are fewer than three poses, and rotations about one axis only.
 
     Examples
     --------
@@ -88,10 +84,9 @@ def hand_eye(flange: Array, measured: Array, start: Place = (0, 0, 0)) -> tuple[
     sign = np.sign(np.linalg.det(V))
     Z, X = proper(sign * V), proper(sign * W).T
     A = np.concatenate([np.hstack([Z @ R, np.eye(3)]) for R in RA])
-    o = np.asarray(start, dtype=float)
-    b = measured[:, :3, 3] - transformed(flange, o) @ Z.T
+    b = measured[:, :3, 3] - flange[:, :3, 3] @ Z.T
     t: Any = np.linalg.lstsq(A, b.ravel(), rcond=1e-6)[0]
-    return rigid(Z, t[3:]), rigid(X, o + t[:3])
+    return rigid(Z, t[3:]), rigid(X, t[:3])
 
 
 def proper(M: Array) -> Array:

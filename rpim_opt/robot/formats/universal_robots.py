@@ -145,7 +145,7 @@ def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[
 # kinematics.yaml
 
 
-def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Described:
+def read_ur_kinematics(path: str | Path) -> Described:
     """Return the robot of a ``kinematics.yaml`` of ROS, in the controller's Base (``base_link`` turned half a turn).
 
     Under ``kinematics`` stand shoulder, upper_arm, forearm, wrist_1, wrist_2 and wrist_3, each with the origin of its
@@ -155,7 +155,7 @@ def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Describ
     ur_calibration computes them for R = Rx Ry Rz: a file from a controller therefore describes the robot only to
     the product of its small yaw angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
 
-    The file has plain keys, two spaces or more a level, one a line; joint limits (6, 2) [rad] are not in it.
+    The file has plain keys, two spaces or more a level, one a line; joint limits are not in it.
 
     Examples
     --------
@@ -167,7 +167,7 @@ def read_ur_kinematics(path: str | Path, limits: Array | None = None) -> Describ
     path = Path(path)
     chain, _ = _yaml_chain(read_bytes(path), path)
     table, base, tool, _ = describe(chain)
-    robot = Robot("Universal Robots", table, limits=np.empty((0, 0)) if limits is None else limits, source=path.name)
+    robot = Robot("Universal Robots", table, source=path.name)
     return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
