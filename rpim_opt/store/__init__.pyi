@@ -3,8 +3,6 @@ from .instances import calibrate as calibrate
 from .instances import load as load
 from .new_folder import new_problem as new_problem
 from .own_code import allow_code as allow_code
-from .prior_file import load_prior as load_prior
-from .prior_file import save_prior as save_prior
 from .problem_file import find_problem as find_problem
 from .problem_file import problems_folder as problems_folder
 from .raw import Understanding as Understanding

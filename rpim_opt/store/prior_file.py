@@ -1,17 +1,15 @@
-"""Priors in files: ``[prior]`` of a problem file, and JSON files in which every number reads back to the same bits."""
+"""``[prior]`` of a problem file: what is known of parameters, an earlier result, a fleet."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 from pydantic import ConfigDict, Field
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import inside, read_json, write_json
+from rpim_opt.basics.files import inside
 from rpim_opt.basics.schema import Table
 from rpim_opt.basics.units import fits, split_unit
 from rpim_opt.bayes.prior import Prior
@@ -20,75 +18,6 @@ from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.robot.parameter_names import JOINT_OFFSET, is_joint_offset
 from rpim_opt.robot.parameters import Parameters
-
-FORMAT = "rpim-opt prior"
-VERSION = 1
-
-
-def save_prior(prior: Prior, path: str | Path) -> None:
-    """Write a prior to one JSON file, which `load_prior` and a problem file's ``[prior]`` read.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> prior = ro.bayes.Prior(tails=5.0) & ro.bayes.Prior.known("a2 + a3 +- 0.05 mm")
-    >>> ro.store.save_prior(prior, "prior.json")
-    >>> ro.store.load_prior("prior.json") == prior
-    True
-    """
-    from rpim_opt.store.serialize import plain
-
-    write_json(Path(path), {"format": FORMAT, "version": VERSION, **plain(prior)})
-
-
-def load_prior(path: str | Path) -> Prior:
-    """Return the prior of a file of `save_prior`; an InputError names the key that does not fit.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> ro.store.save_prior(ro.bayes.Prior(tails=np.inf, scale={"theta?_mrad": 8.0}), "prior.json")
-    >>> ro.store.load_prior("prior.json").tails
-    inf
-    """
-    path = Path(path)
-    stored = read_json(path)
-    if not _is_prior(stored):
-        raise InputError("the file", "no prior of rpim-opt", "a file of store.save_prior()", path)
-    return _prior(stored, path)
-
-
-def _is_prior(stored: Any) -> bool:
-    return isinstance(stored, dict) and stored.get("format") == FORMAT
-
-
-def _prior(stored: Mapping[str, Any], path: Path) -> Prior:
-    """Return the prior of a file's content."""
-    from rpim_opt.store.serialize import structured
-
-    try:
-        if stored.get("version") != VERSION:
-            raise InputError("key version", repr(stored.get("version"))[:40], f"{VERSION}")
-        prior = structured(stored, Prior)
-        numbers = {"key centre": [*prior.centre.values()], "key scale": [*prior.scale.values()]}
-        for number, each in enumerate(prior.statements, start=1):
-            where = f"key statements {number}"
-            p, k = len(each.names), len(each.values)
-            reference = [0.0] * p if each.reference is None else each.reference
-            if {len(each.dimensions), len(reference), *map(len, each.rows)} - {p} or len(each.rows) != k:
-                accepted = f"{k} rows of {p} numbers, one a parameter, and as many dimensions and numbers of reference"
-                raise InputError(where, "parts that do not fit together", accepted)
-            numbers[where] = [*each.values, *reference, *(v for row in each.rows for v in row)]
-        for where, values in numbers.items():
-            if not np.isfinite(values).all():
-                raise InputError(where, "a number that is not finite", "finite numbers")
-    except InputError as error:
-        raise error.within(path) from None
-    return prior
-
-
-# --- [prior] of a problem file -----------------------------------------------------------------------------------
 
 
 class PriorTable(Table):
@@ -157,9 +86,6 @@ def stated_prior(
     def earlier() -> Prior:
         from rpim_opt.store.result_file import load_result  # most folders name no earlier result
 
-        stored = read_json(files[table.earlier])
-        if _is_prior(stored):
-            return _prior(stored, files[table.earlier])
         return Prior.from_result(load_result(files[table.earlier], measurements), table.inflate, table.without)
 
     def population() -> Prior:

@@ -15,7 +15,6 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_json
 from rpim_opt.calibration.acceptance import distance_quantile, reaching, region_of
 from rpim_opt.problem.workspace import in_base
-from rpim_opt.store.serialize import digest
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -227,11 +226,6 @@ def test_a_file_keeps_the_record(everything, tmp_path: Path) -> None:
     written = read_json(tmp_path / "result.json")
     assert written["acceptance"]["verdict"] == accept(again).verdict
     assert written["held_out"]["identified"]["count"] == len(held.label)
-    written["record"]["held_out"]["error"][0] = 0.0
-    written["digest"] = digest(written)
-    (tmp_path / "result.json").write_text(json.dumps(written))
-    with pytest.raises(ro.InputError, match=r"held_out|validation"):  # the figures no longer follow from the rows
-        ro.load_result(tmp_path)
 
 
 # --- problem file and commands -----------------------------------------------------------------------------------

@@ -26,7 +26,6 @@ from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.prior_file import load_prior, save_prior
 from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
 from rpim_opt.store.raw import NOISE, understand_of
 from rpim_opt.store.serialize import digest
@@ -224,19 +223,6 @@ def stated(data: bytes, folder: Path) -> None:
     prior = ro.bayes.Prior.known(_sentence(data))
     found = prior.stated(_parameters())
     require(bool(np.isfinite(found.rows).all()) and bool(np.isfinite(found.values).all()), "finite rows")
-    path = folder / "prior.json"
-    save_prior(prior, path)
-    require(load_prior(path) == prior, "the same prior")
-
-
-def prior(data: bytes, folder: Path) -> None:
-    """Read a prior's file."""
-    path = folder / "prior.json"
-    path.write_bytes(data)
-    found = load_prior(path)
-    save_prior(found, path)
-    require(load_prior(path) == found, "the same prior")
-    found.stated(_parameters())
 
 
 def result(data: bytes, folder: Path) -> None:
@@ -279,7 +265,6 @@ PARSERS: dict[str, Callable[[bytes, Path], None]] = {
     "calibration_conf": calibration_conf,
     "sentence": sentence_alone,
     "stated": stated,
-    "prior": prior,
     "result": result,
     "options": options,
 }

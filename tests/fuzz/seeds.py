@@ -123,14 +123,6 @@ def _results() -> list[str]:
     return texts
 
 
-def _priors() -> list[str]:
-    prior = ro.bayes.Prior(tails=5.0, scale={"theta?_mrad": 8.0}) & ro.bayes.Prior.known("a2 + a3 +- 0.05 mm")
-    with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder) / "prior.json"
-        ro.store.save_prior(prior, path)
-        return [path.read_text(encoding="utf-8")]
-
-
 def _targets() -> list[str]:
     return [
         "label,q1_deg,q2_deg\nA,0,10\nB,1,2\n",
@@ -159,7 +151,6 @@ MAKERS = {
     "calibration_conf": lambda: [CONF],
     "sentence": lambda: list(SENTENCES),
     "stated": lambda: [*KNOWN, *SENTENCES],
-    "prior": _priors,
     "result": _results,
     "options": _options,
 }

@@ -1,8 +1,7 @@
-"""What a folder believes before the data, in files: words, numbers, earlier results."""
+"""What a folder states before the data: words, numbers, earlier results."""
 
 from __future__ import annotations
 
-import json
 import shutil
 from pathlib import Path
 
@@ -43,54 +42,6 @@ def a_prior() -> Prior:
         centre={"d5_mm": 0.1 + 0.2}, scale={"theta?_mrad": 1 / 3}, tails=np.inf, groups=("a? d?",), frames=7.0
     )
     return prior & Prior.known("a2 - 0.3 a3 = nominal + 0.1 +- 0.07 mm")
-
-
-def test_a_prior_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    prior = a_prior()
-    ro.store.save_prior(prior, tmp_path / "prior.json")
-    assert ro.store.load_prior(tmp_path / "prior.json") == prior
-
-
-def test_the_posterior_of_a_result_comes_back_to_the_last_bit(tmp_path: Path) -> None:
-    result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
-    prior = Prior.from_result(result, without=("base_*",))
-    ro.store.save_prior(prior, tmp_path / "prior.json")
-    assert ro.store.load_prior(tmp_path / "prior.json") == prior
-    assert Prior.from_result(result, without=("base_*",)) == prior
-
-
-@pytest.mark.parametrize(
-    ("change", "says"),
-    [
-        ({"format": "rpim-opt result"}, "no prior of rpim-opt"),
-        ({"version": 2}, "key version"),
-        ({"tails": -1.0}, "prior, key tails"),
-        ({"frames": "wide"}, "key frames"),
-        ({"statements": [{"names": ["a2"]}]}, "key statements 1"),
-    ],
-)
-def test_a_file_that_is_no_prior_is_refused(tmp_path: Path, change: dict[str, object], says: str) -> None:
-    path = tmp_path / "prior.json"
-    ro.store.save_prior(a_prior(), path)
-    path.write_text(json.dumps({**json.loads(path.read_text()), **change}))
-    with pytest.raises(ro.InputError) as error:
-        ro.store.load_prior(path)
-    assert str(path) in str(error.value)
-    assert says in str(error.value)
-
-
-@pytest.mark.parametrize(
-    ("key", "value"),
-    [("rows", [[1.0, 2.0, 3.0]]), ("reference", []), ("dimensions", ["length"]), ("values", []), ("values", ["nan"])],
-)
-def test_statements_that_do_not_fit_together_are_refused(tmp_path: Path, key: str, value: list[object]) -> None:
-    path = tmp_path / "prior.json"
-    ro.store.save_prior(a_prior(), path)
-    content = json.loads(path.read_text())
-    content["statements"][0][key] = value
-    path.write_text(json.dumps(content))
-    with pytest.raises(ro.InputError, match=r"prior\.json, key statements 1: found (parts that|a number that is not)"):
-        ro.store.load_prior(path)
 
 
 # --- results ---------------------------------------------------------------------------------------------------------
@@ -172,11 +123,9 @@ def test_joint_offsets_are_three_times_the_angle_scale_unless_said(folder: Path,
 def test_a_folder_takes_an_earlier_result_as_its_prior(folder: Path, tmp_path: Path) -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
     ro.store.save_result(result, folder / "earlier.json")
-    ro.store.save_prior(a_prior(), folder / "prior.json")
     found = with_prior(folder, '[prior]\nfrom = "earlier.json"\ninflate = 2\nwithout = ["base_*"]')
     assert found.prior == Prior.from_result(result, 2.0, ("base_*",))
     assert "earlier.json" in found.record.files
-    assert with_prior(folder, '[prior]\nfrom = "prior.json"').prior == a_prior()
 
 
 def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
