@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
@@ -58,15 +58,10 @@ STYLE = {
 
 
 def figure(draw: Callable[..., Any], title: str, caption: str = "", height: float = HEIGHT) -> Figure:
-    """Return a figure of what ``draw`` draws on matplotlib axes ``ax``; the title stands for it where none is shown."""
-    return Figure(chart(draw, title, height)[0], caption)
-
-
-def chart(draw: Callable[..., Any], title: str, height: float = HEIGHT) -> tuple[Markup, Any]:
-    """Return what is drawn as SVG for a page, and the axes; a unit of the SVG is one of their pixels.
+    """Return a figure of what ``draw`` draws on matplotlib axes ``ax``; the title stands for it where none is shown.
 
     The page's policy allows no style attributes: they become attributes of their own. The page's colours stand in the
-    place of the light ones, and marks have their ``hints`` as tooltips.
+    place of the light ones, and marks have their ``hints`` as tooltips. A unit of the SVG is a pixel.
     """
     from matplotlib import rc_context
     from matplotlib.figure import Figure as Drawing
@@ -106,7 +101,7 @@ def chart(draw: Callable[..., Any], title: str, height: float = HEIGHT) -> tuple
     text = ElementTree.tostring(root, encoding="unicode")
     for role, color in {**plot.COLORS, "grid": STYLE["grid.color"]}.items():
         text = text.replace(color, f"var(--{role})")
-    return Markup(text), ax
+    return Figure(Markup(text), caption)
 
 
 def coded(text: str) -> Markup:
@@ -121,32 +116,23 @@ def _environment() -> Environment:
         loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
         trim_blocks=True, lstrip_blocks=True,
     )  # fmt: skip
-    environment.policies["json.dumps_kwargs"] = {"allow_nan": False}
     environment.filters["coded"] = coded
     return environment
 
 
 def render(
     title: str, kind: str, heading: str, top: Iterable[Block], sections: Iterable[tuple[str, Iterable[Block]]],
-    script: str = "", data: Mapping[str, Any] | None = None,
 ) -> str:  # fmt: skip
-    """Return a page as HTML: all texts are escaped, its own style and script alone may run, nothing is loaded.
+    """Return a page as HTML: all texts are escaped, its own style alone counts, no script runs, nothing is loaded.
 
-    The script is a file of the templates that reads ``data``. Pictures may stand in the page as data.
+    Pictures may stand in the page as data.
     """
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
-    code = (TEMPLATES / script).read_text(encoding="utf-8") if script else ""
-    policy = f"default-src 'none'; img-src data:; style-src {_digest(style)}"
-    if script:
-        policy += f"; script-src {_digest(code)}"
+    digest = base64.b64encode(sha256(style.encode()).digest()).decode()
+    policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
     return _environment().get_template("page.html").render(
-        title=title, kind=kind, heading=heading, top=top, sections=sections, data=data,
-        policy=policy, style=Markup(style), script=Markup(code),
+        title=title, kind=kind, heading=heading, top=top, sections=sections, policy=policy, style=Markup(style),
     )  # fmt: skip
-
-
-def _digest(text: str) -> str:
-    return f"'sha256-{base64.b64encode(sha256(text.encode()).digest()).decode()}'"
 
 
 # --- checks over time --------------------------------------------------------------------------------------

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined, percent
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
@@ -284,30 +284,28 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
         own = of.selector
         if own not in marked:
             marked = {own: of.weight, **marked}
-    path = program.path(weight_grid(program, 200 if program.closed_form else 40))
-    curve = np.sqrt([[e.loss, e.penalty] for e in path])
-    chosen: dict[str, Array] = {}
-    for name, weight in marked.items():
-        (at,) = program.path([weight])
-        chosen[f"{name}, weight {weight:.2g}"] = np.sqrt([at.loss, at.penalty])
-        if name == own:
-            own = f"{name}, weight {weight:.2g}"
-    return draw_l_curve(curve, chosen, own, ax)
 
+    def at(weight: float) -> list[Array]:
+        """Return the curve's point at a weight, or none: far from the chosen one a solver may fail."""
+        with suppress(NoSolutionFound):
+            (each,) = program.path([weight])
+            return [np.sqrt([each.loss, each.penalty])]
+        return []
 
-def draw_l_curve(curve: Array, chosen: Mapping[str, Array], own: str, ax: Axes = None) -> Axes:
-    """Draw an L-curve (k, 2), roots of loss and penalty, and points of it by name, of which ``own`` is in use."""
+    weights = weight_grid(program, 200 if program.closed_form else 40)
+    curve = np.array([point for weight in weights for point in at(weight)])
     ax = _axes(ax)
     residual, solution = curve[curve[:, 1] > VANISHED * float(np.median(curve[:, 1]))].T
     ax.plot(residual, solution, color=COLORS["ink"], lw=1.5)
-    others = [name for name in chosen if name != own]
-    for k, name in enumerate(others):
-        style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
-        (dot,) = ax.plot(*chosen[name].reshape(2, 1), color=f"C{k}", label=name, **style)
-        dot.hints = [name]
-    if own in chosen:
-        x, y = chosen[own].reshape(2, 1)
-        _dots(ax, x, y, "mark", f"chosen: {own}", [f"chosen: {own}"], ms=9.0)
+    for k, name in enumerate(sorted(marked, key=lambda name: name == own)):
+        label = f"{name}, weight {marked[name]:.2g}"
+        for x, y in at(marked[name]):
+            if name == own:
+                _dots(ax, [x], [y], "mark", f"chosen: {label}", [f"chosen: {label}"], ms=9.0)
+                continue
+            style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
+            (dot,) = ax.plot([x], [y], color=f"C{k}", label=label, **style)
+            dot.hints = [label]
     ax.set(xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior scales]")
     _logarithmic(ax, "x")
     _logarithmic(ax, "y")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -24,7 +24,7 @@ from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import HEADER, noise_sentence, scatter, scatter_rows, turned_frames, weight_lines
-from rpim_opt.convex.rules.selection import Selection, weight_grid
+from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
 from rpim_opt.data.dataset import Dataset
@@ -32,7 +32,7 @@ from rpim_opt.data.record import Earlier
 from rpim_opt.problem.design import combination, observe
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import plot, summary
-from rpim_opt.report.page import Block, Figure, Table, chart, figure, render
+from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
@@ -65,13 +65,12 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
 
 @dataclass(frozen=True)
 class Content:
-    """A result, what several sections judge of it, and what the page's script draws."""
+    """A result, and what several sections judge of it."""
 
     result: Calibration
     accepted: Acceptance | None
     map: Workspace | None
     composition: list[str]
-    embedded: dict[str, Any]
 
 
 def page(result: Calibration) -> str:
@@ -87,15 +86,13 @@ def page(result: Calibration) -> str:
     found = summary.workspace(result) if accepted is None else accepted.workspace
     if found is not None and not np.isfinite(found.expanded).all():
         found = None
-    content = Content(result, accepted, found, composition, {})
+    content = Content(result, accepted, found, composition)
     return render(
         f"Calibration: {heading}",
         f"Robot calibration report, {result.record.made[:10]}",
         heading,
         [*_headline(content), ("notes", warnings)],
         [(name, list(section(content))) for name, section in SECTIONS],
-        "report.js",
-        content.embedded,
     )
 
 
@@ -273,10 +270,6 @@ def _parameters(content: Content) -> Iterator[Block]:
 
 # --- diagnostics -------------------------------------------------------------------------------------------
 
-MOST_POINTS = 2000
-"""Points drawn in space."""
-VIEWS = (("30,20", "oblique"), ("0,90", "from above"), ("0,0", "along y"), ("90,0", "along x"))
-"""Azimuth and elevation [deg], and their names."""
 MOST_FLAGGED = 200
 """Flagged rows that are named, the worst first."""
 
@@ -285,7 +278,6 @@ def _diagnostics(content: Content) -> Iterator[Block]:
     result = content.result
     yield "heading", "Residuals"
     yield from _residuals(result, content.composition)
-    yield from _space(result, content.embedded)
     yield "heading", "Identifiability"
     yield from _identifiability(result)
     yield "heading", "Flagged and excluded rows"
@@ -314,52 +306,6 @@ def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
     if rows:
         caption = f"{what.capitalize()}, mean ± standard deviation [mm]"
         yield "table", Table(caption, ["data, axis", "nominal", "identified"], rows)
-
-
-def _space(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
-    points, before, after = [], [], []
-    labels: list[str] = []
-    for name, data in summary.sets(result).items():
-        vectors = result.error_vectors(data, nominal=True)
-        finite = np.isfinite(vectors).all(axis=1)
-        points.append(result.measured_positions(data)[finite])
-        before.append(vectors[finite])
-        after.append(result.error_vectors(data)[finite])
-        labels += [f"{data.label[i]} ({name})" for i in np.flatnonzero(finite)]
-    P = np.vstack(points)
-    if not len(P):
-        return
-    drawn = np.linspace(0, len(P) - 1, min(len(P), MOST_POINTS)).astype(int)
-    embedded["space"] = {
-        "points": P[drawn].round(6).tolist(),
-        "labels": [labels[i] for i in drawn],
-        "before": _lines(P[drawn], np.vstack(before)[drawn]),
-        "after": _lines(P[drawn], np.vstack(after)[drawn]),
-    }
-    ends = zip("xyz", P.min(axis=0), P.max(axis=0), strict=True)
-    span = ", ".join(f"{axis} {low:z.2f} to {high:z.2f} m" for axis, low, high in ends)
-    what = "measured positions in the instrument's frame"
-    if result.problem.sample().touches is not None:
-        what = "touches"
-    text = f"{len(P)} {what} with their error vectors, {span}. Turn with the mouse, a finger or the arrow keys."
-    if len(drawn) < len(P):
-        text += f" {len(drawn)} of them are drawn."
-    label = f"Measured positions in space with their error vectors: {len(P)} points, {span}. Arrow keys turn the view."
-    yield "heading", "Errors in space"
-    yield "space", {"text": text, "label": label, "views": VIEWS}
-
-
-def _lines(points: Array, vectors: Array) -> dict[str, Any]:
-    """Return errors [m] as enlarged lines [m]; those far beyond the others are cut so that these can be seen."""
-    length = np.linalg.norm(vectors, axis=1)
-    longest = 3 * float(np.percentile(length, 90))
-    cut = vectors * np.minimum(1.0, longest / np.maximum(length, 1e-12))[:, None]
-    times = plot.magnification(points, cut)
-    beyond = int(np.count_nonzero(length > longest))
-    note = f"enlarged {times:,.0f} times"
-    if beyond:
-        note += f", {beyond} beyond {mm(1e3 * longest)} mm cut"
-    return {"lines": (times * cut).round(5).tolist(), "errors": (1e3 * length).round(6).tolist(), "note": note}
 
 
 def _identifiability(result: Calibration) -> Iterator[Block]:
@@ -503,62 +449,35 @@ def _regularization(content: Content) -> Iterator[Block]:
     # with an earlier result as the prior, weight 1 joins two sets of data: no other weight has a meaning
     has_path = formulation.penalty is not None and formulation.solvable and not result.record.earlier
     if has_path and result.weight > 0:
-        yield from _weight(result, content.embedded)
+        yield from _weight(result)
     draw = partial(plot.picard, result.program, result.penalty_weight)
     yield "figures", [figure(draw, "Singular values and coefficients of the data", PICARD)]
 
 
-def _weight(result: Calibration, embedded: dict[str, Any]) -> Iterator[Block]:
-    """Yield the L-curve and the choice of every rule; what the page's slider needs goes into ``embedded``."""
+def _weight(result: Calibration) -> Iterator[Block]:
+    """Yield the L-curve, and the choice of every rule with the mean error that it leads to."""
     given = Selection(result.weight, "given", np.array([]), np.array([]), True)
     chosen = {**compare(result.program), result.selector: result.selection or given}
-    name, curve = _path(result, chosen)
-    weights = np.array(curve["weight"])
-    points = np.column_stack([curve["residual"], curve["solution"]])
-    places = {
-        rule: int(np.argmin(np.abs(np.log(weights / choice.weight))))
-        for rule, choice in chosen.items()
-        if choice.weight > 0
-    }
-    k = places[result.selector]
-    marked = {rule: points[i] for rule, i in places.items()}
-    draw = partial(plot.draw_l_curve, points, marked, result.selector)
-    svg, ax = chart(draw, "L-curve: residual norm against norm of the deviations", L_CURVE_HEIGHT)
-    x, y = ax.transData.transform(np.maximum(points, np.finfo(float).tiny)).clip(0, 1e4).round(2).T
-    takers: dict[str, list[str]] = {}
-    for rule, i in places.items():
-        takers.setdefault(str(i), []).append("the chosen weight" if rule == "given" else rule)
-    names = {place: ", ".join(rules) for place, rules in takers.items()}
-    drawn = {"x": x.tolist(), "y": (L_CURVE_HEIGHT - y).tolist()}
-    embedded["curve"] = {**curve, **drawn, "of": name, "takers": names, "chosen": k}
+    chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))
+    marked = {rule: choice for rule, choice in chosen.items() if choice.weight > 0}
+    draw = partial(plot.l_curve, result, marked)
+    title = "L-curve: residual norm against norm of the deviations"
     caption = "Every point is the solution at one weight: small weights above left, large ones below right."
-    yield "weight", {"figure": Figure(svg, caption), "last": len(weights) - 1, "chosen": k}
+    yield "figures", [figure(draw, title, caption, L_CURVE_HEIGHT)]
+    name, data = next(iter(summary.sets(result).items()))
+    problem = result.problem.on(data)
     rows = []
-    for rule, choice in sorted(chosen.items(), key=lambda item: item[1].weight):
-        mean = mm(curve["error"][places[rule]]) if rule in places else ""
+    for rule, choice in chosen.items():
+        mean = ""
+        with contextlib.suppress(NoSolutionFound):
+            if rule in marked:
+                (estimate,) = result.program.path([choice.weight])
+                errors = problem.errors(result.problem.parameters.free.scale * estimate.z)
+                mean = mm(1e3 * float(np.nanmean(errors)))
         own = f"{rule} (chosen)" if rule == result.selector else rule
         rows.append([own, f"{choice.weight:.3g}", mean, choice.note or WHY.get(rule, "given")])
     title = "Weights that the selection rules choose from the identification data alone"
     yield "table", Table(title, ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True)
-
-
-def _path(result: Calibration, chosen: Mapping[str, Selection]) -> tuple[str, dict[str, list[float]]]:
-    """Solve over a grid of weights and at the chosen ones; return whose mean error [mm] is given, and the curve."""
-    program = result.program
-    count = 80 if program.closed_form else 30
-    name, data = next(iter(summary.sets(result).items()))
-    problem = result.problem.on(data)
-    scale = result.problem.parameters.free.scale
-    curve: dict[str, list[float]] = {"weight": [], "residual": [], "solution": [], "error": []}
-    positive = [choice.weight for choice in chosen.values() if choice.weight > 0]
-    for weight in np.unique([*weight_grid(program, count), *positive]):
-        with contextlib.suppress(NoSolutionFound):  # far from the chosen weight a solver may fail
-            (estimate,) = program.path([weight])
-            curve["weight"].append(estimate.weight)
-            curve["residual"].append(float(np.sqrt(estimate.loss)))
-            curve["solution"].append(float(np.sqrt(estimate.penalty)))
-            curve["error"].append(1e3 * float(np.nanmean(problem.errors(scale * estimate.z))))
-    return name, curve
 
 
 SECTIONS = (

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator
 from dataclasses import replace
@@ -107,9 +106,7 @@ def test_one_file_that_loads_nothing(arm) -> None:
     assert "url(" not in re.sub(r"url\(#\w+\)", "", text)  # clip paths of the charts
     assert "@import" not in text
     (policy,) = [m["content"] for m in read.all("meta") if m.get("http-equiv") == "Content-Security-Policy"]
-    assert re.fullmatch(
-        r"default-src 'none'; img-src data:; style-src 'sha256-\S+'; script-src 'sha256-\S+'", str(policy)
-    )
+    assert re.fullmatch(r"default-src 'none'; img-src data:; style-src 'sha256-\S+'", str(policy))
     assert page(arm) == text
 
 
@@ -127,15 +124,11 @@ def test_headings_descend_and_figures_have_words(arm) -> None:
 
 def test_every_text_of_a_user_stays_text(evil) -> None:
     read = Reader(evil)
-    assert len(read.scripts) == 2
+    assert not read.scripts
     assert not read.all("img")
     assert not read.all("b")
     for label in EVIL:
         assert label in read.words
-    labels = json.loads(read.scripts[0])["space"]["labels"]
-    assert labels[: len(EVIL)] == [f"{label} (validation)" for label in EVIL]
-    assert "</" not in read.scripts[0]
-    assert "alert(1)" not in read.scripts[1]
 
 
 def test_a_report_says_what_a_reader_must_know() -> None:
@@ -160,7 +153,7 @@ def test_other_formulations_have_a_report(formulation) -> None:
     weight = 0.0 if formulation is ro.least_squares else 1.0
     text = page(ro.calibrate(problem, formulation, weight))
     assert ("No intervals" in text) == (formulation is not ro.least_squares)
-    assert ('id="weight"' in text) == (formulation is not ro.least_squares)
+    assert ("L-curve: residual norm" in text) == (formulation is not ro.least_squares)
 
 
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("cable", "joints", "markers", "scara", "seven_axis")]
@@ -224,52 +217,10 @@ def test_nothing_is_fetched_and_nothing_complains(opened: Browser) -> None:
     assert opened.complaints() == []
     assert [url.split(":")[0] for url in opened.requests()] == ["file"]
     drawn = opened.run("[...document.querySelectorAll('svg path')].map(p => p.getTotalLength())")
-    assert len(drawn) >= 19  # lines of ten charts, and those in space
+    assert len(drawn) >= 19  # lines of ten charts
     outlines = opened.run("[...document.querySelectorAll('svg path')].filter(p => !p.getAttribute('d')).length")
     assert outlines == 0
     assert opened.run("document.querySelectorAll('svg use title').length") >= 2 * (16 + 9)
-
-
-def test_the_slider_tells_of_every_weight(opened: Browser) -> None:
-    says = "document.getElementById('weight-says').textContent"
-    first = opened.run(says)
-    assert "(chosen)" in first
-    assert "selected by l_curve" in first
-    opened.run("document.getElementById('weight').focus()")
-    place = opened.run("document.getElementById('cursor').getAttribute('cx')")
-    opened.press("ArrowRight")
-    second = opened.run(says)
-    assert second != first
-    assert "residual norm" in second
-    for _ in range(20):
-        opened.press("ArrowRight")
-    assert float(opened.run("document.getElementById('cursor').getAttribute('cx')")) > float(place) + 10
-    curve = "document.getElementById('cursor').ownerSVGElement"
-    opened.run(f"{curve}.scrollIntoView()")
-    box = opened.run(f"(b => [b.left, b.top, b.width, b.height])({curve}.getBoundingClientRect())")
-    at = (box[0] + 0.95 * box[2], box[1] + 0.8 * box[3])
-    opened.mouse("mouseMoved", *at)
-    assert opened.run(says) not in (first, second)
-
-
-def test_the_view_turns_by_mouse_and_keyboard(opened: Browser) -> None:
-    drawn = "document.querySelector('#space .vectors').getAttribute('d')"
-    first = opened.run(drawn)
-    assert first.count("M") == 25
-    opened.run("document.getElementById('space').focus()")
-    opened.press("ArrowLeft")
-    second = opened.run(drawn)
-    box = "document.getElementById('space').getBoundingClientRect()"
-    x, y = opened.run(f"(b => [b.left + b.width / 2, b.top + b.height / 2])({box})")
-    opened.mouse("mousePressed", x, y, held=True)
-    opened.mouse("mouseMoved", x + 60, y + 20, held=True)
-    opened.mouse("mouseReleased", x + 60, y + 20)
-    third = opened.run(drawn)
-    opened.run("document.querySelector('button[data-view=\"0,90\"]').click()")
-    above = opened.run(drawn)
-    opened.run("document.querySelector('input[value=before]').click()")
-    assert len({first, second, third, above, opened.run(drawn)}) == 5
-    assert "before calibration" in opened.run("document.getElementById('space-says').textContent")
 
 
 @pytest.mark.parametrize("dark", [False, True])
