@@ -43,8 +43,6 @@ ITERATIONS = 6
 """Of the first fit between two estimates, twice as many in every later one: the first estimates change soon."""
 DISTINCT = 0.3
 """Logarithms of hyperparameters by which two optima differ."""
-NEARLY, APART = 6.0, 1.0
-"""By how much -2 ln L of another optimum may be worse to be named, and its logarithms must differ."""
 VAGUE = 1.0
 """Standard deviation of a logarithm from which on a scale of the geometry is hardly identified."""
 FLATTEST = 0.05
@@ -396,14 +394,6 @@ def _read(stack: Stack) -> np.ndarray:
 def _doubts(fit: Fit, spread: Array) -> Iterator[str]:
     """Yield sentences on how far the marginal likelihood decides; ``spread`` (s,) of the logarithms."""
     evidence, point = fit.evidence, fit.point
-    for other in fit.others:
-        if other.value - point.value < NEARLY and np.abs(other.logs - point.logs).max() > APART:
-            ratios = ", ".join(f"{ratio:.1g}" for ratio in np.exp(other.logs - point.logs))
-            yield (
-                "The marginal likelihood has a second optimum that is nearly as good, with hyperparameters "
-                f"{ratios} times as large: more configurations would decide."
-            )
-            break
     if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
         yield "A hyperparameter is implausibly far from its prior median: check units, scales and stated noise."
     vague = [i for i in evidence.prior.geometry if spread[i] > VAGUE]

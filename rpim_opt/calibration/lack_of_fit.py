@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import sampled
-from rpim_opt.bayes.model_selection import FIRST, OWNED, SESSIONS, SPEAK, TURNED, WARMTH, Comparison, Judged
+from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Comparison, Judged
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import family_of
 from rpim_opt.calibration.identify import calibrate
@@ -34,8 +34,6 @@ CORRELATED = 4.0
 """z-score from which on residuals are said to be autocorrelated."""
 ROUGH, FINE = 2.0, 0.3
 """Repeatability over measurement noise above which the robot is the limit, and below which the instrument is."""
-GROSS = 300.0
-"""Repeatability over measurement noise above which data are wrong."""
 NEGLIGIBLE = 0.1
 """Parts below this share of a larger one are not worth a word."""
 NOTABLE = 0.5
@@ -52,29 +50,33 @@ FEWEST_NEIGHBOURS = 8
 """Configurations below which there is no autocorrelation."""
 UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
 """Unit in which residuals are said, and its size in SI."""
-PATTERNS = {
-    "gravity": ("compliance?",),
-    "first harmonic": ("ecc_cos?", "ecc_sin?"),
-    "second harmonic": ("ecc2_cos?", "ecc2_sin?"),
-    "moments": ("bend*",),
-    SESSIONS: ("session_*",),
-    WARMTH: ("expansion",),
-}
-"""What `identify` says for the model extensions."""
-WHAT = {
-    "gravity": "gravity",
-    "first harmonic": "unevenly turning joints (eccentric encoders or gears)",
-    "second harmonic": "second harmonics of joints",
-    "moments": "gravity on masses with other centres than assumed",
-    "sessions": "a registration that differs from session to session",
-    "temperature": "lengths that grow with temperature",
-}
-DOES = {
-    "gravity": "The arm bends under gravity",
-    "first harmonic": "Joints turn unevenly (eccentric encoders or gears)",
-    "second harmonic": "Joints turn unevenly twice a turn",
-    "sessions": "The registration differs from session to session",
-    "temperature": "Lengths grow with temperature",
+
+
+class Extension(NamedTuple):
+    """A model extension in words: the patterns that identify it, and what it is where it is missing, and present."""
+
+    identify: tuple[str, ...]
+    name: str
+    effect: str = ""
+
+
+EXTENSIONS = {
+    "gravity": Extension(("compliance?",), "gravity", "The arm bends under gravity"),
+    "first harmonic": Extension(
+        ("ecc_cos?", "ecc_sin?"),
+        "unevenly turning joints (eccentric encoders or gears)",
+        "Joints turn unevenly (eccentric encoders or gears)",
+    ),
+    "second harmonic": Extension(
+        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints turn unevenly twice a turn"
+    ),
+    "moments": Extension(("bend*",), "gravity on masses with other centres than assumed"),
+    SESSIONS: Extension(
+        ("session_*",),
+        "a registration that differs from session to session",
+        "The registration differs from session to session",
+    ),
+    WARMTH: Extension(("expansion",), "lengths that grow with temperature", "Lengths grow with temperature"),
 }
 
 
@@ -121,9 +123,8 @@ class LackOfFit:
         Extensions of the model that the data support.
     alike
         Autocorrelation of the residuals of the model with all that `missing` names; None for too few.
-    upward, narrow
-        Joints whose compliance is significantly negative, which gravity cannot do; joints that turned so little that
-        nothing of their gears can be told.
+    upward
+        Joints whose compliance is significantly negative, which gravity cannot do.
     repeated, excess
         RMS of repeated readings of a configuration about their mean, None without enough of them; RMS of the residuals
         beyond that, where it is more than chance.
@@ -147,7 +148,6 @@ class LackOfFit:
     present: Mapping[str, Effect] = field(default_factory=dict)
     alike: Autocorrelation | None = None
     upward: tuple[int, ...] = ()
-    narrow: tuple[int, ...] = ()
     repeated: float | None = None
     excess: float = 0.0
     overstated: bool = False
@@ -179,9 +179,9 @@ class LackOfFit:
             size = ""
             if effect.rms is not None:
                 size = f": {_size(self, effect.rms)} RMS beyond what geometry can imitate"
-            lines.append(f"{DOES[family]}{size} (-2 ln L falls by {effect.gain:.0f}).")
+            lines.append(f"{EXTENSIONS[family].effect}{size} (-2 ln L falls by {effect.gain:.0f}).")
         if self.missing:
-            what = joined([WHAT[family] for family in self.missing])
+            what = joined([EXTENSIONS[family].name for family in self.missing])
             lines.append(
                 f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (-2 ln L "
                 f'falls by {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
@@ -232,7 +232,6 @@ class LackOfFit:
             "present": present,
             "alike": None if self.alike is None else self.alike._asdict(),
             "upward": list(self.upward),
-            "narrow": list(self.narrow),
             "alarming": self.alarming,
             "text": self.sentences(),
         }
@@ -280,13 +279,12 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         joint=after["joint"],
         repeatable=float(np.sqrt(share * total)),
         missing=best.families,
-        parameters=tuple(p for family in best.families for p in PATTERNS[family]),
+        parameters=tuple(p for family in best.families for p in EXTENSIONS[family].identify),
         gain=compared.gain,
         share=share,
         present=present,
         alike=_residual_autocorrelation(compared, best),
         upward=_upward(compared, present),
-        narrow=_narrow(problem),
         repeated=again,
         excess=excess,
         overstated=overstated,
@@ -384,15 +382,6 @@ def _upward(compared: Comparison, present: Mapping[str, Effect]) -> tuple[int, .
     return tuple(k for i, k in joint.items() if z[i] < -SURE * sd[i] and moves[i] > NOTABLE * largest)
 
 
-def _narrow(problem: CalibrationProblem) -> tuple[int, ...]:
-    """Return the revolute joints that turned by less than harmonics need."""
-    if len(problem.arms) > 1:
-        return ()
-    travel = np.ptp(problem.joint_values, axis=0)
-    kinds = problem.robot.joint_types
-    return tuple(i + 1 for i, kind in enumerate(kinds) if kind == "revolute" and travel[i] < TURNED[FIRST])
-
-
 def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:
     """Return the RMS [m or rad] of repeated readings about their mean, None for too few, and its freedom."""
     squares = 0.0
@@ -487,16 +476,10 @@ def _limit(found: LackOfFit) -> list[str]:
     """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
     if found.correlated and found.alike is not None:
         even = "Even then residuals" if found.missing else "Residuals"
-        lines = [
+        return [
             f"{even} of neighbouring configurations are correlated ({found.alike.correlation:.2f}, z = "
             f"{found.alike.z:.0f}): the model lacks an effect, which more readings will not average away."
         ]
-        if found.narrow:
-            named = joined([str(joint) for joint in found.narrow])
-            lines.append(f"Joints {named} moved too little to identify gear eccentricity.")
-        return lines
-    if found.robot > GROSS * found.instrument:
-        return ["No robot repeats so badly: look for wrong units, signs, frames or rows first (`inspect`)."]
     if found.robot > ROUGH * found.instrument:
         limit = "The robot, not the instrument, limits the result"
         if found.repeated is not None and found.excess:

@@ -13,7 +13,7 @@ from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
-from rpim_opt.calibration.diagnosis import Flag, Held
+from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.calibration.verdict import Verdict, rms
@@ -27,8 +27,6 @@ from rpim_opt.robot.parameter_names import EXPANSION, is_joint_offset, of_sessio
 
 MOST_ROWS, MOST_BOUNDS = 8, 5
 """Outlying rows and active bounds that are named one by one."""
-CLEARLY_MORE = 1.25
-"""Factor from which on the error of an outlier from a fit without it is said beside that of the fit."""
 LAST_DIGIT = 1e-4
 """What tables of parameters show [mm, degree]."""
 REPEATABILITY = {
@@ -177,11 +175,7 @@ def _outlying(result: Outcome) -> list[str]:
     flagged = result.flagged
     if not flagged:
         return []
-    alone = _alone(result, flagged[:MOST_ROWS])
-    named = [
-        f"{flag.label} ({flag.sigmas:.0f} sigma, {flag.error_mm:.2f} mm{alone.get(flag.label, '')})"
-        for flag in flagged[:MOST_ROWS]
-    ]
+    named = [f"{flag.label} ({flag.sigmas:.0f} sigma, {flag.error_mm:.2f} mm)" for flag in flagged[:MOST_ROWS]]
     text = f"Outlying rows: {', '.join(named)}"
     if len(flagged) > MOST_ROWS:
         text += f" and {len(flagged) - MOST_ROWS} more"
@@ -196,27 +190,6 @@ def _outlying(result: Outcome) -> list[str]:
     if len(together) < len(flagged) and result.squared_loss:
         lines.append("A squared loss lets outliers pull the fit: use formulation 'robust', or exclude them.")
     return lines
-
-
-def _alone(result: Outcome, flags: Sequence[Flag]) -> dict[str, str]:
-    """Say by how much rows miss what a fit without their configuration predicts, where that is more."""
-    from rpim_opt.calibration.leverage import influence
-
-    problem = result.problem
-    if not isinstance(problem, CalibrationProblem):
-        return {}
-    try:
-        found = influence(result)
-    except InputError:  # a loss or penalty that is not squared
-        return {}
-    said = {}
-    change = dict(zip(found.configuration.tolist(), found.change, strict=True))
-    for flag in flags:
-        row = problem.labels.index(flag.label)
-        error = 1e3 * problem.errors(result.x + change[problem.data.configuration[row]])[row]
-        if error > CLEARLY_MORE * flag.error_mm:
-            said[flag.label] = f"; {error:.2f} mm from a fit without it"
-    return said
 
 
 def _bound(result: Outcome, held: Held) -> str:

@@ -49,7 +49,7 @@ def in_parts() -> PartitionedProblem:
 
 def test_what_numbers_of_joints_would_not_tell_is_not_said_of_several_robots() -> None:
     found = lack_of_fit(both())
-    assert found.upward == found.narrow == ()
+    assert found.upward == ()
     assert not found.missing
     assert likely_causes(both()) == []
 
