@@ -34,6 +34,8 @@ CORRELATED = 4.0
 """z-score from which on residuals are said to be autocorrelated."""
 ROUGH, FINE = 2.0, 0.3
 """Repeatability over measurement noise above which the robot is the limit, and below which the instrument is."""
+GROSS = 300.0
+"""Repeatability over measurement noise above which data are wrong."""
 NEGLIGIBLE = 0.1
 """Parts below this share of a larger one are not worth a word."""
 NOTABLE = 0.5
@@ -480,6 +482,8 @@ def _limit(found: LackOfFit) -> list[str]:
             f"{even} of neighbouring configurations are correlated ({found.alike.correlation:.2f}, z = "
             f"{found.alike.z:.0f}): the model lacks an effect, which more readings will not average away."
         ]
+    if found.robot > GROSS * found.instrument:
+        return ["No robot repeats so badly: look for wrong units, signs, frames or rows first (`inspect`)."]
     if found.robot > ROUGH * found.instrument:
         limit = "The robot, not the instrument, limits the result"
         if found.repeated is not None and found.excess:

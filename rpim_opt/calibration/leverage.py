@@ -14,8 +14,7 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.convex.expressions import term
-from rpim_opt.convex.trust import SMALL
+from rpim_opt.convex.trust import Squares
 from rpim_opt.problem.blocks import in_parts
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
@@ -56,7 +55,7 @@ class Influence(Tabled):
     deviation
         (n,) standard deviations of the parameters from the noise [SI]; zero where the data do not see one.
     weight
-        (C,) what a robust loss gave the configuration at the end, against a squared loss; 1 for a squared one.
+        (C,) what a robust loss gave the configuration at the end, over its squared residual; 1 for a squared loss.
 
     Examples
     --------
@@ -147,23 +146,26 @@ def influence(result: Outcome) -> Influence:
     """
     if not result.linear_penalty:
         raise InputError("influence", f"formulation '{result.formulation.name}'", "a squared penalty or none")
-    stated = result.problem.parameters.free
+    free = result.problem.parameters.free
     model, first_label = _equations(result)
     numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)
-    weight = _weights(result, model, which)
-    model = model.scaled(np.sqrt(weight))
+    whole = np.bincount(which, (model.A @ result.z - model.b) ** 2)
+    stated = result.formulation
+    if not result.squared_loss:  # squares with the weights that the loss ended with
+        model, _ = Squares(stated.loss, stated.name, stated.loss_over)(model, result.z)
     A, b = model.triangle[:, :-1], model.triangle[:, -1]
-    L, c = np.zeros((0, len(stated))), np.zeros(0)
+    L, c = np.zeros((0, len(free))), np.zeros(0)
     form = result.program.penalty_form
     if form is not None:
         root = np.sqrt(result.penalty_weight)
         L, c = root * form.matrix, root * form.c
     at_bound = {each.name for each in result.held}
-    free = np.array([name not in at_bound for name in stated.names])
+    moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
-    if np.linalg.norm(gradient[free]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
-        raise _unweighted(result)
-    T = _inverse_root(np.vstack([A, L]), free)
+    if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
+        accepted = "a loss that weighs its equations by their residuals: squares, Huber's"
+        raise InputError("influence", f"formulation '{stated.name}'", accepted)
+    T = _inverse_root(np.vstack([A, L]), moving)
     residual = model.A @ result.z - model.b
     leverage, change = _left_out(model.A @ T, residual, equations)
     change = change @ T.T
@@ -177,13 +179,13 @@ def influence(result: Outcome) -> Influence:
     return Influence(
         label=tuple(first_label[number] for number in numbers),
         configuration=numbers,
-        parameters=stated.names,
-        dimensions=stated.dimensions,
+        parameters=free.names,
+        dimensions=free.dimensions,
         leverage=leverage,
         cook=np.sum((change @ A.T) ** 2, axis=1) / (max(used, TINY) * max(variance, TINY)),
-        change=change * stated.scale,
-        deviation=spread * stated.scale,
-        weight=np.bincount(which, weight) / equations,
+        change=change * free.scale,
+        deviation=spread * free.scale,
+        weight=np.divide(np.bincount(which, residual**2), whole, out=np.ones(len(whole)), where=whole > 0),
     )
 
 
@@ -203,28 +205,6 @@ def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:
     for each in data:
         labels |= dict(zip(each.configuration[::-1], each.label[::-1], strict=True))
     return replace(models[0], A=A[order], b=b[order], group=group[order]), labels
-
-
-def _weights(result: Outcome, model: LinearModel, which: np.ndarray) -> Array:
-    """Return loss'(v) / (2 v) of every equation (m,), of the configuration ``which`` (m,): the loss ended with them."""
-    if result.squared_loss:
-        return np.ones(len(model.b))
-    residual = model.A @ result.z - model.b
-    stated = result.formulation
-    v = np.abs(residual)
-    if stated.loss_over == "configuration":
-        v = np.sqrt(np.bincount(which, residual**2))
-    v = np.maximum(v, SMALL)
-    slope = term(stated.loss, len(v), f"formulation '{stated.name}', loss").slope(v)
-    if slope is None:
-        raise _unweighted(result)
-    each = np.maximum(slope, 0.0) / (2 * v)
-    return each[which] if stated.loss_over == "configuration" else each
-
-
-def _unweighted(result: Outcome) -> InputError:
-    found = f"formulation '{result.formulation.name}'"
-    return InputError("influence", found, "a loss that weighs its equations by their residuals: squares, Huber's")
 
 
 def _inverse_root(rows: Array, free: np.ndarray) -> Array:

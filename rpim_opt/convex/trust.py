@@ -166,7 +166,8 @@ class Squares:
         projected = along_u @ model.A  # u'A, group by group
         A = np.sqrt(across)[which, None] * model.A
         A += ((np.sqrt(along) - np.sqrt(across))[which] * u)[:, None] * projected[which]
-        b = A @ z - (slope / (2 * np.sqrt(along)))[which] * u
+        shift = np.divide(slope, 2 * np.sqrt(along), out=np.zeros_like(slope), where=along > 0)
+        b = A @ z - shift[which] * u
         return replace(model, A=A, b=b), priced(norms) - float(np.sum((A @ z - b) ** 2))
 
     def _along(self, model: LinearModel, z: Array, which: np.ndarray, v: Array, priced: Term) -> Array:

@@ -108,6 +108,7 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
         "which more readings will not average away.",
         "Residuals of",
     ),
+    "gross": (left(1e-1, instrument=1e-4, position=1e-1), "No robot repeats so badly", "limits"),
     "does not repeat": (
         left(1e-3, instrument=1e-4, position=1e-3, repeated=1e-3),
         "limits the result, by its repeatability, backlash or drift", "Repeat five",
