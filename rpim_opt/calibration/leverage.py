@@ -55,7 +55,7 @@ class Influence(Tabled):
     deviation
         (n,) standard deviations of the parameters from the noise [SI]; zero where the data do not see one.
     weight
-        (C,) what a robust loss gave the configuration at the end, over its squared residual; 1 for a squared loss.
+        (C,) what a robust loss gave the configuration at the end, against a squared one; 1 for a squared loss.
 
     Examples
     --------
@@ -149,7 +149,7 @@ def influence(result: Outcome) -> Influence:
     free = result.problem.parameters.free
     model, first_label = _equations(result)
     numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)
-    whole = np.bincount(which, (model.A @ result.z - model.b) ** 2)
+    squares = (model.A @ result.z - model.b) ** 2
     stated = result.formulation
     if not result.squared_loss:  # squares with the weights that the loss ended with
         model, _ = Squares(stated.loss, stated.name, stated.loss_over)(model, result.z)
@@ -167,6 +167,7 @@ def influence(result: Outcome) -> Influence:
         raise InputError("influence", f"formulation '{stated.name}'", accepted)
     T = _inverse_root(np.vstack([A, L]), moving)
     residual = model.A @ result.z - model.b
+    weight = np.divide(residual**2, squares, out=np.ones(len(squares)), where=squares > 0)
     leverage, change = _left_out(model.A @ T, residual, equations)
     change = change @ T.T
     used = float(np.sum(leverage))
@@ -185,7 +186,7 @@ def influence(result: Outcome) -> Influence:
         cook=np.sum((change @ A.T) ** 2, axis=1) / (max(used, TINY) * max(variance, TINY)),
         change=change * free.scale,
         deviation=spread * free.scale,
-        weight=np.divide(np.bincount(which, residual**2), whole, out=np.ones(len(whole)), where=whole > 0),
+        weight=np.bincount(which, weight) / equations,
     )
 
 
