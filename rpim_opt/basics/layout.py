@@ -279,24 +279,37 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
     lines = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, lines))
-    units = [""] * width
+    units = _units_below(lines, width, grid.blanks)
+    names, groups = _grouped([[*line, *[""] * (width - len(line))] for line in lines[: -1 if units else None]])
+    return [Head(*parts) for parts in zip(names, groups, units or [""] * width, strict=True)], above
+
+
+def _units_below(lines: Sequence[Sequence[str]], width: int, blanks: bool) -> list[str]:
+    """Return the units in the last line of a header, one a column; none where it has names."""
     bare = [cell.strip("[]()") for cell in lines[-1]]
-    if len(lines) > 1 and any(bare) and all(cell.lower() in UNIT_SIGNS for cell in filter(None, bare)):
-        lines.pop()
-        signs = ["" if cell in ("-", "1") else cell for cell in bare]
-        lacking = [""] * (width - len(signs))
-        units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
-    *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
-    groups = [""] * width
-    alone = {i for i in range(width) if not names[i] and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping)}
-    for i in alone:  # merged downwards: the name stands higher up
-        names[i] = next(row[i] for row in reversed(grouping) if row[i])
+    if len(lines) < 2 or not any(bare) or any(cell.lower() not in UNIT_SIGNS for cell in filter(None, bare)):
+        return []
+    signs = ["" if cell in ("-", "1") else cell for cell in bare]
+    lacking = [""] * (width - len(signs))
+    return lacking + signs if blanks else signs + lacking  # a blank cell of the label cannot be seen
+
+
+def _grouped(lines: Sequence[Sequence[str]]) -> tuple[list[str], list[str]]:
+    """Return the names of columns and what groups them, from lines of a header whose cells may be merged."""
+    *grouping, last = lines
+    names = list(last)
+    groups = [""] * len(names)
+    downwards = set()  # merged downwards: the name stands higher up
+    for i, name in enumerate(last):
+        if not name and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping):
+            downwards.add(i)
+            names[i] = next(row[i] for row in reversed(grouping) if row[i])
     for row in grouping:
         group = ""  # merged with what is right of it
         for i, cell in enumerate(row):
-            group = "" if i in alone else cell or group
+            group = "" if i in downwards else cell or group
             groups[i] = f"{groups[i]} {group}".strip()
-    return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
+    return names, groups
 
 
 def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
@@ -464,33 +477,43 @@ def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
     axis = next((each for each in columns if {str(cell).lower() for cell in each.cells} == set("xyz")), None)
     if axis is None:
         return columns, []
-    letters = [str(cell).lower() for cell in axis.cells]
     others = [each for each in columns if each is not axis]
-    points: dict[str, dict[str, int]] = {}  # the row of every coordinate, by the names of points
-    for key in others:
-        names = [str(cell).strip() for cell in key.cells]
-        if all(names) and len(set(zip(names, letters, strict=True))) == len(names) > 2 * len(set(names)):
-            for i, (name, letter) in enumerate(zip(names, letters, strict=True)):
-                points.setdefault(name, {})[letter] = i
-            break
+    points = _points([str(cell).lower() for cell in axis.cells], others)
     if not points:
         accepted = "a column that names its point, all three once"
         raise InputError("the header", f"a row a coordinate ('{axis.name}')", accepted)
     whole = []
     values = []
     for each in others:
-        cells = [{each.cells[i] for i in rows.values()} for rows in points.values()]
+        cells = [{each.cells[i] for i in rows.values()} for rows in points]
         if all(len(own) == 1 for own in cells):
             whole.append(each._replace(cells=[own.pop() for own in cells]))
         elif _is_numeric(list(map(str, each.cells))):
             values.append(each)
+    value = _measured(values)
+    for letter in "xyz":
+        head = Head(letter, "", value.head.unit or split(value.name)[1])
+        cells = [str(value.cells[rows[letter]]) if letter in rows else "" for rows in points]
+        whole.append(Column(str(head), head, cells))
+    return whole, [f"a row a coordinate: column '{value.name}' by '{axis.name}'."]
+
+
+def _points(letters: Sequence[str], keys: Sequence[Column]) -> list[dict[str, int]]:
+    """Return the rows of every point by coordinate; the first column whose names have three rows each tells them."""
+    for key in keys:
+        rows = list(zip((str(cell).strip() for cell in key.cells), letters, strict=True))
+        points: dict[str, dict[str, int]] = {}
+        for i, (name, letter) in enumerate(rows):
+            points.setdefault(name, {})[letter] = i
+        if "" not in points and len(set(rows)) == len(rows) > 2 * len(points):
+            return list(points.values())
+    return []
+
+
+def _measured(values: Sequence[Column]) -> Column:
+    """Return the one of several columns of numbers that holds what was measured."""
     measured = [each for each in values if VALUE.search(each.name)] or values
     if len(measured) != 1:
         found = f"a row a coordinate, with values {', '.join(each.name for each in measured) or 'nowhere'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    (value,) = measured
-    for letter in "xyz":
-        head = Head(letter, "", value.head.unit or split(value.name)[1])
-        cells = [str(value.cells[rows[letter]]) if letter in rows else "" for rows in points.values()]
-        whole.append(Column(str(head), head, cells))
-    return whole, [f"a row a coordinate: column '{value.name}' by '{axis.name}'."]
+    return measured[0]

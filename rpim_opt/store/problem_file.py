@@ -278,18 +278,7 @@ def read_problem(
         variants = content.get("variant", {})
         own = {key: value for key, value in content.items() if key != "variant"}
         table, placed = _checked(_overlay(own, pick(variants, variant, "variant", path)), kinds, path)
-    observations = table.observation
-    if table.identification is not None:  # the one of the top level comes first
-        keys = ("measurement", "layout", "identification", "validation")
-        first = Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={})
-        observations = [first, *observations]
-    if not observations:
-        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
-    for each in observations:
-        pick(kinds, each.measurement, "key measurement", path)
-        inside(path.parent, each.identification, "key identification", path)
-        if each.validation:  # an empty one is how a variant has none
-            inside(path.parent, each.validation, "key validation", path)
+    observations = _observations(table, kinds, path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     arm = _arm(table, path)
@@ -303,23 +292,43 @@ def read_problem(
     base = None
     if table.base != "auto":
         base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
-    if not table.tool:
-        tools = {"": tuple(arm.tool)}
-    elif any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
-        tools = {"": _frame(table.tool, "tool", path)}
-    else:
-        tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
     return ProblemFile(
         path=path,
         table=table,
         placed=placed,
         robot=arm.robot,
         kinds=kinds,
-        observations=tuple(observations),
-        tools=tools,
+        observations=observations,
+        tools=_tools(table, arm, path),
         base=base,
         board=_board(table, path),
     )
+
+
+def _observations(table: ProblemTable, kinds: Mapping[str, Measurement], path: Path) -> tuple[Observation, ...]:
+    """Return the tables of measurements, that of the top level first; all lie in the folder."""
+    observations = table.observation
+    if table.identification is not None:
+        keys = ("measurement", "layout", "identification", "validation")
+        first = Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={})
+        observations = [first, *observations]
+    if not observations:
+        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
+    for each in observations:
+        pick(kinds, each.measurement, "key measurement", path)
+        inside(path.parent, each.identification, "key identification", path)
+        if each.validation:  # an empty one is how a variant has none
+            inside(path.parent, each.validation, "key validation", path)
+    return tuple(observations)
+
+
+def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[float, ...]]:
+    """Return where the reflectors start, by marker."""
+    if not table.tool:
+        return {"": tuple(arm.tool)}
+    if any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
+        return {"": _frame(table.tool, "tool", path)}
+    return {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
 
 
 def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:

@@ -191,22 +191,31 @@ def understand_of(
 ) -> Understanding:
     """Return what raw tables of an arm say, as `understand_tables` does."""
     options = options or TableOptions()
-    known = pick(MEASUREMENTS, measurement, "measurement") if measurement is not None else None
     files = [(path, raw) for path in map(Path, data) for raw in _sheets(path, options)]
-    if known is None:
-        columns = [raw.columns for _, raw in files]
-        known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
-    for kind in [known] if known else (pose, position):  # the first that they have all values of
+    known = _known_type(files, measurement)
+    for kind in [known] if known else (pose, position):
         tables = _tables(files, arm, kind, options)
-        stems = set().union(*(each.stems for each in tables))
-        if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
+        if known or _has_all_values(tables, kind):
             found = _whole(files, arm, kind, options, tables)
             doubt = next((each.doubt for each in tables if each.doubt), "")
             return _checked(found, files, arm, doubt) if doubt and kind.turning else found
     names = ", ".join(name for _, raw in files for name in raw.columns)
-    accepted = f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}"
-    accepted += "".join(f"; {note.rstrip('.')}" for _, raw in files for note in raw.notes if note.startswith("sheet '"))
+    sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
+    accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
+
+
+def _known_type(files: Files, measurement: str | None) -> Measurement | None:
+    """Return the measurement type that is stated, or that columns show; None for poses or positions."""
+    if measurement is not None:
+        return pick(MEASUREMENTS, measurement, "measurement")
+    columns = [raw.columns for _, raw in files]
+    return next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
+
+
+def _has_all_values(tables: Sequence[Understood], kind: Measurement) -> bool:
+    stems = set().union(*(each.stems for each in tables))
+    return any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms)))
 
 
 def _sheets(path: Path, options: TableOptions) -> list[RawTable]:
