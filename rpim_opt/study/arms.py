@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -27,8 +27,7 @@ VALIDATION_COUNT = 200
 """Configurations that an arm is judged at."""
 
 
-@dataclass(frozen=True, eq=False)
-class SimulatedArm:
+class SimulatedArm(NamedTuple):
     """What a tracker saw of an arm whose truth is known.
 
     Parameters

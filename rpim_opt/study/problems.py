@@ -16,7 +16,6 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.record import Record
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.instances import Instance, load
-from rpim_opt.study.arms import SimulatedArm
 
 ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed that returns one"
 RETURNS = "an instance, a simulated arm, a problem, or a pair of a problem and validation data"
@@ -78,12 +77,7 @@ def _sources(problems: Any, label: str = "") -> Iterator[Source]:
             name = place.parent.name if place.name == "problem.toml" else place.name
             yield Source(label or name or str(path), load(path))
     elif instance is not None:
-        title = "problem"
-        if isinstance(problems, Instance | CalibrationProblem):
-            title = problems.record.title if isinstance(problems, Instance) else problems.robot.name
-        elif isinstance(problems, SimulatedArm):
-            title = "SimulatedArm"
-        yield Source(label or title, instance)
+        yield Source(label or instance.record.title or instance.problem.robot.name, instance)
     elif isinstance(problems, Iterable) and not label:
         for problem in problems:
             yield from _sources(problem)
@@ -111,17 +105,11 @@ def _instance(given: Any, label: str) -> Instance | None:
     match given:
         case Instance():
             return given
-        case SimulatedArm():
-            return _bare(given.problem, given.true, label)
         case CalibrationProblem():
-            return _bare(given, None, label)
-        case (CalibrationProblem() as problem, Dataset() as validation):
-            return _bare(problem, validation, label)
+            return Instance(given, tikhonov, None, record=Record(label))
+        case (CalibrationProblem() as problem, Dataset() as validation, *_):  # a simulated arm, too
+            return Instance(problem, tikhonov, None, record=Record(label, validation=validation))
     return None
-
-
-def _bare(problem: CalibrationProblem, validation: Dataset | None, title: str) -> Instance:
-    return Instance(problem, tikhonov, None, record=Record(title, validation=validation))
 
 
 # --- what is held out ------------------------------------------------------------------------------------------------
