@@ -2,8 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import sys
+from typing import Any
+
 import pytest
 
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+"""Modules are compiled once, not in each of the processes that tests start."""
 SMOKE = (
     "tests/test_architecture.py",
     "tests/test_cli.py",
@@ -30,7 +37,6 @@ DEFAULT = {
     "tests/calibration/test_camera.py::test_new_makes_a_folder_from_corners": ("on the flange",),
     "tests/problem/test_camera.py::test_mistakes_are_found_in_views": ("sign",),
     "tests/problem/test_design.py::test_a_design_is_near_the_best_and_better_than_chance": ("D",),
-    "tests/problem/test_derivatives.py::test_no_optimizer_finds_a_lower_objective": ("1.0",),
     "tests/problem/test_blocks.py::test_no_digit_depends_on_the_number_of_cores": ("9000",),
     "tests/bayes/test_groups.py::test_the_most_likely_weights_are_those_of_a_grid": ("0",),
     "tests/study/test_comparison.py::test_intervals_of_other_problems_cover_as_they_say": ("5",),
@@ -49,7 +55,6 @@ LONG = {
     "tests/calibration/test_causes.py::test_another_unit_from_halfway_on_is_named": ("",),
     "tests/calibration/test_causes.py::test_misread_orientations_are_named": ("",),
     "tests/calibration/test_causes.py::test_an_exchanged_reflector_is_no_moved_foot": ("",),
-    "tests/report/test_report.py::test_a_report_says_what_a_reader_must_know": ("",),
     "tests/convex/test_grid.py::test_a_calibration_ends_where_plain_cvxpy_ends": (
         "Tikhonov, matrix inequality, rank_deficient",
         "parameters in the loss, markers",
@@ -62,6 +67,14 @@ LONG = {
     ),
 }
 """Long cases of a test whose others are short, ``""`` for a test without cases."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_make_scheduler(config: Any, log: Any) -> Any:
+    """Leave most tests of a module to one worker, which makes their fixtures once."""
+    from xdist.scheduler import WorkStealingScheduling
+
+    return WorkStealingScheduling(config, log)
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

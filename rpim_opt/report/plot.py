@@ -430,7 +430,7 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
         which = (shade == k) & (above == over)
         level = float(levels[k])
         text = f"to {mm(level)} mm, above the limit" if over else f"to {mm(min(level, limit or np.inf))} mm"
-        style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "lw": 0, "label": text}
+        style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "label": text}
         left, bottom = corners[which].T
         hints = [f"{mm(value)} mm" for value in worst[which]]
         _boxes(ax, left, left + size[0], bottom, bottom + size[1], hints, **style)
@@ -530,8 +530,13 @@ def _dots(
 
 
 def _boxes(ax: Axes, left: Array, right: Array, low: Array, high: Array, hints: Sequence[str], **style: Any) -> None:
-    for box, hint in zip(ax.bar(left, high - low, right - left, low, align="edge", **style), hints, strict=True):
-        box.hints = [hint]
+    from matplotlib.collections import PolyCollection
+
+    corners = np.array([[left, low], [left, high], [right, high], [right, low]]).transpose(2, 0, 1)
+    boxes: Any = ax.add_collection(PolyCollection(corners, lw=0, **style))
+    boxes.hints = hints
+    boxes.sticky_edges.y.extend(low)
+    ax.autoscale_view()
 
 
 def _logarithmic(ax: Axes, which: str) -> None:

@@ -12,7 +12,6 @@ import rpim_opt as ro
 from tests import ROOT
 
 NAMES = sorted(folder.name for folder in (ROOT / "problems").iterdir())
-MRAD = (0.2, 1.0, 3.0)
 STEP = 3e-3
 """Of the differences, in prior standard deviations."""
 
@@ -39,7 +38,7 @@ def differences(problem: ro.CalibrationProblem, x: np.ndarray) -> np.ndarray:
     return np.column_stack([(4 * slope(k, STEP) - slope(k, 2 * STEP)) / 3 for k in range(len(x))])
 
 
-@pytest.mark.parametrize("name", [*NAMES, *MRAD])
+@pytest.mark.parametrize("name", [*NAMES, 3.0])
 def test_every_column_of_the_jacobian_is_the_derivative(name: str | float) -> None:
     problem = ro.load(name).problem if isinstance(name, str) else scattered(name)
     scale = problem.parameters.free.scale
@@ -51,9 +50,8 @@ def test_every_column_of_the_jacobian_is_the_derivative(name: str | float) -> No
     assert (off / np.maximum(largest, 1e-4 * largest.max())).max() < 2e-6
 
 
-@pytest.mark.parametrize("joint", MRAD)
-def test_no_optimizer_finds_a_lower_objective(joint: float) -> None:
-    problem = scattered(joint)
+def test_no_optimizer_finds_a_lower_objective() -> None:
+    problem = scattered(1.0)
     scale = problem.parameters.free.scale
     z = ro.calibrate(problem, ro.tikhonov, weight=1.0).x / scale
 
