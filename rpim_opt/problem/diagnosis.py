@@ -16,6 +16,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, counted, joined, listed, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, combination, observe
 from rpim_opt.problem.misreadings import better_reading, misfit, placed
 from rpim_opt.problem.noise import Equations
@@ -647,7 +648,7 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Say whether the residuals at x (n,) are those of a gear ratio, a coupling of joints, or of the instrument.
 
     One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, or that
-    of the base's place along the measured positions (scale) or their directions (offset of distances).
+    of the scale or offset of distances, of positions by the base's place along them and along their directions.
     """
     free = problem.parameters.free
     q = problem.joint_values[problem.owners]
@@ -655,16 +656,23 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     pairs = [(i, j) for i, name in enumerate(zeros) for j in range(q.shape[1]) if name in free.names and q[:, j].any()]
     base = [free.names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in free.names]
     y = np.zeros((len(problem.data), 3))
+    lengths = np.zeros((len(problem.data), 2))  # slopes of distances by their scale and offset
     for block in problem.data.blocks:
-        if block.measurement.name in ("position", "pose"):
+        if block.measurement.name in ("position", "pose") and len(base) == 3:
             y[block.row] = block.y[:, :3]
-    ways = [y, y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)] if y.any() and len(base) == 3 else []
+        elif block.measurement.name in ("cable", "distance"):
+            lengths[block.row] = np.column_stack([block.y, np.ones(len(block.y))])
+    ways = [y, y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)] if len(base) == 3 else []
 
     def columns(A: Array) -> list[Array]:
         slopes = A / free.scale
         places = [free.names.index(zeros[i]) for i, _ in pairs]
-        along = [np.sum(slopes[:, base] * way[problem.owners], axis=1, keepdims=True) for way in ways]
-        return [*(slopes[:, [k]] * q[:, [j]] for k, (_, j) in zip(places, pairs, strict=True)), *along]
+        gears = [slopes[:, [k]] * q[:, [j]] for k, (_, j) in zip(places, pairs, strict=True)]
+        whitening = np.linalg.norm(A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1)
+        along = lengths[problem.owners] * whitening[:, None]
+        for k, way in enumerate(ways):
+            along[:, k] += np.sum(slopes[:, base] * way[problem.owners], axis=1)
+        return [*gears, along[:, [0]], along[:, [1]]]
 
     found = _added(problem, x, columns)
     if found is None or abs(factor := found.coefficients[0]) > SMALL:
@@ -680,11 +688,11 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         yield f"measured lengths are {100 * factor:+.2g} % too long: {left}; check the scale of the instrument."
     else:
         far = three_digits(1e3 * factor)
-        yield f"measured distances are {far} mm too long: {left}; check the reflector's radius."
+        yield f"measured distances are {far} mm too long: {left}; check its zero and the reflector's radius."
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say from which row on the residuals at x (n,) show a base, a reflector or a joint's zero that moved.
+    """Say from which row on the residuals at x (n,) show a base, fixture, reflector or joint's zero that moved.
 
     Its columns for the rows from there on are added to the linearization (`_added`).
     """
@@ -692,10 +700,18 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     data = problem.data
     markers = {marker for block in data.blocks for marker in block.markers}
     parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
+    fixtures = set()
+    for block in data.blocks:
+        names = list(block.measurement.parameters)
+        if names:
+            fixtures.add(names[0].split("_")[0])
+            parts.setdefault(names[0].split("_")[0], set()).update(of_fixture(name, block.fixture) for name in names)
     for i, kind in enumerate(problem.robot.joint_types, start=1):
         parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
     of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
-    if len(of["base"]) < len(FRAME) or len(data) < 2 * FEWEST:
+    if len(of["base"]) < len(FRAME):
+        of["base"] = []
+    if not any(of[what] for what in ("base", *fixtures)) or len(data) < 2 * FEWEST:
         return
     tried = [(k, what) for k in _places(len(data)) for what, some in of.items() if some]
     found = _added(problem, x, lambda A: [A[:, of[what]] * (problem.owners >= k)[:, None] for k, what in tried])
@@ -706,11 +722,12 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         after = equations.length & (equations.row >= place)
         change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * found.coefficients)
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
-        asked = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
+        causes = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
+        causes |= dict.fromkeys(fixtures, "did it, or the robot's foot, move")
         yield (
             f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
             f"them, and fit a {what} that moved (that leaves {100 * found.left:.0f} % of the residuals): "
-            f"{asked.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
+            f"{causes.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
         )
 
 

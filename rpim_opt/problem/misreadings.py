@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations, permutations, product
 from typing import NamedTuple
@@ -14,15 +14,18 @@ from scipy.spatial.transform import Rotation
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import hand_eye, transforms
+from rpim_opt.problem.registration.frames import FIXTURE, settled, starting_parameters
 from rpim_opt.problem.registration.global_start import described, explained, rms, search
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
 from rpim_opt.robot.formats.tables import read_robot
-from rpim_opt.robot.kinematics import forward_kinematics
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameter_names import tool_prefix
 
 STEPS = 20
 """Steps of a fit of base and reflectors, joint zeros too if they are free."""
@@ -80,6 +83,8 @@ WRONG = 0.02
 """Points that are off by more than this part of their extent fit no drawing of their robot."""
 LEFT = 0.05
 """What leaves more than this part of the extent explains nothing, even if gross errors are behind it."""
+ZERO = 0.1
+"""How far joint zeros may be off [rad, m] in fits to distances."""
 FEW = 30
 """Rows of a first try; what comes near the best is tried on more."""
 SAME = 1.05
@@ -202,17 +207,17 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
 
 def _of_positions() -> Iterator[Reading]:
     """Yield readings with other measured positions: units of all columns or one, handedness."""
-
-    def scaled(what: str, remedy: str, factors: Array) -> Reading:
-        return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
-
     for factor, (unit, remedy) in LENGTHS.items():
-        yield scaled(f"measured lengths {unit}", remedy, np.full(3, factor))
+        yield _scaled(f"measured lengths {unit}", remedy, factor)
         for axis, of_axis in zip("xyz", np.eye(3), strict=True):
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
-            yield scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
+            yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
     remedy = "change the sign of one coordinate, or exchange two"
     yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
+
+
+def _scaled(what: str, remedy: str, factors: Array | float) -> Reading:
+    return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
 
 
 def _of_poses() -> Iterator[Reading]:
@@ -272,7 +277,7 @@ def _of_rows(count: int, dof: int) -> Iterator[Reading]:
 
         def slipped(points: Points, i: int = i, by: int = by) -> Points:
             q = points.q.copy()
-            q[:, i] = np.roll(q[:, i], -by)
+            q[..., i] = np.roll(q[..., i], -by, axis=0)
             return replace(points, q=q).take(rows[:-1] if by > 0 else rows[1:])
 
         what = f"column q{i + 1} one row too {low} in the table"
@@ -360,7 +365,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     """
     points = points_of(problem)
     if points is None:
-        return None
+        return _better_lengths(problem)
     robot = problem.robot
     mapping = None if explained(robot, points) else search(robot, points)
     if mapping is not None:
@@ -384,6 +389,74 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     if not left < BETTER * stated or (left > LEFT and not points.seen):
         return None if points.seen else _sibling(robot, points)
     return _compared(robot, chain, points, stated, left)
+
+
+@dataclass(frozen=True, eq=False)
+class Lengths:
+    """Distances: joint values (N, p, dof), lengths (N, 1) [m], and the problem that they are of.
+
+    No frame can be eliminated from them, so that a reading is judged by a fit of anchor, reflectors and joint zeros.
+    """
+
+    q: Array
+    y: Array
+    problem: CalibrationProblem
+
+    def take(self, index: np.ndarray) -> Lengths:
+        """Return the rows at ``index``."""
+        return replace(self, q=self.q[index], y=self.y[index])
+
+    def evenly(self, most: int) -> Lengths:
+        """Return so many rows, evenly spread, at most."""
+        count = len(self.y)
+        return self.take(np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)))
+
+    def left(self) -> float:
+        """Return the RMS error of the best three quarters of the rows over the extent of the lengths."""
+        rows = np.arange(len(self.y))
+        of = self.problem.data.blocks[0]
+        block = Block(of.measurement, self.q, self.y, of.covariance[:1], rows, of.markers, of.fixture)
+        data = Dataset((block,), tuple(map(str, rows)), rows)
+        robot = self.problem.robot
+        p = self.problem.parameters
+        own = dict(zip(p.names, p.nominal, strict=True))
+        tools = {marker: [own[tool_prefix(marker) + c] for c in FRAME] for marker in block.markers}
+        try:
+            parameters = starting_parameters(robot, data, [own[f"base_{c}"] for c in FRAME], tools)
+        except InputError:  # lengths to which no anchor belongs
+            return float("inf")
+        zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, 1)]
+        reflectors = [tool_prefix(marker) + "[xyz]" for marker in block.markers]
+        fixture = [of_fixture(name, block.fixture) for name in block.measurement.parameters]
+        free = parameters.identify([*zeros, *reflectors, *fixture])
+        fit = CalibrationProblem(robot, replace(free, scale=np.where(free.placed, FIXTURE, ZERO)), data)
+        error = np.sort(np.abs(fit.errors(settled(fit, STEPS))))[: 3 * len(rows) // 4]
+        return float(np.sqrt(np.mean(error**2)) / np.ptp(self.y))
+
+
+def _better_lengths(problem: CalibrationProblem) -> Better | None:
+    """Return the single mistake that explains distances far better, or None."""
+    blocks = problem.data.blocks
+    kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
+    if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance"):
+        return None
+    order = np.argsort(np.concatenate([block.row for block in blocks]))
+    q, y = (np.concatenate([getattr(block, name) for block in blocks])[order] for name in ("q", "y"))
+    table = Lengths(q, y, problem)
+    stated = table.evenly(SOME_ROWS).left()
+    robot = problem.robot
+    readings = [*_of_joints(robot), *_of_rows(len(y), robot.dof)]
+    for factor, (unit, _) in LENGTHS.items():
+        remedy = f"multiply column distance by {factor:g} or name its unit"
+        readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
+    found = np.array([each.change(table).evenly(SOME_ROWS).left() for each in readings])
+    best = float(found.min())
+    if not best < min(BETTER * stated, LEFT):
+        return None
+    alike = [readings[i] for i in np.argsort(found) if found[i] <= SAME * best][:4]
+    what, remedy = (", or ".join(words) for words in zip(*(each[:2] for each in alike), strict=True))
+    extent = float(np.ptp(alike[0].change(table).y))
+    return Better(what, remedy, stated * float(np.ptp(y)), best * extent)
 
 
 def _sibling(robot: Robot, points: Points) -> Better | None:

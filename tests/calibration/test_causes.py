@@ -320,3 +320,40 @@ def test_a_table_in_the_standard_convention_is_named() -> None:
     wrong = replace(problem, robots=sheet, parameters=replace(problem.parameters, nominal=nominal))
     causes = likely_causes(calibrated(wrong))
     assert "standard (distal) Denavit-Hartenberg" in causes[1], causes
+
+
+def cable(outliers: bool = False, **changes: np.ndarray) -> ro.Calibration:
+    """Calibrate with the lengths of one cable whose anchor nobody has stated."""
+    problem = ro.load("cable").problem
+    data = problem.data.take(np.sort(problem.data.blocks[0].row))
+    block = replace(data.blocks[0], **changes)
+    y = block.y.copy()
+    y[[3, 9, 22]] += np.array([[0.008], [-0.015], [0.03]]) * outliers
+    return ro.calibrate(ro.problem.problem_from(problem.robot, replace(data, blocks=(replace(block, y=y),))))
+
+
+@pytest.mark.parametrize("outliers", [False, True])
+def test_an_anchor_that_is_not_stated_is_found(outliers: bool) -> None:
+    """The reflector is 80 mm off the flange, which moves an anchor that is located without it by metres."""
+    result = cable(outliers)
+    assert result.verdict.delivered
+    assert len(result.learned.left_out) == 3 * outliers
+    held_out = ro.load("cable").validation
+    rows = np.sort(held_out.blocks[0].row)
+    assert np.sqrt(np.mean(result.errors(held_out.take(rows)) ** 2)) < 1e-4  # the noise, which held-out rows lack
+
+
+def test_a_mistake_in_lengths_is_named() -> None:
+    """No frame can be eliminated from them: every reading is a fit of its own."""
+    result = cable(q=ro.load("cable").problem.data.blocks[0].q * [1, -1, 1, 1, 1, 1])
+    assert not result.verdict.delivered
+    assert "joint 2 reversed" in result.verdict.reasons[-1]
+
+
+def test_a_constant_error_of_distances_is_named() -> None:
+    """5 mm on every distance: residuals are within what a robot does by itself, and it is wrong by 2 mm."""
+    problem = ro.load("distance").problem
+    blocks = tuple(replace(block, y=block.y + 0.005) for block in problem.data.blocks)
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=blocks)))
+    assert not result.verdict.delivered
+    assert "measured distances are 4.7" in likely_causes(result)[1]

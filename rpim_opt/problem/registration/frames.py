@@ -235,7 +235,7 @@ def problem_from(
         Patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`.
     base
         (6,) start of the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx;
-        ``"auto"`` registers it.
+        ``"auto"`` registers it; zero where the measurements do not depend on it.
     tool
         (6,) start of the reflector in the frame behind the last joint's modified-DH row; where it is not stated, that
         of the URDF's tip, or zero. A start that the data contradict is replaced by its registration.
@@ -260,6 +260,8 @@ def problem_from(
         robot = robot.robot
     start = np.zeros(6) if tool is None else np.asarray(tool, dtype=float)
     placed = None if isinstance(base, str) else np.asarray(base, dtype=float)
+    if placed is None and not any(block.measurement.registers for block in data.blocks):
+        placed = np.zeros(6)  # lengths do not depend on it
     parameters = starting_parameters(robot, data, placed, {"": start})
     problem = CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
     found = relocated(problem)
@@ -316,6 +318,7 @@ def starting_parameters(
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
     entries: dict[str, tuple[str, float]] = {}
+    fixtures: set[str] = set()
     for block in data.blocks:
         kind = block.measurement
         names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
@@ -324,12 +327,48 @@ def starting_parameters(
             tool = numeric_frame(places[block.markers[0]])
             T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
             given = kind.start(T[:, :3, 3], block.y)
+            fixtures |= {names[name] for name in given}
         for name, dimension in kind.parameters.items():
             entries[names[name]] = (dimension, float(given.get(name, 0.0)))
     if temperature is None and len(data.temperatures):
         temperature = float(data.temperatures.mean())
     named = sorted({*data.sessions, *sessions})
-    return model_parameters(robot, base, tools, entries, own_frames(data), named, temperature)
+    parameters = model_parameters(robot, base, tools, entries, own_frames(data), named, temperature)
+    return _with_fixtures(robot, parameters, data, fixtures)
+
+
+FIXTURE, REFLECTOR = 1.0, 0.1
+"""How far [m, rad] a fixture and a reflector may be from where the first registration puts them."""
+TRIMMED, STEPS, GROSS = 3, 30, 5.0
+"""How often fixtures are fitted, in how many steps, and medians of the errors beyond which a row is left out then."""
+
+
+def _with_fixtures(robot: Robot, parameters: Parameters, data: Dataset, names: set[str]) -> Parameters:
+    """Return the parameters with fixtures at the least squares of the nominal robot, reflectors fitted beside them.
+
+    A start that takes the reflector for known is off by more than the reflector is: a long cable's anchor by metres.
+    """
+    if not names:
+        return parameters
+    own = np.isin(parameters.names, list(names))
+    markers = {marker for block in data.blocks for marker in block.markers}
+    tools = np.isin(parameters.names, [tool_prefix(marker) + c for marker in markers for c in "xyz"])
+    scale = np.where(own, FIXTURE, np.where(tools, REFLECTOR, parameters.scale))
+    free = replace(parameters, identified=own | tools, scale=scale)
+    problem = whole = CalibrationProblem(robot, free, data)
+    for _ in range(TRIMMED):  # gross outliers would pull the start
+        try:
+            x = settled(problem, STEPS)
+            error = np.nan_to_num(whole.errors(x))
+            kept = np.flatnonzero(error <= GROSS * np.median(error))
+            if len(kept) == len(problem.data):
+                break
+            problem = whole.on(data.take(kept))
+        except InputError:
+            return parameters
+    nominal = parameters.nominal.copy()
+    nominal[own] += x[own[free.identified]]
+    return replace(parameters, nominal=nominal)
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
@@ -448,7 +487,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
     return alone, settled(alone)
 
 
-def settled(alone: Source) -> Array:
+def settled(alone: Source, steps: int = 200) -> Array:
     """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated.
 
     Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.
@@ -458,7 +497,7 @@ def settled(alone: Source) -> Array:
     z = np.zeros(len(scale))
     model = source.linearize(scale * z)
     damping = 0.0
-    for _ in range(200):
+    for _ in range(steps):
         R = model.triangle[:, :-1]
         A = np.vstack([R, np.eye(len(z))])
         size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
