@@ -147,8 +147,6 @@ HOW: dict[str, dict] = {
     "k_fold": {"weight": "k_fold"},
     "lasso": {"formulation": ro.lasso, "weight": 1.0},
     "group lasso": {"formulation": ro.group_lasso, "weight": 1.0},
-    "groups of weights": {"weight": {"left.*": 1.0, "right.*": 3.0, "tool": 0.1}},
-    "kinds": {"weight": {"alpha theta": 1.0, "d a": 3.0}},
 }
 
 
