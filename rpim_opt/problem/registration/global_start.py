@@ -340,7 +340,7 @@ def _gauged(robot: Robot, zero: Array) -> Array:
     return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < np.radians(2)), quarter, zero)
 
 
-def _plain(sign: Array, zero: Array) -> tuple[int, int, float]:
-    """How far a mapping is from the stated one: joints that change, reversed ones, then the size of the zeros."""
+def _plain(sign: Array, zero: Array) -> tuple[int, int, float, list[float]]:
+    """How far a mapping is from the stated one: joints that change, reversed ones, size of the zeros, then signs."""
     changed = (sign < 0) | (np.abs(zero) > NEAR_ZERO)
-    return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2)
+    return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2), sign.tolist()
