@@ -24,12 +24,12 @@ from rpim_opt.problem.noise import Equations, Scatter, Stack, equation_numbers
 from rpim_opt.problem.row_functions import (
     Functions,
     Kept,
-    Needs,
     Structure,
     asked,
     loads_in,
     loads_of,
     measured_torques,
+    needed,
     require_loads,
     require_same_torques,
 )
@@ -368,7 +368,7 @@ class CalibrationProblem(RobotModel):
             names = p.names
             if block.robot:  # those of other robots keep their long names, which no formulation asks for
                 names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
-            loads = loads_of(robot, Needs.of(robot, p.of_robot(block.robot)), self.data, block)
+            loads = loads_of(robot, needed(robot, p.of_robot(block.robot)), self.data, block)
             self._structures[block] = Structure(
                 robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
                 tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],

@@ -20,7 +20,7 @@ from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, of_term, tool_prefix
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Posture, Symbol, Term, Transmission, dependencies
+from rpim_opt.robot.terms import Dependencies, Posture, Symbol, Term, Transmission, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
@@ -270,27 +270,16 @@ class Loads(NamedTuple):
         return {name: stated[COLUMN.format(name)] for name in self.columns}
 
 
-class Needs(NamedTuple):
-    """What the parameters that are identified, or not zero, need to know of a row."""
-
-    torques: bool
-    moments: bool
-    payload: bool
-    columns: frozenset[str]
-
-    @classmethod
-    def of(cls, robot: Robot, parameters: Parameters) -> Needs:
-        """Return what a robot with a table of parameters needs."""
-        used = parameters.identified | (parameters.nominal != 0)
-        names = {parameters.names[i] for i in np.flatnonzero(used)}
-        terms = [name for name in names if of_term(name)]
-        asked = dependencies(robot.model, robot.joint_types, names.__contains__)
-        return cls(
-            torques=asked.torques or any(name.startswith("compliance") for name in terms),
-            moments=asked.gravity or any(name.startswith("bend") for name in terms),
-            payload=asked.gravity,
-            columns=asked.columns,
-        )
+def needed(robot: Robot, parameters: Parameters) -> Dependencies:
+    """Return what a robot's parameters that are identified, or not zero, need to know of a row."""
+    used = parameters.identified | (parameters.nominal != 0)
+    names = {parameters.names[i] for i in np.flatnonzero(used)}
+    of_arms = [name for name in names if of_term(name)]
+    found = dependencies(robot.model, robot.joint_types, names.__contains__)
+    return found._replace(
+        torques=found.torques or any(name.startswith("compliance") for name in of_arms),
+        moments=any(name.startswith("bend") for name in of_arms),
+    )
 
 
 def measured_torques(data: Dataset, robot: str = "") -> bool:
@@ -298,14 +287,14 @@ def measured_torques(data: Dataset, robot: str = "") -> bool:
     return any(block.torque is not None for block in data.blocks if block.robot == robot)
 
 
-def loads_of(robot: Robot, needs: Needs, data: Dataset, block: Block) -> Loads:
+def loads_of(robot: Robot, needs: Dependencies, data: Dataset, block: Block) -> Loads:
     """Return what the rows of a block of some data state, and what they need of gravity."""
     weighs = needs.torques and not measured_torques(data, block.robot)
     return Loads(
         torques=block.torque is not None,
         payload=block.payload is not None,
         approach=block.approach is not None,
-        gravity=robot.gravity if weighs or needs.moments else None,
+        gravity=robot.gravity if weighs or needs.gravity or needs.moments else None,
         weighs=weighs,
         columns=tuple(block.columns),
     )
@@ -313,13 +302,13 @@ def loads_of(robot: Robot, needs: Needs, data: Dataset, block: Block) -> Loads:
 
 def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool) -> Loads:
     """Return what commands state that are to be compensated: torques, or a payload where those of gravity count."""
-    needs = Needs.of(robot, parameters)
+    needs = needed(robot, parameters)
     if needs.columns:
         accepted = "a calibration without it: its value at the corrected commands is unknown"
         raise InputError("compensation", f"a term that depends on column '{min(needs.columns)}'", accepted)
     weighs = needs.torques and not measured_torques(data)
-    gravity = robot.gravity if weighs or needs.moments else None
-    return Loads(torques=torques, payload=weighs or needs.payload, gravity=gravity, weighs=weighs)
+    gravity = robot.gravity if weighs or needs.gravity or needs.moments else None
+    return Loads(torques=torques, payload=weighs or needs.gravity, gravity=gravity, weighs=weighs)
 
 
 def loads_in(robot: Robot, block: Block) -> list[Array]:
@@ -345,16 +334,16 @@ def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block])
         if sided and all(block.approach is None for block in blocks):
             found = f"'{name}' without directions of approach"
             raise InputError("key identify", found, "columns approach1, ... (-1, 0 or +1) in the data")
-    needed = Needs.of(robot, parameters).columns
+    columns = needed(robot, parameters).columns
     for block in blocks:
-        for name in sorted({*needed, *block.measurement.extra} - {*block.columns}):
+        for name in sorted({*columns, *block.measurement.extra} - {*block.columns}):
             accepted = f"a column '{name}' of the table, or Dataset.of(..., columns={{'{name}': ...}})"
             raise InputError("data", f"no column '{name}', on which a term or a measurement depends", accepted)
 
 
 def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now: bool) -> None:
     """Refuse other torques than a problem has where compliances need them: gravity's are on guessed masses."""
-    if before == now or not Needs.of(robot, parameters).torques:
+    if before == now or not needed(robot, parameters).torques:
         return
     if now:
         accepted = "none, as in the problem's data: its compliances multiply the torques of gravity"

@@ -419,10 +419,11 @@ def entries_of(model: Model, joint_types: Sequence[str]) -> Iterator[tuple[str, 
 
 
 class Dependencies(NamedTuple):
-    """What terms depend on in a row: torques, gravity, directions of approach, columns."""
+    """What terms depend on in a row: torques, gravity, its moments of links, directions of approach, columns."""
 
     torques: bool = False
     gravity: bool = False
+    moments: bool = False
     approach: bool = False
     columns: frozenset[str] = frozenset()
 

@@ -9,7 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.row_functions import Needs, loads_of, repeatable
+from rpim_opt.problem.row_functions import loads_of, needed, repeatable
 from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated
@@ -106,7 +106,7 @@ def test_a_nominal_compliance_bends_a_robot_too() -> None:
 def test_what_no_parameter_asks_for_is_not_evaluated() -> None:
     problem, _ = simulated(("a?", "ecc2_*"), configurations=4)
     for patterns, gravity in (("a?", None), ("compliance3", ARM.gravity), ("bend3_4x", ARM.gravity)):
-        needs = Needs.of(ARM, problem.parameters.identify([patterns]))
+        needs = needed(ARM, problem.parameters.identify([patterns]))
         assert loads_of(ARM, needs, problem.data, problem.data.blocks[0]).gravity is gravity
 
 
