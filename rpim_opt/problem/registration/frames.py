@@ -39,10 +39,8 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import tool_prefix
 from rpim_opt.robot.parameters import Parameters, model_parameters
 
-ENOUGH, FEW = 2000, 300
-"""Rows of a measurement that register frames, where there are more; of all together, where they are only compared."""
-MISFIT = 3.0
-"""Nominal errors of a robot up to which positions agree with a registration in closed form."""
+ENOUGH = 2000
+"""Rows of a measurement that register frames, where there are more."""
 FREE = 0.1
 """Standard deviation of a rotation [rad] from which closed forms are tried: they refuse what is not determined."""
 
@@ -117,7 +115,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
         if start.uncertainty > FREE or (len(count) > 1 and not start.certified):
             raise InputError("the data", start.reason, "turns about two axes")
     except InputError as error:
-        base, found, _ = _fitted(robot, rows, places)
+        base, found = _fitted(robot, rows, places)
         return Located(base, found, f"by registration of positions: {error.found}")
     places[marker][:3] = start.tool[:3, 3]
     for other in places.keys() - {marker}:  # where their positions are least off, seen from the base
@@ -141,8 +139,8 @@ def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:
         tools[marker] = frame_numbers(rigid(proper(turned.sum(axis=0)), np.asarray(tools[marker][:3])))
 
 
-def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array], Array]:
-    """Return base (6,) and reflectors (6,) that fit positions of the nominal robot, and the errors (N,) that are left.
+def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array]]:
+    """Return base (6,) and reflectors (6,) that fit positions of the nominal robot.
 
     Reflectors are where they are stated up to `TOOL_ERROR`, and turned as poses show.
     """
@@ -158,7 +156,7 @@ def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Arra
     fit = fit_arms(robot, given, steps=12)
     found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
     _turn(found, fit.base[0], rows)
-    return frame_numbers(fit.base[0]), found, fit.error[0]
+    return frame_numbers(fit.base[0]), found
 
 
 APART = 0.1
@@ -402,19 +400,11 @@ def relocated(problem: Source) -> Source | None:
         at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
         tools = {marker: p.nominal[k] for marker, k in at.items()}
 
-        def far(found: Located, limit: float) -> list[tuple[np.ndarray, Array]]:
-            frames = [(base, found.base), *((k, found.tools[marker]) for marker, k in at.items())]
-            return [(k, place) for k, place in frames if _misplaced(p, k, place, limit)]
-
-        few = _Rows.of(problem.robot, data, FEW // max(len(data.blocks), 1) + 3)
-        if few is not None:
-            place, reflectors, error = _fitted(problem.robot, few, tools)
-            agrees = np.sqrt(np.mean(error**2)) <= MISFIT * NOMINAL_ERROR
-            if agrees and not far(Located(place, reflectors, ""), MISPLACED / 2):
-                return None
-        for k, place in far(locate(problem.robot, data, tools), MISPLACED):
-            free = p.identified[k]
-            nominal[k[free]] = place[free]
+        found = locate(problem.robot, data, tools)
+        for k, place in [(base, found.base), *((k, found.tools[marker]) for marker, k in at.items())]:
+            if _misplaced(p, k, place):
+                free = p.identified[k]
+                nominal[k[free]] = place[free]
     except InputError:
         return None
     if (nominal == p.nominal).all():
@@ -427,7 +417,7 @@ def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
     return np.array([p.names.index(prefix + component) for component in FRAME])
 
 
-def _misplaced(p: Parameters, k: np.ndarray, place: Array, limit: float = MISPLACED) -> bool:
+def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
     """Whether an identified frame at places k (6,) of a table is further than so many scales from its statement."""
     position, orientation = np.split(p.identified[k], 2)
     if not position.all() or orientation.any() != orientation.all():
@@ -435,7 +425,7 @@ def _misplaced(p: Parameters, k: np.ndarray, place: Array, limit: float = MISPLA
     T, T0 = numeric_frame(place), numeric_frame(p.nominal[k])
     # the deviation that takes the nominal frame there (`kinematics.frame`)
     deviation = np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])
-    far = np.abs(deviation) > limit * (p.scale[k] + NOMINAL_ERROR)
+    far = np.abs(deviation) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
     return bool((far & p.identified[k]).any())
 
 
