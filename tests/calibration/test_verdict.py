@@ -91,8 +91,7 @@ def test_files_hold_the_verdict(tmp_path: Path) -> None:
     assert stored["verdict"] == {"delivered": False, "reasons": list(result.verdict.reasons)}
     stored["verdict"] = {"delivered": True, "reasons": []}
     (tmp_path / "result.json").write_text(json.dumps({**stored, "digest": digest(stored)}))
-    with pytest.raises(ro.InputError, match="key verdict"):
-        load_result(tmp_path)
+    assert load_result(tmp_path).verdict == result.verdict  # which is judged anew
 
 
 def test_python_follows_it(tmp_path: Path) -> None:
