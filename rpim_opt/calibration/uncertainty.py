@@ -122,14 +122,7 @@ class Uncertainty(Tabled):
             rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
         expanded = f"U, k = {self.coverage_factor:.2f}"
         head = ["parameter", "unit", "value", "u, noise", "u, prior", "u, combined", expanded]
-        lines = [
-            table(head, rows),
-            self.noise_test().verdict,
-            f"Effective degrees of freedom: {self.result.freedom:.1f}.",
-        ]
-        if any(row["held_back"] for row in self._frame_rows()):
-            lines.append("* at an active bound or held by a constraint: the interval is conditional on it.")
-        return "\n".join(lines)
+        return "\n".join([table(head, rows), *self._notes()])
 
     def _short(self) -> str:
         return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
@@ -157,8 +150,8 @@ class Uncertainty(Tabled):
             self.noise_test().verdict,
             f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
         ]
-        if self.result.held_back:
-            lines.append("Intervals of parameters at an active bound are conditional on it.")
+        if any(row["held_back"] for row in self._frame_rows()):
+            lines.append("* at an active bound or held by a constraint: the interval is conditional on it.")
         return lines
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.text import joined, percent
+from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
@@ -28,9 +28,14 @@ if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
 
 __all__ = [
-    "error_axes", "error_histogram", "error_vectors", "errors", "l_curve", "parameters", "picard", "selection",
+    "error_vectors",
+    "errors",
+    "l_curve",
+    "parameters",
+    "picard",
+    "selection",
     "selectors",
-]  # fmt: skip
+]
 
 Axes = Any  # matplotlib's, imported where axes are made
 
@@ -40,8 +45,6 @@ MODELS = {"before": "nominal", "after": "identified"}
 """Model that errors before and after calibration are of."""
 MANY_ROWS = 100
 """Above it each row is a small point without a name."""
-LINEAR_MM = 0.1
-"""Size up to which the axis of signed errors is linear."""
 
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
@@ -84,72 +87,11 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     return _with_legend(ax)
 
 
-def error_histogram(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw a histogram of the errors [mm] before and after calibration. Arguments as for `errors`.
-
-    It covers four decades at most; smaller errors are in the first bar.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.error_histogram(result)
-    >>> ax.get_xlabel(), ax.get_xscale()
-    ('error [mm]', 'log')
-    """
-    ax = _axes(ax)
-    lengths, _ = _lengths(result, data or result.problem.data)
-    every = np.concatenate(list(lengths.values()))
-    high = max(float(every.max(initial=0.0)), 1e-6) * 1.001
-    low = max(float(every.min(initial=high)), 1e-4 * high)
-    edges = np.geomspace(low, high, 25 if high > 1.01 * low else 2)
-    below = []
-    for when, each in lengths.items():
-        count = np.histogram(np.maximum(each, edges[0]), edges)[0]
-        bins = np.flatnonzero(count)
-        hints = [f"{MODELS[when]}: {count[k]} rows from {mm(edges[k])} to {mm(edges[k + 1])} mm" for k in bins]
-        sides = (edges[bins], edges[bins + 1], np.zeros(len(bins)), count[bins])
-        _boxes(ax, *sides, hints, color=COLORS[when], alpha=0.85, label=MODELS[when])
-        if (each < low).any():
-            below.append(f"{int(np.sum(each < low))} {MODELS[when]}")
-    note = f"\nThe first bar includes the rows below {low:.2g} mm: {joined(below)}." if below else ""
-    ax.set(xlabel=f"error [mm]{note}", ylabel="rows")
-    _logarithmic(ax, "x")
-    return _with_legend(ax)
-
-
-def error_axes(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
-    """Draw mean (dot) and central 95 % (line) of the errors [mm] along x, y and z. Arguments as for `errors`.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.error_axes(result)
-    >>> [label.get_text() for label in ax.get_xticklabels()]
-    ['x', 'y', 'z']
-    """
-    ax = _axes(ax)
-    frame, what, vectors = signed_errors(result, data or result.problem.data)
-    ax.axhline(0, color=COLORS["before"], lw=1)
-    for (when, each), shift in zip(vectors.items(), (-0.1, 0.1), strict=True):
-        mean = each.mean(axis=0)
-        low, high = np.percentile(each, [2.5, 97.5], axis=0)
-        place = np.arange(1, 4) + shift
-        hints = [
-            f"{axis}, {MODELS[when]}: mean {m:+z.3f} mm, 95 % of the rows from {a:+z.3f} to {b:+z.3f} mm"
-            for axis, m, a, b in zip("xyz", mean, low, high, strict=True)
-        ]
-        ax.vlines(place, low, high, color=COLORS[when])
-        _dots(ax, place, mean, when, MODELS[when], hints)
-    ax.set_yscale("symlog", linthresh=LINEAR_MM)
-    ax.yaxis.set_major_formatter("{x:g}")
-    ax.yaxis.minorticks_off()
-    ax.set(xlabel=f"axis of {frame}", ylabel=f"{what} [mm]")
-    _name(ax, "x", "xyz")
-    return _with_legend(ax)
-
-
 def error_vectors(result: Calibration, data: Dataset | None = None, nominal: bool = False, ax: Axes = None) -> Axes:
     """Draw measured positions [m] with their error vectors, of the identified or of the nominal model, in 3D.
 
-    The title says how they are enlarged. Arguments as for `errors`.
+    They are enlarged by 1, 2 or 5 times 10^k, the longest to at most a sixth of the positions' extent; the title says
+    by how much. Arguments as for `errors`.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -161,7 +103,10 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
     vectors = result.error_vectors(data, nominal=nominal)
     finite = np.isfinite(vectors).all(axis=1)
     points, vectors = points[finite], vectors[finite]
-    times = magnification(points, vectors)
+    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
+    exponent = np.log10(max(float(np.ptp(points, axis=0).max()), 1e-3) / 6 / max(longest, 1e-12))
+    decade = 10.0 ** np.floor(exponent)
+    times = float(max(step for step in (1, 2, 5) if step * decade <= 10**exponent) * decade)
     when = "before" if nominal else "after"
     ax.scatter(*points.T, s=6, color="0.3")
     width = 0.5 if len(points) > MANY_ROWS else 1.5
@@ -178,25 +123,6 @@ def _lengths(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list
     finite = np.isfinite(after)
     labels = [data.label[i] for i in np.flatnonzero(finite)]
     return {"before": before[finite], "after": after[finite]}, labels
-
-
-def signed_errors(result: Calibration, data: Dataset) -> tuple[str, str, dict[str, Array]]:
-    """Return whose axes positions are along, what the errors are, and these (N, 3) [mm] before and after."""
-    frame, what = "the instrument", "measured minus modelled"
-    if any(block.measurement.touching for block in data.blocks):  # there is no instrument
-        frame, what = "the robot's base", "mean of the point minus touch"
-    before = 1e3 * result.error_vectors(data, nominal=True)
-    after = 1e3 * result.error_vectors(data)
-    finite = np.isfinite(after).all(axis=1)
-    return frame, what, {"before": before[finite], "after": after[finite]}
-
-
-def magnification(points: Array, vectors: Array) -> float:
-    """Return the factor, 1, 2 or 5 times 10^k, by which the longest error is a sixth of the points' extent."""
-    longest = float(np.linalg.norm(vectors, axis=1).max(initial=0.0))
-    exponent = np.log10(max(float(np.ptp(points, axis=0).max()), 1e-3) / 6 / max(longest, 1e-12))
-    decade = 10.0 ** np.floor(exponent)
-    return float(max(step for step in (1, 2, 5) if step * decade <= 10**exponent) * decade)
 
 
 # --- parameters --------------------------------------------------------------------------------------------

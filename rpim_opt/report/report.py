@@ -174,7 +174,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
             caption = f"{name.capitalize()}, distance of touches from their point [mm]"
             yield "table", Table(caption, HEADER, scatter_rows(touched))
     name, data = next(iter(summary.sets(result).items()))
-    yield "figures", _error_figures(result, name, data)
+    yield "figures", [_error_figure(result, name, data)]
     if content.map is not None:
         yield "heading", "Expanded uncertainty in the workspace"
         yield from _uncertainty(content.map, result)
@@ -192,13 +192,9 @@ def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
     return lines
 
 
-def _error_figures(result: Calibration, name: str, data: Dataset) -> list[Figure]:
-    rows = "Error of every row before and after calibration"
-    distribution = "Distribution of the errors before and after calibration"
-    return [
-        figure(partial(plot.errors, result, data), rows, f"Every {name} row."),
-        figure(partial(plot.error_histogram, result, data), distribution, f"Distribution of the {name} errors."),
-    ]
+def _error_figure(result: Calibration, name: str, data: Dataset) -> Figure:
+    title = "Error of every row before and after calibration"
+    return figure(partial(plot.errors, result, data), title, f"Every {name} row.")
 
 
 def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
@@ -288,23 +284,18 @@ def _diagnostics(content: Content) -> Iterator[Block]:
 
 def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
     yield "text", [*noise_sentence(result), *composition]
-    figures = []
     rows = []
     what = ""
     if len(summary.sets(result)) > 1:
-        figures += _error_figures(result, "identification", result.problem.data)
+        yield "figures", [_error_figure(result, "identification", result.problem.data)]
     for name, data in summary.sets(result).items():
-        frame, what, vectors = plot.signed_errors(result, data)
-        if not len(vectors["after"]):
-            continue
-        caption = f"{name.capitalize()}: mean (dot) and central 95 % of the rows along the axes of {frame}."
-        figures.append(figure(partial(plot.error_axes, result, data), "Errors along x, y and z", caption))
-        for i, axis in enumerate("xyz"):
-            means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
-            rows.append([f"{name}, {axis}", *means])
-    yield "figures", figures
+        what, vectors = summary.signed_errors(result, data)
+        if len(vectors["after"]):
+            for i, axis in enumerate("xyz"):
+                means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
+                rows.append([f"{name}, {axis}", *means])
     if rows:
-        caption = f"{what.capitalize()}, mean ± standard deviation [mm]"
+        caption = f"{what}, mean ± standard deviation [mm]"
         yield "table", Table(caption, ["data, axis", "nominal", "identified"], rows)
 
 

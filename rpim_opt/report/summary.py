@@ -77,6 +77,17 @@ def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
     return [row for row in rows if row["count"]]
 
 
+def signed_errors(result: Calibration, data: Dataset) -> tuple[str, dict[str, Array]]:
+    """Return what errors along axes are, and these (N, 3) [mm] before and after calibration."""
+    what = "Measured minus modelled along the axes of the instrument"
+    if any(block.measurement.touching for block in data.blocks):  # there is no instrument
+        what = "Mean of the point minus touch along the axes of the robot's base"
+    before = 1e3 * result.error_vectors(data, nominal=True)
+    after = 1e3 * result.error_vectors(data)
+    finite = np.isfinite(after).all(axis=1)
+    return what, {"before": before[finite], "after": after[finite]}
+
+
 def _both_models(
     result: Calibration, what: str, data: Dataset, dimension: str, rows: Any = slice(None), unit: Unit = "mm"
 ) -> list[dict[str, Any]]:

@@ -14,6 +14,7 @@ import rpim_opt as ro
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.report.page import TEMPLATES, figure
 from rpim_opt.report.plot import COLORS
+from rpim_opt.report.summary import signed_errors
 
 mpl.use("Agg")
 from matplotlib import pyplot as plt
@@ -38,10 +39,10 @@ def test_a_chart_has_a_tooltip_at_every_mark_and_its_texts_as_text(result) -> No
 
 
 def test_a_chart_has_no_style_and_nothing_is_loaded(result) -> None:
-    svg, _ = figure(partial(ro.plot.error_histogram, result), "Histogram")
+    svg, _ = figure(partial(ro.plot.parameters, result), "Deviations")
     assert "style" not in svg
     assert "url(" not in re.sub(r"url\(#\w+\)", "", svg)
-    assert svg == figure(partial(ro.plot.error_histogram, result), "Histogram")[0]
+    assert svg == figure(partial(ro.plot.parameters, result), "Deviations")[0]
 
 
 def test_thousands_of_rows_are_one_picture(result) -> None:
@@ -69,22 +70,9 @@ def test_an_axis_of_little_more_than_a_decade_has_more_than_one_tick(low: float,
     plt.close(ax.figure)
 
 
-def test_a_histogram_says_what_is_below_its_first_bar(result) -> None:
-    assert "The first bar" not in ro.plot.error_histogram(result).get_xlabel()
-    data = result.problem.data
-    y = data.blocks[0].y.copy()
-    y[0] -= result.error_vectors()[0]  # what the identified model predicts
-    exact = ro.Dataset.of(data.q, y, 5e-5)
-    note = r"error \[mm\]\nThe first bar includes the rows below \S+ mm: 1 identified\."
-    assert re.fullmatch(note, ro.plot.error_histogram(result, exact).get_xlabel())
-    plt.close("all")
-
-
 def test_errors_of_touches_are_along_the_axes_of_the_robot(result) -> None:
     problem = result.problem
     touched = problem.on(ro.data.touches(problem.data.q[:6], ["A"] * 3 + ["B"] * 3, sigma=1e-4))
-    assert ro.plot.error_axes(result).get_xlabel() == "axis of the instrument"
-    axes = ro.plot.error_axes(ro.calibrate(touched, ro.tikhonov, 1.0))
-    assert axes.get_xlabel() == "axis of the robot's base"
-    assert axes.get_ylabel() == "mean of the point minus touch [mm]"
-    plt.close("all")
+    assert signed_errors(result, problem.data)[0] == "Measured minus modelled along the axes of the instrument"
+    what, _ = signed_errors(ro.calibrate(touched, ro.tikhonov, 1.0), touched.data)
+    assert what == "Mean of the point minus touch along the axes of the robot's base"

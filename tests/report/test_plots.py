@@ -68,15 +68,7 @@ def fitted() -> tuple[ro.store.Instance, ro.calibration.Calibration]:
 
 
 def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:
-    instance, result = fitted
-    ro.plot.error_histogram(result, instance.validation, ax)
-    heights = [np.ptp(bar.vertices[:, 1]) for bars in ax.collections for bar in bars.get_paths()]
-    assert sum(heights) == 2 * len(instance.validation)  # nothing outside the bins
-    ax.clear()
-    ro.plot.error_axes(result, instance.validation, ax)
-    want = 1e3 * result.error_vectors(instance.validation).mean(axis=0)
-    assert drawn(ax, "identified").get_ydata() == pytest.approx(want, rel=1e-12)
-    ax.clear()
+    _, result = fitted
     ro.plot.parameters(result, ax=ax)
     names = [text.get_text() for text in ax.get_yticklabels()]
     x = dict(zip(result.problem.parameters.free.names, 1e3 * result.x, strict=True))
@@ -110,9 +102,6 @@ def test_labels_of_rows_do_not_overlap(ax, fitted, count: int) -> None:
     assert overlapping(ax.xaxis) == 0
     named = [text.get_text() for text in ax.get_xticklabels()] == list(data.label)
     assert named == (count <= 60)  # beyond, letters would be too small to be read
-    ax.clear()
-    ro.plot.error_histogram(result, data, ax)
-    assert overlapping(ax.xaxis) == 0
 
 
 def test_names_of_many_parameters_do_not_overlap(fitted) -> None:
@@ -125,20 +114,10 @@ def test_names_of_many_parameters_do_not_overlap(fitted) -> None:
     plt.close(ax.figure)
 
 
-def test_spreads_end_inside_the_axes(ax, fitted) -> None:
-    instance, result = fitted
-    ro.plot.error_axes(result, instance.validation, ax)
-    low, high = ax.transData.inverted().transform(ax.transAxes.transform([[0, 0.02], [0, 0.98]]))[:, 1]
-    ends = np.concatenate([each.get_segments() for each in ax.collections])[:, :, 1]
-    assert ends.size == 2 * 2 * 3
-    assert low < ends.min()
-    assert ends.max() < high
-
-
 def test_axes_are_made_and_carry_units(fitted) -> None:
     _, result = fitted
     axes = [
-        ro.plot.errors(result), ro.plot.error_histogram(result), ro.plot.error_axes(result), ro.plot.parameters(result),
+        ro.plot.errors(result), ro.plot.parameters(result),
         ro.plot.parameters(result, "angle"), ro.plot.picard(result.program), ro.plot.error_vectors(result),
     ]  # fmt: skip
     said = [ax.get_xlabel() + ax.get_ylabel() for ax in axes]
