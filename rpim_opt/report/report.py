@@ -430,7 +430,7 @@ def _noise(block: Rows) -> str:
 
 WHY = {"learned": "maximum of the marginal likelihood"}
 """Reasons of choices that have no note; others were given."""
-L_CURVE_HEIGHT = 330.0
+L_CURVE_HEIGHT = 430.0
 PICARD = "Picard's condition at the solution: the penalty damps directions below the line; data near 1 are noise."
 
 

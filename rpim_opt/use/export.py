@@ -37,7 +37,7 @@ Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
 
 
-def identified(result: Calibration, marker: str = "") -> Described:
+def identified(result: Calibration, marker: str | None = None) -> Described:
     """Return what a calibration identified: the robot, its base in the instrument's frame, and a reflector as tool.
 
     Parameters
@@ -45,7 +45,7 @@ def identified(result: Calibration, marker: str = "") -> Described:
     result
         The calibration.
     marker
-        Which reflector; the only one by default.
+        Which reflector; the first by default.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def identified(result: Calibration, marker: str = "") -> Described:
     if extras:
         accepted = "MDH parameters, base and tool: files hold nothing else; `compensate` corrects commands for them"
         raise InputError("the calibration", listed(extras, 6), accepted)
-    prefix = tool_prefix(marker)
+    prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
     base = np.array([of["base_" + c] for c in FRAME])
@@ -130,7 +130,7 @@ def export_files(
     whole = result
     result, notes = geometry_alone(whole)
     note = result.verdict.require(despite_verdict)
-    robot = _with_first_reflector(result, marker).robot
+    robot = identified(result, marker).robot
     frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
@@ -288,32 +288,24 @@ def export_urdf(
     np.float64(0.001)
     """
     note = result.verdict.require(despite_verdict)
-    arm = _with_first_reflector(result, marker)
+    arm = identified(result, marker)
     own = read_urdf(source, root, tip)
     names = result.problem.parameters.names
     if marker is None and tool is None and len(reflectors(names)) > 1:
         tool = False
+    root_at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
+    reflector_at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
     written: list[Array | None] = []
     notes = []
-    root_at = numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))
-    reflector_at = np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)
-    of_frames = (
-        ("base", "root", base, arm.base, own.base, f"the instrument's frame it is at {placed(frame_numbers(root_at))}"),
-        (
-            "tool",
-            "tip",
-            tool,
-            arm.tool,
-            own.tool,
-            f"its frame the reflector is at {placed(frame_numbers(reflector_at))}",
-        ),
-    )
-    for name, link, stated, place, of_file, there in of_frames:
+    for name, link, stated, where, there in (
+        ("base", "root", base, "the instrument's frame", f"the instrument's frame it is at {root_at}"),
+        ("tool", "tip", tool, "the DH table's flange frame", f"its frame the reflector is at {reflector_at}"),
+    ):
+        place = getattr(arm, name)
         free = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
-        moves = (free and same_place(place, of_file)) if stated is None else stated
+        moves = (free and same_place(place, getattr(own, name))) if stated is None else stated
         written.append(place if moves else None)
         if moves:
-            where = "the DH table's flange frame" if name == "tool" else "the instrument's frame"
             notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)} in {where}.")
         elif free:
             notes.append(f"URDF: its {link} link stays where it was; in {there}.")
@@ -327,7 +319,7 @@ def export_urdf(
 
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
     """Write a ``calibration.conf``; what alpha1 and a1 say is where the controller's Base is, and is left out."""
-    robot = _with_first_reflector(result).robot
+    robot = identified(result).robot
     nominal = result.problem.robot
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
@@ -343,10 +335,6 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     if not np.array_equal(mdh, robot.mdh):
         notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
     return notes
-
-
-def _with_first_reflector(result: Calibration, marker: str | None = None) -> Described:
-    return identified(result, reflectors(result.problem.parameters.names)[0] if marker is None else marker)
 
 
 def noted(text: str, ending: str, note: str) -> str:
