@@ -185,6 +185,9 @@ def new(
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
     rotation: Annotated[str, Option(help="What rx, ry, rz are: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
+    constants: Annotated[
+        str, Option(help="Joints that did not move and have no column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")
+    ] = "",
     encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = "",
     separator: Annotated[str, Option(help="comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
@@ -207,7 +210,8 @@ def new(
 
         options = console.table_options(
             units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, prefix=prefix,
-            encoding=encoding, separator=separator, decimal=decimal, within=time_tolerance,
+            constants=tuple(console.listed_words(constants)), encoding=encoding, separator=separator, decimal=decimal,
+            within=time_tolerance,
         )  # fmt: skip
         if dry_run:
             found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)

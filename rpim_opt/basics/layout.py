@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import UNIT_SIGNS, UNITS, parse_units, split
+from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6
 """A row belongs to the data if it has this part of the numbers of the fullest row."""
@@ -41,7 +42,9 @@ WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
 UNITS_LINE = re.compile(r"\W*(?:units?|einheit(?:en)?|unités?|unidades|unità)\s*[:=]?\s+(.+)", re.IGNORECASE)
 """A line above the header that states units."""
-READING = ("encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "joints")
+READING = (
+    "encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "constants", "joints",
+)  # fmt: skip
 """What a problem file remembers of how its tables were read, so that later ones are read alike."""
 
 
@@ -66,6 +69,8 @@ class TableOptions:
         body, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``.
     prefix
         Of the names of the joints, where columns of several robots are there.
+    constants
+        Values of joints that did not move and have no column, by headers with units: ``("torso_lift [m]=0.15",)``.
     key, within
         The column by which several files are joined, ``"row"`` for the number of the row; tolerance [s] where they are
         joined by the nearest time.
@@ -89,6 +94,7 @@ class TableOptions:
     quaternion: str = ""
     rotation: str = ""
     prefix: str = ""
+    constants: tuple[str, ...] = ()
     key: str = ""
     within: float | None = None
     joints: tuple[str, ...] = ()
@@ -104,7 +110,7 @@ class TableOptions:
             if name not in READING:
                 raise InputError("key reading", f"'{name}'", choices(name, READING))
         found: dict[str, Any] = dict(texts)
-        for name in ("columns", "joints"):
+        for name in ("columns", "constants", "joints"):
             found[name] = tuple(filter(None, texts.get(name, "").split(",")))
         return cls(**found)
 
@@ -112,7 +118,8 @@ class TableOptions:
         """Return what is stated as texts, but for the sheet and for how several files are joined."""
         said = {name: getattr(self, name) for name in READING}
         units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
-        said |= {"units": ",".join(units), "columns": ",".join(self.columns), "joints": ",".join(self.joints)}
+        said |= {"units": ",".join(units)}
+        said |= {name: ",".join(getattr(self, name)) for name in ("columns", "constants", "joints")}
         return {name: text for name, text in said.items() if text}
 
 
@@ -150,6 +157,19 @@ class RawTable:
     heads: Mapping[str, Head] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
+
+    def with_constants(self, constants: Sequence[str]) -> RawTable:
+        """Return the table with columns of one value each, ``torso_lift [m]=0.15``."""
+        columns, heads = dict(self.columns), dict(self.heads)
+        for text in constants:
+            name, mark, value = (part.strip() for part in text.rpartition("="))
+            if not mark or math.isnan(numeral(value)):
+                raise InputError("constants", f"'{text}'", "a column's name with its unit, =, and a number")
+            if name in columns:
+                raise InputError("constants", f"'{name}', which the table has", "a column that it lacks")
+            columns[name] = [value] * len(next(iter(columns.values()), ()))
+            heads[name] = Head(name)
+        return replace(self, columns=columns, heads=heads)
 
 
 def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:

@@ -175,7 +175,7 @@ def _outlying(result: Outcome) -> list[str]:
     flagged = result.flagged
     if not flagged:
         return []
-    named = [f"{flag.label} ({flag.sigmas:.0f} sigma, {flag.error_mm:.2f} mm)" for flag in flagged[:MOST_ROWS]]
+    named = [f"{flag.label} ({flag.sigmas:.0f} sigma, residual {flag.error_mm:.2f} mm)" for flag in flagged[:MOST_ROWS]]
     text = f"Outlying rows: {', '.join(named)}"
     if len(flagged) > MOST_ROWS:
         text += f" and {len(flagged) - MOST_ROWS} more"

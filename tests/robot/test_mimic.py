@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.robot.test_exchange import reach
+from tests.test_cli import run
 
 URDF = """<robot name="palletizer"><link name="base"/><link name="column"/><link name="lift"/><link name="upper"/>
 <link name="wrist"/><link name="tip"/>
@@ -77,3 +79,29 @@ def test_commands_of_joints_that_others_follow_are_corrected(arm: ro.robot.Descr
     corrected = ro.use.compensate(result, q[:5])
     assert corrected.q.shape == (5, 2)
     assert result.verdict
+
+
+def lines(rows: np.ndarray) -> str:
+    return "".join(f"P{i}," + ",".join(map(repr, row)) + "\n" for i, row in enumerate(rows.tolist()))
+
+
+def test_a_joint_that_nobody_recorded_is_stated(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A torso that stood still has no column: its value comes from the command, and from the folder afterwards."""
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_text(re.sub(r"<mimic[^>]*>", "", URDF))
+    arm = ro.read_urdf("arm.urdf")
+    rng = np.random.default_rng(0)
+    q = np.column_stack([rng.uniform(-1, 1, 40), np.full(40, 0.15), *rng.uniform(0, 0.6, (2, 40))])
+    T = numeric_frame(arm.base) @ ro.robot.forward_kinematics(arm.robot, q) @ numeric_frame(arm.tool)
+    measured = np.hstack([np.degrees(q[:, [0]]), q[:, [2]], np.degrees(q[:, [3]]), 1e3 * T[:, :3, 3]])
+    Path("joints.csv").write_text("id,turn [deg],slide2 [m],bend [deg]\n" + lines(measured[:, :3]))
+    Path("points.csv").write_text("id,x_mm,y_mm,z_mm\n" + lines(measured[:, 3:]))
+    data = ["--data", "joints.csv", "--data", "points.csv"]
+    folder = ["new", "cell", "--robot", "arm.urdf", *data]
+    assert run(monkeypatch, *folder) == 2
+    assert run(monkeypatch, *folder, "--constants", "slide [m]=lots") == 2
+    assert run(monkeypatch, *folder, "--constants", "turn [deg]=1") == 2
+    assert run(monkeypatch, *folder, "--constants", "slide [m]=0.15") == 0
+    instance = ro.load("cell")
+    assert np.allclose(instance.problem.data.q, q, atol=1e-9)
+    assert 'constants = "slide [m]=0.15"' in Path("cell/problem.toml").read_text()

@@ -58,6 +58,8 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
     for stem in _required(columns, robot, kind):
         if (stem, "") not in columns:
             accepted = kind.accepted.get(stem, " or ".join(with_unit(stem, known[stem][0])))
+            if stem[0] == "q" and stem[1:].isdigit():
+                accepted += ", or rpim-opt new --constants for a joint that did not move"
             raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
     return columns
 

@@ -121,6 +121,9 @@ def understand(
     known = number_columns(robot, kind)
     try:
         read, rotation = _readings(raw, robot, kind, options, joints, targets)
+        if options.constants and any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
+            raw = raw.with_constants(options.constants)  # of several files that with the joints
+            read, rotation = _readings(raw, robot, kind, options, joints, targets)
         columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
         if "rx" in known and (options.rotation or rotation) not in ("", "extrinsic xyz"):
             columns, meant = _as_quaternions(columns, meant, options.rotation or rotation)
