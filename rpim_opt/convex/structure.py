@@ -352,7 +352,7 @@ class Structure:
             if self.joint:
                 return self._together(z, r, weight)
             if self._own_of(self.answers.loss.expression):
-                loss = self._loss_at_best.at_best(self.seen(r))
+                loss = self._loss_at_best(self.seen(r))
             else:
                 loss = self.loss_of(r)
             if self._own_of(self.answers.penalty_of_z):
@@ -360,8 +360,11 @@ class Structure:
             return loss, self.penalty_of(z)
 
     @cached_property
-    def _loss_at_best(self) -> Canonical:
-        return Canonical(self.answers.loss.expression, [], self.answers.loss.variable)
+    def _loss_at_best(self) -> Callable[[Array], float]:
+        loss = self.loss
+        if loss is not None and loss.threshold is not None:
+            return lambda v: loss.best(v)[0]
+        return Canonical(self.answers.loss.expression, [], self.answers.loss.variable).at_best
 
     @cached_property
     def _penalty_at_best(self) -> Canonical:

@@ -196,6 +196,25 @@ def test_where_a_path_begins_changes_nothing(loss: str) -> None:
         assert estimate.objective == pytest.approx(alone.objective, rel=1e-7)
 
 
+@pytest.mark.parametrize(
+    ("loss", "over"),
+    [
+        (LOSSES["tail"]["loss"], "equation"),
+        (cp.max, "configuration"),
+        (lambda r: cp.sum_largest(cp.abs(r), 40), "equation"),
+        (lambda r: cp.max(cp.multiply(np.linspace(1, 2, r.size), cp.abs(r))), "equation"),
+    ],
+)
+def test_some_rows_of_many_give_the_minimum_of_all(loss: Any, over: str) -> None:
+    problem, _ = simulated(configurations=450, noise=1e-4, seed=3)
+    model = problem.linearize(np.zeros(34))
+    mine = ro.Formulation("mine", loss, cp.sum_squares, CONSTRAINTS["ball"], loss_over=over)
+    for estimate in ro.convex.pose(mine, model).path([30.0, 1.0]):
+        best = plain(mine, model, estimate.weight)
+        assert estimate.objective == pytest.approx(best.objective, rel=1e-6)
+        assert estimate.objective <= best.objective + 1e-7 * max(abs(best.objective), 1.0)
+
+
 @pytest.mark.parametrize("formulation", ["robust", "sum_of_norms"])
 @pytest.mark.parametrize("rule", ["reml", "l_curve", "corner", "gcv", "quasi_optimality"])
 def test_storage_decides_nothing(formulation: str, rule: str, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -26,6 +26,8 @@ ATTEMPTS: tuple[dict[str, Any], ...] = (
     {"static_regularization_constant": 1e-7},
 )
 """Settings that are tried in turn: where one factorization stalls, another does not."""
+EQUILIBRATED = {"equilibrate_enable": True, "tol_gap_abs": SOUGHT, "tol_gap_rel": SOUGHT, "tol_feas": SOUGHT}
+"""Settings for rows beside tangents of many others, whose costs are far larger."""
 CURVED = 1e-14
 """Eigenvalues of P below this part of the largest are rounding."""
 DENSE = 4e5
@@ -61,7 +63,8 @@ class Canonical:
         self._chain: Any
         data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
         self.size = len(data["c"])
-        self.at = data["param_prob"].var_id_to_col[variable.id] + np.arange(variable.size)
+        self._columns = data["param_prob"].var_id_to_col
+        self.at = self._columns[variable.id] + np.arange(variable.size)
         dims = data["dims"]
         self.cones = dims_to_solver_cones(dims)
         self.zero = int(dims.zero)
@@ -147,6 +150,11 @@ class Canonical:
         cones = [clarabel.ZeroConeT(self.zero), clarabel.NonnegativeConeT(self.linear - self.zero)]
         return [cone for cone, count in zip(cones, (self.zero, self.linear - self.zero), strict=True) if count]
 
+    def price(self, variable: Any, slope: float) -> None:
+        """Make a scalar variable cost so much in the objective."""
+        column = self._columns[variable.id]
+        self.q[column] = slope * self.column_scale[column]
+
     def value(self, x: Array) -> float:
         """Return the objective at x (N,)."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
@@ -173,21 +181,6 @@ class Canonical:
         raw = SimpleNamespace(status="Solved", solve_time=0.0, iterations=0, obj_val=0.0)
         raw.x, raw.z = x * self.column_scale, z * self.row_scale
         return self._chain.invert(raw, self._inverse).dual_vars
-
-    def part(self, kept: np.ndarray, owner: np.ndarray) -> Canonical:
-        """Return the form of some entries of the variable; ``owner`` (m,) is the entry of every inequality, or -1."""
-        made = object.__new__(Canonical)
-        rows = np.flatnonzero((owner < 0) | np.isin(owner, kept))
-        out = np.setdiff1d(np.arange(len(self.at)), kept)
-        columns = np.setdiff1d(np.arange(self.size), self.at[out])
-        made.A, made.b, made.q = self.A[rows][:, columns], self.b[rows], self.q[columns]
-        made.P, made.offset, made.zero, made.size = self.P[columns][:, columns], self.offset, self.zero, len(columns)
-        inequalities = int(((rows >= self.zero) & (rows < self.linear)).sum())
-        made.linear = self.zero + inequalities
-        clarabel = import_module("clarabel")
-        made.cones = [clarabel.NonnegativeConeT(inequalities) if "Nonneg" in str(cone) else cone for cone in self.cones]
-        made.at = np.searchsorted(columns, self.at[kept])
-        return made
 
 
 def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int]) -> tuple[Array, Array]:
@@ -313,6 +306,7 @@ class Small:
         self.penalty, self.rows, self.loss, self.sizes = penalty, rows, loss, sizes
         self.face = np.zeros(0, dtype=int)
         self.near = np.zeros(penalty.size)
+        self.attempts = ATTEMPTS
 
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
@@ -392,7 +386,7 @@ class Small:
         P.data *= scale  # tolerances are absolute below one
         program = P, cost * scale, matrix, np.concatenate(bounds), data.cones
         status = ""
-        for attempt in ATTEMPTS:
+        for attempt in self.attempts:
             found = clarabel.DefaultSolver(*program, clarabel_settings(attempt)).solve()
             status = str(found.status)
             if status in SOLVED:

@@ -8,12 +8,14 @@ sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a kink are 
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
 
 import numpy as np
+from scipy.optimize import bisect
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.expressions import cp
@@ -49,6 +51,10 @@ ROUND = 32
 """Rows that are taken as they are come in multiples of this: a program of so many is made once."""
 BLOCK = 1024
 """Rows that are multiplied together, as a processor's cache holds them."""
+DECADES, EXACT = 6, 1e-15
+"""Decades beyond the largest entry in which a best threshold is looked for, and how exactly, relative."""
+SCALED = ("AddExpression", "multiply", "MulExpression", "DivExpression", "reshape", "Promote")
+"""Expressions below which a maximum is looked for."""
 JUMP = 1e-3
 """Part of the slope's total variation above which a jump counts as a kink."""
 PROBES = 64
@@ -408,19 +414,35 @@ class OutsideDomain(Exception):
 class Loss:
     """A loss f(v) that is no square, and limits of v (M,): residuals, or where ``positive`` configurations' norms.
 
-    Where it is ``separable``, f(v) = sum_i f_i(v_i).
+    Where it is ``separable``, f(v) = sum_i f_i(v_i); with a ``threshold`` t min_t rate t + sum_i f_i(v_i, t).
     """
 
     def __init__(self, expression: Any, variable: Any, positive: bool, limits: tuple[Any, ...] = ()):
         self.expression, self.variable, self.positive, self.limits = expression, variable, positive, limits
         self.entries: Any = None
-        if not limits and {v.id for v in expression.variables()} == {variable.id}:
+        self.threshold: Any = None
+        self._lock = threading.Lock()  # a variable has one value at a time
+        if limits:
+            return
+        expression = _by_threshold(expression)
+        own = [v for v in expression.variables() if v.id != variable.id]
+        if not own:
             self.entries = _summands(expression, variable)
+        elif len(own) == 1 and own[0].shape == () and not any(own[0].attributes.values()):
+            self.entries, self.threshold = _summands(expression, variable), own[0]
+            self.rate = self._rate(expression)
+            if not np.isfinite(self.rate):
+                self.entries = self.threshold = None
 
     @property
     def separable(self) -> bool:
         """Whether the loss is a sum over entries."""
-        return self.entries is not None
+        return self.entries is not None and self.threshold is None
+
+    @cached_property
+    def canonical(self) -> Canonical:
+        """Loss and limits in canonical form."""
+        return Canonical(self.expression, self.limits, self.variable)
 
     @cached_property
     def uniform(self) -> bool:
@@ -448,6 +470,54 @@ class Loss:
         apart = 1e-5 * v if self.positive else 1e-6 * (1 + np.abs(v))
         high, low = self.slope(v + apart), self.slope(v - apart)
         return self.slope(v), np.maximum((high - low) / (2 * apart), 0.0)
+
+    # --- with a threshold ---
+
+    def _rate(self, expression: Any) -> float:
+        """Return what the threshold costs a unit beside the entries; NaN where that varies, or entries are curved."""
+        if self.entries is None or not self.entries.is_pwl():  # of curved entries tangents bound too little
+            return np.nan
+        self.variable.save_value(np.zeros(self.variable.size))
+        beside = []
+        for t in (0.0, 1.0, 3.0):
+            self.threshold.save_value(np.array(t))
+            values: list[Any] = [expression.value, self.entries.value]
+            if values[0] is None or values[1] is None:
+                return np.nan
+            beside.append(float(values[0]) - float(np.sum(values[1])))
+        constant, one, three = beside
+        proportional = constant == 0 and abs(three - 3 * one) <= 1e-12 * abs(three)
+        return one if proportional else np.nan
+
+    @cached_property
+    def _by_both(self) -> tuple[Evaluation, Evaluation]:
+        return evaluation(self.entries, self.variable), evaluation(self.entries, self.threshold)
+
+    def at_threshold(self, v: Array, t: float) -> tuple[Array, Array]:
+        """Return values f_i(v_i, t) (M,) and their slopes by v_i (M,)."""
+        with self._lock:
+            self.threshold.save_value(np.array(t))
+            values, slopes = self._by_both[0](v)
+        return values * np.ones(len(v)), slopes * np.ones(len(v))
+
+    def by_threshold(self, v: Array, t: float) -> Array:
+        """Return the slopes of f_i(v_i, t) by t, (M,)."""
+        with self._lock:
+            self.variable.save_value(v)
+            slopes = self._by_both[1](t)[1]
+        return np.asarray(slopes * np.ones(len(v)))
+
+    def best(self, v: Array) -> tuple[float, float]:
+        """Return the least value at v (M,) and the threshold there; infinity where there is none."""
+
+        def rise(t: float) -> float:
+            return self.rate + float(self.by_threshold(v, t).sum())
+
+        for far in (1.0 + np.abs(v).max()) * 10.0 ** np.arange(DECADES):
+            if rise(-far) <= 0 <= rise(far):
+                t = float(bisect(rise, -far, far, xtol=EXACT * far, rtol=EXACT))
+                return self.rate * t + float(self.at_threshold(v, t)[0].sum()), t
+        return np.inf, np.nan
 
     def some(self, which: np.ndarray) -> tuple[Any, Any]:
         """Return the sum of some entries, and the variable (k,) of their own that it is an expression of."""
@@ -486,17 +556,31 @@ class Loss:
 # --- the expression tree -----------------------------------------------------------------------------------------
 
 
+def _by_threshold(e: Any) -> Any:
+    """Return an expression whose maximum or sum of the k largest is written as min_t k t + sum(pos(v - t))."""
+    if type(e).__name__ in ("max", "sum_largest") and e.size == 1:
+        t = cp.Variable()
+        return getattr(e, "k", 1) * t + cp.sum(cp.pos(e.args[0] - t))
+    if type(e).__name__ in SCALED:
+        return e.copy([_by_threshold(a) for a in e.args])
+    return e
+
+
+def _has(e: Any, v: Any) -> bool:
+    return v.id in {each.id for each in e.variables()}
+
+
 def _summands(e: Any, v: Any) -> Any:
-    """Return the entrywise expression (M,) whose sum a scalar expression is, up to a constant; None for another one."""
+    """Return the entrywise expression (M,) whose sum a scalar expression is, up to what v does not change, or None."""
     name = type(e).__name__
-    if e.size != 1 or v.id not in {each.id for each in e.variables()}:
+    if e.size != 1 or not _has(e, v):
         return None
     if name in ("Sum", "norm1", "quad_over_lin"):
         entries = {"Sum": lambda a: a, "norm1": cp.abs, "quad_over_lin": cp.square}[name](e.args[0])
         if name == "quad_over_lin" and e.args[1].is_constant():
             entries = entries / e.args[1]
         return _checked(entries, v)
-    parts = [a if a.is_constant() else _summands(a, v) for a in e.args]
+    parts = [_summands(a, v) if _has(a, v) else a for a in e.args]
     if name == "MulExpression" and parts[0] is e.args[0] and v.shape == e.args[1].shape:  # weights @ entries
         return _checked(cp.multiply(cp.reshape(e.args[0], v.shape, order="C"), e.args[1]), v)
     if any(part is None for part in parts):
@@ -520,7 +604,7 @@ def entrywise(e: Any, v: Any) -> bool:
     """Return whether entry i of an expression depends on v_i alone."""
     from cvxpy.atoms.elementwise.elementwise import Elementwise
 
-    if e is v or not e.variables():
+    if e is v or not _has(e, v):
         return True
     if e.shape != v.shape:
         return False
@@ -540,6 +624,8 @@ def _restricted(e: Any, v: Any, own: Any, which: np.ndarray) -> Any:
     """Return the entries (k,) of an entrywise expression, as an expression of their own variable (k,)."""
     if e is v:
         return own
+    if not e.args and e.variables():  # a threshold
+        return e
     if not e.variables():
         if e.size == v.size and e.size > 1:
             return cp.Constant(np.ravel(e.value)[which])
@@ -565,6 +651,8 @@ def evaluation(e: Any, v: Any) -> Evaluation:
     if not e.variables():
         number = np.ravel(e.value) if e.size > 1 else np.squeeze(e.value)
         return lambda x: (number, 0.0)
+    if not _has(e, v):
+        return lambda x: (np.ravel(e.value) if e.size > 1 else np.squeeze(e.value), 0.0)
     norm = _is_norm(e)
     inner = [evaluation(a, v) for a in (e.args[0].args if norm else e.args)]
     name = "norm" if norm else type(e).__name__

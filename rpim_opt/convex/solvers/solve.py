@@ -3,36 +3,36 @@
 from __future__ import annotations
 
 import threading
-from dataclasses import dataclass, field
-from typing import Any
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.separable import FEW, Loss, Newton, OutsideDomain, Rows, kink_of
+from rpim_opt.convex.solvers.conic import EQUILIBRATED, Canonical, Damping, Point, Small, Squares, Unsolved
+from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows, kink_of
 
 GENERATIONS = 40
-"""Rounds of row generation before all rows are taken."""
+"""Working sets of entries before all rows are taken."""
 INACTIVE = 1e-6
-"""Part of the largest slope below which an entry of a loss is not active."""
-VIOLATED = 1e-8
-"""Part of the largest entry by which an inequality of a left-out row may be missed."""
+"""Part of the largest slope below which slopes are the same, and an entry of a loss is not active."""
+GAP = 1e-8
+"""Relative gap between a loss and its bound by tangents at which the working set suffices."""
 
 
 @dataclass(eq=False)
 class Warm:
-    """What one solution leaves to the next: the point, the width of smoothing, active rows, Clarabel's data."""
+    """What one solution leaves to the next: point, width of smoothing, sizes of working sets, Clarabel's data."""
 
     penalty: Canonical
     z: Array | None = None
     x: Array | None = None
     width: float = 0.0
-    working: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=int))
+    count: int = 0
     small: dict[int, Small] = field(default_factory=dict)
     exact: dict[int, Small] = field(default_factory=dict)
     direct: dict[int, Small] = field(default_factory=dict)
-    canonical: Canonical | None = None
+    some: dict[tuple[int, int], Small] = field(default_factory=dict)
     kink: float = -1.0
     lock: Any = field(default_factory=threading.RLock)
 
@@ -42,15 +42,9 @@ class Warm:
             self.small[rows] = Small(self.penalty, rows)
         return self.small[rows]
 
-    def form(self, loss: Loss) -> Canonical:
-        """Return the loss in canonical form."""
-        if self.canonical is None:
-            self.canonical = Canonical(loss.expression, loss.limits, loss.variable)
-        return self.canonical
-
     def begun(self, z: Array | None) -> Warm:
         """Return another one that shares what does not change, to begin at z (n,) or anew."""
-        other = Warm(self.penalty, canonical=self.canonical, kink=self.kink)
+        other = Warm(self.penalty, kink=self.kink)
         if z is not None and len(self.penalty.at) == self.penalty.size:
             other.z, other.x = z, z
         return other
@@ -72,8 +66,8 @@ def minimum(
     separable, smooth          proximal Newton, a sequence of small programs
     separable, non-smooth      the same on the smoothed loss, then rows near kinks;
                                of at most `FEW` entries all rows as they are
-    any other                  row generation where rows stand in inequalities alone,
-                               else all rows
+    with a threshold           entries near a kink as they are, tangents of others
+    any other                  all rows
     ========================== =====================================================
 
     A quadratic loss is None, with ``squares``, which are also what is quadratic beside another loss. ``accuracy`` is
@@ -141,82 +135,102 @@ def _all_rows(
     terms = _beside(squares, n, damping)
     count = 0 if terms is None else n + 1
     if count not in warm.direct:
-        warm.direct[count] = Small(warm.penalty, count, warm.form(loss), rows.sizes if loss.positive else None)
+        warm.direct[count] = Small(warm.penalty, count, loss.canonical, rows.sizes if loss.positive else None)
     return warm.direct[count].solve(terms, weight, rows.A, rows.b)
 
 
 def _coupled(
     loss: Loss, rows: Rows, warm: Warm, weight: float, squares: Squares | None, damping: Damping | None
 ) -> Point:
-    """Return the minimum by row generation.
+    """Return the minimum of a loss with a threshold (a maximum, CVaR, the sum of the largest) by some of its entries.
 
-    A loss whose entries stand in inequalities alone (a maximum, CVaR, the sum of the largest) is solved for some
-    entries, which bounds it from below, and for those that it then violates, until there are none.
+    Those near a kink are taken as they are and all others by their tangents, which bounds the loss from below; those
+    that then have other slopes are added, until the bound is reached. Of any other loss all rows are taken.
     """
-    canonical = warm.form(loss)
-    count, n = loss.variable.size, rows.A.shape[1]
-    if count <= FEW or not _in_inequalities(canonical):
+    n, at = rows.A.shape[1], warm.penalty.at
+    if loss.variable.size <= FEW or loss.threshold is None:
         return _all_rows(loss, rows, warm, weight, squares, damping)
-    touched = canonical.A[:, canonical.at].tocoo()
-    owner = np.full(len(canonical.b), -1)
-    owner[touched.row] = touched.col
-    terms = _beside(squares, n, damping)
-    entries = rows.entries if loss.positive else lambda r: r
-    if not len(warm.working):
-        start = warm.program(n + 1).solve(rows.squares.damped(damping), weight)
-        v = entries(rows.A @ start.x[warm.penalty.at] - rows.b)
-        warm.working = np.sort(np.argsort(-np.abs(v))[: 4 * n])
-        warm.z = start.x[warm.penalty.at]
+    terms = _beside(squares, n, damping) or Squares(np.zeros((0, n)), np.zeros(0), np.zeros(n))
+    z = warm.z
+    if z is None:
+        z = warm.program(n + 1).solve(rows.squares.damped(damping), weight).x[at]
+    tangent = _tangent(loss, rows, rows.A @ z - rows.b)
+    if not np.isfinite(tangent.value):
+        return _all_rows(loss, rows, warm, weight, squares, damping)
+    working = np.sort(tangent.near[: max(4 * n, warm.count or np.count_nonzero(tangent.pull))])
     for _ in range(GENERATIONS):
-        sizes = rows.sizes[warm.working] if loss.positive and rows.sizes is not None else None
-        part = canonical.part(warm.working, owner)
-        small = Small(warm.penalty, 0 if terms is None else n + 1, part, sizes)
-        A, b = rows.of(warm.working)
+        outside = np.ones(len(tangent.near), dtype=bool)
+        outside[working] = False
+        slope = np.where(rows.spread(outside), tangent.slope, 0.0)
+        small = _some(loss, rows, warm, working, len(terms.y))
+        part: Any = small.loss
+        part.price(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
         try:
-            point = small.solve(terms, weight, A, b)
-        except Unsolved as error:
-            if "DualInfeasible" not in str(error) or len(warm.working) == count or warm.z is None:
+            point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *rows.of(working))
+        except Unsolved:
+            if len(working) == len(outside):
                 raise
-            v = entries(rows.A @ warm.z - rows.b)  # too few rows to bound the loss from below
-            warm.working = np.sort(np.argsort(-np.abs(v))[: 4 * len(warm.working)])
+            working = np.union1d(working, tangent.near[: 4 * len(working)])  # too few to bound the loss from below
             continue
-        warm.z = point.x[warm.penalty.at]
-        v = entries(rows.A @ warm.z - rows.b)
-        more = _violated(canonical, owner, warm.working, v, point.rest)
-        if len(more) and point.rest is not None:  # unknowns of the loss that nothing holds count as violated, too
-            bound = part.value(point.rest)
-            if canonical.at_best(v) - bound <= VIOLATED * max(abs(bound), 1.0):
-                more = more[:0]
-        if not len(more):  # the next minimum begins with what is active, and the largest beside it
-            pull = np.zeros(len(rows.b))
-            pull[rows.places(warm.working)] = point.slope
-            size = np.abs(entries(pull))
-            active = np.flatnonzero(size > INACTIVE * size.max())
-            warm.working = np.union1d(active, np.argsort(-np.abs(v))[: len(active) + n])
-            return point
-        warm.working = np.union1d(warm.working, more[: max(4 * n, len(warm.working))])
+        r = rows.A @ point.x[at] - rows.b
+        bound = part.value(point.rest) + float(slope @ r) + float(tangent.constant[outside].sum())
+        there = _tangent(loss, rows, r)
+        if there.value - bound <= GAP * max(abs(bound), 1.0):
+            pull = np.zeros(len(r))
+            pull[rows.places(working)] = point.slope
+            warm.count = len(working) // 2
+            return replace(point, slope=pull + slope)
+        other = np.flatnonzero(np.abs(there.pull - tangent.pull) > INACTIVE * np.abs(there.pull).max())
+        more = np.union1d(working, np.union1d(other, there.near[: 4 * n]))
+        if len(more) == len(working):
+            break
+        tangent, working = there, more
     return _all_rows(loss, rows, warm, weight, squares, damping)
 
 
-def _in_inequalities(canonical: Canonical) -> bool:
-    """Whether the entries stand in inequalities alone."""
-    at = canonical.at
-    rows = np.unique(canonical.A[:, at].tocoo().row)
-    free = not np.any(canonical.q[at]) and not abs(canonical.P[:, at]).nnz
-    return bool(free and ((rows >= canonical.zero) & (rows < canonical.linear)).all())
+def _some(loss: Loss, rows: Rows, warm: Warm, working: np.ndarray, squares: int) -> Small:
+    """Return the small program with some entries of a loss with a threshold as they are, beside so many squares."""
+    key = len(working), squares
+    if key in warm.some:
+        return warm.some[key]
+    expression, own = loss.some(working)
+    sizes = None if rows.sizes is None else rows.sizes[working]
+    made = Small(warm.penalty, squares, Canonical(expression + loss.threshold, [], own), sizes)
+    made.attempts = (EQUILIBRATED,)
+    if loss.uniform and (rows.sizes is None or np.ptp(rows.sizes) == 0):  # one program serves any entries of a number
+        warm.some[key] = made
+    return made
 
 
-def _violated(canonical: Canonical, owner: np.ndarray, working: np.ndarray, v: Array, rest: Array | None) -> np.ndarray:
-    """Return the entries (k,) outside the working set whose inequalities are violated, the worst first."""
-    count = len(canonical.at)
-    left = np.setdiff1d(np.arange(count), working)
-    full = np.zeros(canonical.size)
-    full[np.setdiff1d(np.arange(canonical.size), canonical.at[left])] = rest
-    full[canonical.at] = v
-    over = (canonical.A @ full - canonical.b)[canonical.zero : canonical.linear]
-    mine = owner[canonical.zero : canonical.linear]
-    bad = (over > VIOLATED * (1 + np.abs(v).max())) & (mine >= 0)
-    worst = np.zeros(count)
-    np.maximum.at(worst, mine[bad], over[bad])
-    more = np.setdiff1d(np.unique(mine[bad]), working)
-    return more[np.argsort(-worst[more])]
+class Tangent(NamedTuple):
+    """The value of a loss with a threshold at some point, and tangents of its entries there, (N,) each.
+
+    ``pull`` are slopes by the entries and ``slope`` (m,) by the equations; ``near`` are the entries in the order of
+    their distance from a kink.
+    """
+
+    value: float
+    constant: Array
+    pull: Array
+    slope: Array
+    by_threshold: Array
+    near: np.ndarray
+
+
+def _tangent(loss: Loss, rows: Rows, r: Array) -> Tangent:
+    """Return the tangents at a residual (m,)."""
+    v = rows.entries(r)
+    value, t = loss.best(v)
+    values, pull = loss.at_threshold(v, t)
+    by_threshold = loss.by_threshold(v, t)
+    slope = pull
+    if loss.positive:
+        slope = rows.spread(pull / np.maximum(v, TINY)) * r
+    far = np.full(len(v), np.inf)
+    most = np.abs(v).max() + abs(t)
+    for h in np.geomspace(most, 1e-8 * most, 20):
+        low = np.maximum(v - h, 0.0) if loss.positive else v - h
+        bent = np.abs(loss.at_threshold(v + h, t)[1] - loss.at_threshold(low, t)[1])
+        far[bent > INACTIVE * bent.max(initial=0.0)] = h
+    constant = values - pull * v - by_threshold * t
+    return Tangent(value, constant, pull, slope, by_threshold, np.argsort(far, kind="stable"))
