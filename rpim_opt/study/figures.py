@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -17,7 +16,7 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarForm
 from rpim_opt.basics.files import refused, write_files
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.report.page import HEIGHT, Block, Table, figure, render
-from rpim_opt.study.ranking import Rows, Summary, figures, number, profiles, without_figures
+from rpim_opt.study.ranking import Rows, Summary, figures, number, profiles
 
 ROW_INCHES = 0.25
 """Height of a method."""
@@ -197,16 +196,13 @@ def _html(rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Map
         figure(partial(_profiles, rows, summary), "Performance profiles", PROFILES, height),
     ]
     title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
-    ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes[:3])]
-    sections = [("Methods", ranking), ("By problem", [("table", _medians(rows, summary, problems))])]
-    missing = _missing(rows, problems)
-    if missing.rows:
-        sections.append(("What could not be computed", [("table", missing)]))
-    sections.append(("How it was made", [("facts", [*axes.items(), *provenance.items()])]))
-    top: list[Block] = [
-        ("lead", {"text": headline(summary), "alarm": False}),
-        ("figures", drawn),
+    ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes)]
+    sections: list[tuple[str, list[Block]]] = [
+        ("Methods", ranking),
+        ("By problem", [("table", _medians(rows, summary, problems))]),
+        ("How it was made", [("facts", [*axes.items(), *provenance.items()])]),
     ]
+    top: list[Block] = [("lead", {"text": headline(summary), "alarm": False}), ("figures", drawn)]
     kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
     return render(f"Comparison: {heading}", kind, heading, top, sections)
 
@@ -242,14 +238,3 @@ def _medians(rows: Rows, summary: Summary, problems: list[str]) -> Table:
             cells.append(shade)
     caption = f"Median {summary.metric} by problem; darker is farther from the best"
     return Table(caption, ["method", *problems], table)
-
-
-def _missing(rows: Rows, problems: list[str]) -> Table:
-    """Return the replicates without figures, by method and reason."""
-    lines: list[list[str]] = []
-    for (method, status, reason), missing in without_figures(rows).items():
-        where = Counter(missing)
-        names = "all" if len(where) == len(problems) else ", ".join(where)
-        lines.append([method, status, str(len(missing)), names, reason])
-    header = ["method", "status", "replicates", "problems", "reason"]
-    return Table("Replicates without a figure", header, lines, prose=True)

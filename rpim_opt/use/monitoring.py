@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import listed
+from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.covariance import scattered
 from rpim_opt.calibration.result import Calibration
@@ -284,21 +285,18 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     m = np.zeros(len(C))
     residual, slopes = problem.slopes(previous_deviations(result, problem))
     readings = scattered(problem, result.variance_factor).reading
-    rows: dict[int, tuple[slice, Array]] = {}
-    start = 0
-    for block, V in zip(problem.data.blocks, readings, strict=True):
-        k = len(block.measurement.components)
-        for row, of_row in zip(block.row, np.broadcast_to(V, (len(block.row), k, k)), strict=True):
-            rows[int(row)] = slice(start, start + k), of_row
-            start += k
+    rows: dict[int, tuple[Array, Array]] = {}
+    for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
+        for row, equations, of_row in zip(block.row, part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True):
+            rows[int(row)] = equations, of_row
     freedom = max(result.freedom, 1.0)
     sigmas = np.zeros(len(rows))
     p_values = np.ones(len(rows))
     for t in range(len(rows)):
         equations, V = rows[t]
-        J = slopes[equations]
+        J = equations[:, 1:]
         S = J @ C @ J.T + V
-        e = residual[equations] - J @ m
+        e = equations[:, 0] - J @ m
         squares = float(e @ np.linalg.solve(S, e))
         sigmas[t] = np.sqrt(squares)
         p_values[t] = fdtrc(len(e), freedom, squares / len(e))
