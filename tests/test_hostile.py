@@ -149,7 +149,7 @@ ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\x08\r"
 def test_titles_and_sources_cannot_command_a_terminal(monkeypatch, capsys, folder, tmp_path) -> None:
     text = json.dumps(f"before{ESCAPES}after")
     (folder / "problem.toml").write_text(PLAIN.replace('"T"', text) + f'[exclude]\n"T2-1" = {text}\n')
-    edit(folder / "problem.toml", "identify", f"source = {text}\nidentify")
+    edit(folder / "problem.toml", 'identify = ["d?"', f'source = {text}\nidentify = ["*a?", "d?"')
     commands = [
         ["inspect", str(folder)],
         ["calibrate", str(folder), "--out", str(tmp_path / "out")],

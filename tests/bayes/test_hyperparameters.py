@@ -127,7 +127,7 @@ def test_sizes_come_out_as_they_were_put_in() -> None:
 
 
 def test_scatter_of_joints_is_told_from_that_of_positions() -> None:
-    wide = [measured(POSITION, drawn(seed), seed, joint=2e-4) for seed in range(3)]
+    wide = [measured(POSITION, drawn(seed), seed, joint=2e-4) for seed in range(2)]
     for problem in wide:
         learned = ro.calibrate(problem, model="auto").learned
         assert learned is not None
@@ -155,7 +155,7 @@ def test_scales_declared_wrong_by_10_hardly_matter(factor: float) -> None:
     assert np.exp(np.mean(np.log(ratio))) < 1.05
 
 
-@pytest.mark.parametrize("factor", [0.1, 1.0, 10.0])
+@pytest.mark.parametrize("factor", [0.1, 10.0])
 def test_deviations_are_not_taken_for_scatter_because_lengths_and_angles_differ(factor: float) -> None:
     """Seven axes, ten configurations: with one size for both all of it was noise, 18 times worse than least squares."""
     arm = ro.study.simulated_arm(seed=1004, count=10, offset=np.radians(1.0 * ((1004 // 3) % 2)))

@@ -152,7 +152,7 @@ def test_too_few_passes_are_said() -> None:
     problem, _ = simulated(size=10.0)
     result = ro.calibrate(problem, ro.tikhonov, 1.0, max_iterations=1)
     assert not result.converged
-    assert "Not converged" in str(result)
+    assert "Not converged" in result.message
 
 
 def test_fewer_equations_than_parameters_need_a_penalty() -> None:

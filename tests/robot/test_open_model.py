@@ -296,7 +296,7 @@ def test_columns_of_a_table_are_read_kept_and_missed(tmp_path: Path) -> None:
     model = ro.Model([warm])
     robot = replace(ARM, model=model)
     table = {f"q{i}_deg": np.degrees(Q[:, i - 1]) for i in range(1, 7)}
-    table |= {"x_mm": np.zeros(N), "y_mm": np.zeros(N), "z_mm": np.zeros(N)}
+    table |= dict(zip(("x_mm", "y_mm", "z_mm"), 1e3 * measured(blank(), SIGMA).data.blocks[0].y.T, strict=True))
     full = table | {"temperature_K": np.arange(N), "hours": np.ones(N)}
     data = ro.read_data(full, robot, {"position_mm": 0.05})
     assert data.take([3, 1]).blocks[0].columns["temperature"].tolist() == [3.0, 1.0]

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +12,7 @@ import rpim_opt as ro
 from rpim_opt.robot.formats.tables import write_robot
 from rpim_opt.robot.kinematics import forward_kinematics
 from tests.simulate import ARM
+from tests.test_cli import run
 
 MINE = '''
 """A gauge that reads heights, and the droop of a link."""
@@ -65,24 +64,22 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def command(*arguments: str | Path) -> subprocess.CompletedProcess[str]:
-    return subprocess.run([sys.executable, "-m", "rpim_opt", *map(str, arguments)], capture_output=True, text=True)
-
-
-def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path) -> None:
-    refused = command("calibrate", folder)
-    assert refused.returncode == 2
-    assert "'mine:height', code of mine.py, accepted" in refused.stderr
-    assert "--allow-code" in refused.stderr
+def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path, monkeypatch, capsys) -> None:
+    here = str(folder)
+    assert run(monkeypatch, "calibrate", here) == 2
+    refused = capsys.readouterr().err
+    assert "'mine:height', code of mine.py, accepted" in refused
+    assert "--allow-code" in refused
     assert not (folder / "ran").exists()
-    done = command("calibrate", folder, "--allow-code", "--out", folder, "--json")
-    assert done.returncode == 0, done.stderr
-    creep = next(each for each in json.loads(done.stdout)["parameters"] if each["name"] == "creep")
+    assert run(monkeypatch, "calibrate", here, "--allow-code", "--out", here, "--json") == 0
+    found = json.loads(capsys.readouterr().out)
+    creep = next(each for each in found["parameters"] if each["name"] == "creep")
     assert creep["identified"] == pytest.approx(RATE, rel=0.03)  # 0.01 mm of noise, 60 rows over eight hours
 
-    assert command("inspect", folder, "--allow-code").returncode == 0
-    assert "--allow-code" in command("report", folder).stderr
-    assert command("report", folder, "--allow-code").returncode == 0
+    assert run(monkeypatch, "inspect", here, "--allow-code") == 0
+    assert run(monkeypatch, "report", here) == 2
+    assert "--allow-code" in capsys.readouterr().err
+    assert run(monkeypatch, "report", here, "--allow-code") == 0
     with pytest.raises(ro.InputError, match="allow-code"):
         ro.load(folder)
     with ro.store.allow_code():
