@@ -71,6 +71,19 @@ LONG = {
 """Long cases of a test whose others are short, ``""`` for a test without cases."""
 
 
+@pytest.fixture
+def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Give reports captions alone where a chart stands: charts, which other tests draw, take most of the time."""
+    from markupsafe import Markup
+
+    from rpim_opt.report.page import Figure
+
+    def figure(draw: Any, title: str, caption: str = "", height: float = 0.0) -> Figure:
+        return Figure(Markup(), caption)
+
+    monkeypatch.setattr("rpim_opt.report.report.figure", figure)
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: Any, log: Any) -> Any:
     """Leave most tests of a module to one worker, which makes their fixtures once."""

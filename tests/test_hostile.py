@@ -146,6 +146,7 @@ def test_what_was_taken_in_silence(wrong) -> None:
 ESCAPES = "\x1b]0;owned\x07\x1b[2J\x9b31m\u202egnp\x08\r"
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_titles_and_sources_cannot_command_a_terminal(monkeypatch, capsys, folder, tmp_path) -> None:
     text = json.dumps(f"before{ESCAPES}after")
     (folder / "problem.toml").write_text(PLAIN.replace('"T"', text) + f'[exclude]\n"T2-1" = {text}\n')

@@ -167,6 +167,7 @@ def made(monkeypatch, folder, problem, *options: str) -> None:
     assert run(monkeypatch, "new", str(folder / "cell"), "--robot", "ur5e", "--data", table, *options) == 0
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
     """From a table with two columns exchanged: every command names them, and calibrating ends with code 1."""
     out = str(tmp_path / "out")

@@ -240,6 +240,7 @@ def test_neighbours_are_sought_among_the_same_kind_only():
     assert abs(apart.z) < 4
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_the_report_says_it():
     result = learned(1, compliance=BENT)
     text = re.sub("</?code>", "`", unescape(page(result)))

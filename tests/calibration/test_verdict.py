@@ -109,6 +109,7 @@ def test_python_follows_it(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
     result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0)
     result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))

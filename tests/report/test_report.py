@@ -138,6 +138,7 @@ def test_every_text_of_a_user_stays_text(evil) -> None:
         assert label in read.words
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_report_says_what_a_reader_must_know() -> None:
     stopped = ro.load("position")
     result = ro.calibrate(stopped.problem, ro.tikhonov, 1.0, max_iterations=1)
@@ -242,6 +243,7 @@ def test_it_prints(opened: Browser, tmp_path: Path) -> None:
     assert 3 <= pages <= 12
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_many_flagged_rows_are_not_all_named(monkeypatch) -> None:
     blunders = ro.load("blunders")
     result = replace(ro.calibrate(blunders.problem, ro.robust, weight=1.0), record=blunders.record)
@@ -281,6 +283,7 @@ def test_no_verdict_where_nothing_is_demanded(arm_page) -> None:
     assert "Expanded uncertainty in the workspace" in read.words
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_both_figures_are_said_where_all_rows_were_used() -> None:
     result = ro.calibration.refit_all(result_of("position"))
     words = " ".join(Reader(page(result)).words.split())

@@ -64,6 +64,7 @@ def folder(tmp_path: Path) -> Path:
     return tmp_path
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_code_of_a_folder_runs_only_where_it_is_allowed(folder: Path, monkeypatch, capsys) -> None:
     here = str(folder)
     assert run(monkeypatch, "calibrate", here) == 2

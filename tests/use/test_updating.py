@@ -168,6 +168,7 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     assert "What each selector takes" not in page  # weight 1 joins both sets of data, no other one does
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_an_update_that_released_nothing_is_reported(monkeypatch, tmp_path) -> None:
     validation = str(problems_folder() / "position" / "validation.csv")
     out = str(tmp_path / "new")
