@@ -489,34 +489,29 @@ class Loss:
         proportional = constant == 0 and abs(three - 3 * one) <= 1e-12 * abs(three)
         return one if proportional else np.nan
 
-    @cached_property
-    def _by_both(self) -> tuple[Evaluation, Evaluation]:
-        return evaluation(self.entries, self.variable), evaluation(self.entries, self.threshold)
-
-    def at_threshold(self, v: Array, t: float) -> tuple[Array, Array]:
-        """Return values f_i(v_i, t) (M,) and their slopes by v_i (M,)."""
+    def at_threshold(self, t: float) -> Evaluation:
+        """Return how f_i(v_i, t) and its slope by v_i are evaluated at numbers v (M,)."""
         with self._lock:
             self.threshold.save_value(np.array(t))
-            values, slopes = self._by_both[0](v)
-        return values * np.ones(len(v)), slopes * np.ones(len(v))
+            return evaluation(self.entries, self.variable)
 
-    def by_threshold(self, v: Array, t: float) -> Array:
-        """Return the slopes of f_i(v_i, t) by t, (M,)."""
+    def by_threshold(self, v: Array) -> Evaluation:
+        """Return how f_i(v_i, t) and its slope by t are evaluated at a number t."""
         with self._lock:
             self.variable.save_value(v)
-            slopes = self._by_both[1](t)[1]
-        return np.asarray(slopes * np.ones(len(v)))
+            return evaluation(self.entries, self.threshold)
 
     def best(self, v: Array) -> tuple[float, float]:
         """Return the least value at v (M,) and the threshold there; infinity where there is none."""
+        at: Any = self.by_threshold(v)
 
         def rise(t: float) -> float:
-            return self.rate + float(self.by_threshold(v, t).sum())
+            return self.rate + float(np.sum(at(t)[1]))
 
         for far in (1.0 + np.abs(v).max()) * 10.0 ** np.arange(DECADES):
             if rise(-far) <= 0 <= rise(far):
                 t = float(bisect(rise, -far, far, xtol=EXACT * far, rtol=EXACT))
-                return self.rate * t + float(self.at_threshold(v, t)[0].sum()), t
+                return self.rate * t + float(np.sum(at(t)[0])), t
         return np.inf, np.nan
 
     def some(self, which: np.ndarray) -> tuple[Any, Any]:
@@ -648,11 +643,9 @@ def evaluation(e: Any, v: Any) -> Evaluation:
     """Return how an expression e that is `entrywise` in v is evaluated, by forward differentiation."""
     if e is v:
         return lambda x: (x, 1.0)
-    if not e.variables():
+    if not _has(e, v):
         number = np.ravel(e.value) if e.size > 1 else np.squeeze(e.value)
         return lambda x: (number, 0.0)
-    if not _has(e, v):
-        return lambda x: (np.ravel(e.value) if e.size > 1 else np.squeeze(e.value), 0.0)
     norm = _is_norm(e)
     inner = [evaluation(a, v) for a in (e.args[0].args if norm else e.args)]
     name = "norm" if norm else type(e).__name__

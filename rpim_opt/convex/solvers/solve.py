@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import threading
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 
@@ -154,12 +155,12 @@ def _coupled(
     z = warm.z
     if z is None:
         z = warm.program(n + 1).solve(rows.squares.damped(damping), weight).x[at]
-    tangent = _tangent(loss, rows, rows.A @ z - rows.b)
+    tangent = Tangent(loss, rows, rows.A @ z - rows.b)
     if not np.isfinite(tangent.value):
         return _all_rows(loss, rows, warm, weight, squares, damping)
     working = np.sort(tangent.near[: max(4 * n, warm.count or np.count_nonzero(tangent.pull))])
     for _ in range(GENERATIONS):
-        outside = np.ones(len(tangent.near), dtype=bool)
+        outside = np.ones(loss.variable.size, dtype=bool)
         outside[working] = False
         slope = np.where(rows.spread(outside), tangent.slope, 0.0)
         small = _some(loss, rows, warm, working, len(terms.y))
@@ -174,7 +175,7 @@ def _coupled(
             continue
         r = rows.A @ point.x[at] - rows.b
         bound = part.value(point.rest) + float(slope @ r) + float(tangent.constant[outside].sum())
-        there = _tangent(loss, rows, r)
+        there = Tangent(loss, rows, r)
         if there.value - bound <= GAP * max(abs(bound), 1.0):
             pull = np.zeros(len(r))
             pull[rows.places(working)] = point.slope
@@ -202,35 +203,29 @@ def _some(loss: Loss, rows: Rows, warm: Warm, working: np.ndarray, squares: int)
     return made
 
 
-class Tangent(NamedTuple):
-    """The value of a loss with a threshold at some point, and tangents of its entries there, (N,) each.
+class Tangent:
+    """The value of a loss with a threshold at a residual (m,), and tangents of its entries there, (N,) each.
 
-    ``pull`` are slopes by the entries and ``slope`` (m,) by the equations; ``near`` are the entries in the order of
-    their distance from a kink.
+    ``pull`` are slopes by the entries and ``slope`` (m,) by the equations.
     """
 
-    value: float
-    constant: Array
-    pull: Array
-    slope: Array
-    by_threshold: Array
-    near: np.ndarray
+    def __init__(self, loss: Loss, rows: Rows, r: Array):
+        self.v, one = rows.entries(r), np.ones(loss.variable.size)
+        self.value, t = loss.best(self.v)
+        self._entries, self._positive = loss.at_threshold(t), loss.positive
+        values, pull = self._entries(self.v)
+        self.pull, self.by_threshold = one * pull, one * loss.by_threshold(self.v)(t)[1]
+        self.constant = values - pull * self.v - self.by_threshold * t
+        self.slope = self.pull
+        if loss.positive:
+            self.slope = rows.spread(self.pull / np.maximum(self.v, TINY)) * r
 
-
-def _tangent(loss: Loss, rows: Rows, r: Array) -> Tangent:
-    """Return the tangents at a residual (m,)."""
-    v = rows.entries(r)
-    value, t = loss.best(v)
-    values, pull = loss.at_threshold(v, t)
-    by_threshold = loss.by_threshold(v, t)
-    slope = pull
-    if loss.positive:
-        slope = rows.spread(pull / np.maximum(v, TINY)) * r
-    far = np.full(len(v), np.inf)
-    most = np.abs(v).max() + abs(t)
-    for h in np.geomspace(most, 1e-8 * most, 20):
-        low = np.maximum(v - h, 0.0) if loss.positive else v - h
-        bent = np.abs(loss.at_threshold(v + h, t)[1] - loss.at_threshold(low, t)[1])
-        far[bent > INACTIVE * bent.max(initial=0.0)] = h
-    constant = values - pull * v - by_threshold * t
-    return Tangent(value, constant, pull, slope, by_threshold, np.argsort(far, kind="stable"))
+    @cached_property
+    def near(self) -> np.ndarray:
+        """The entries (N,) in the order of their distance from a kink."""
+        far = np.full(len(self.v), np.inf)
+        for h in np.abs(self.v).max() * np.geomspace(2, 1e-8, 20):
+            low = np.maximum(self.v - h, 0.0) if self._positive else self.v - h
+            bent = np.abs(self._entries(self.v + h)[1] - self._entries(low)[1]) * np.ones(len(far))
+            far[bent > INACTIVE * bent.max(initial=0.0)] = h
+        return np.argsort(far, kind="stable")
