@@ -63,7 +63,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
 def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     assert flagged(0) == ["Done."]
     eight = flagged(8)[0]
-    assert eight.startswith("Outlying rows: r0 (10 sigma, 1.23 mm), ")
+    assert eight.startswith("Outlying rows: r0 (10 sigma, residual 1.23 mm), ")
     assert "r7 (17 sigma" in eight
     assert "more" not in eight
     eleven = flagged(11)
