@@ -111,6 +111,9 @@ def _headline(content: Content) -> Iterator[Block]:
             text = f"expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
         text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
         yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
+    elif result.verdict.delivered:
+        text = "the fit gives no reason against using this robot; no limit to accept it by is stated."
+        yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
     yield "notes", [*result.verdict.reasons, *result.verdict.beside(result.causes)]
     name, nominal, identified = summary.headline_errors(result)
@@ -230,13 +233,18 @@ def _parameters(content: Content) -> Iterator[Block]:
     free = result.problem.parameters.free
     half = np.full(len(result.x), np.nan)
     note = "No intervals: the formulation has no covariance."
-    head = ["parameter", "nominal", "identified", "deviation", "U", "tolerance"]
+    head = ["parameter", "nominal", "identified", "deviation", "U", "u, noise", "u, prior", "tolerance"]
+    by_cause = np.full((len(result.x), 2), np.nan)
     with contextlib.suppress(InputError):
         uncertainty = Uncertainty(result)
         half = uncertainty.coverage_factor * np.sqrt(np.diag(result.covariance))
+        by_cause = np.sqrt(np.column_stack([np.diag(C) for C in (result.spread.noise, result.spread.prior)]))
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
-        note = f"U = k u: expanded uncertainty ({k}, 95 %) from measurement noise and prior."
+        note = (
+            f"Uncertainty budget: standard uncertainties u from measurement noise and prior; U = k u, of both, is the "
+            f"expanded uncertainty ({k}, 95 %)."
+        )
     tolerance = plot.active_tolerance(result)
     held = {each.name for each in result.held}
     rows = []
@@ -245,10 +253,12 @@ def _parameters(content: Content) -> Iterator[Block]:
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in held:
             name += ", at its bound"
-        spread = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
+        budget = ["", "", ""]
+        if np.isfinite(half[i]):
+            budget = [f"±{half[i] / si:.4f}", *(f"{u / si:.4f}" for u in by_cause[i])]
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
-        rows.append([name, *figures, spread, bound])
+        rows.append([name, *figures, *budget, bound])
     if not np.isfinite(tolerance).any():
         head = head[:-1]
         rows = [row[:-1] for row in rows]
@@ -382,6 +392,7 @@ def _provenance(content: Content) -> Iterator[Block]:
         head = ["calibration", "made", "rows", "changed since", "digest"]
         yield "table", Table("Earlier calibrations that are the prior", head, earlier, prose=True)
     yield "text", ["All figures on this page were computed from the calibration's measurements and parameters."]
+    yield "facts", [(who, f"{'_' * 30} date {'_' * 12}") for who in ("Calibrated by", "Approved by")]
 
 
 def _changes(each: Earlier) -> str:
