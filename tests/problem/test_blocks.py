@@ -306,4 +306,4 @@ def test_storage_decides_nothing(formulation: str, rule: str, count: int) -> Non
         there, here = ro.calibrate(table, formulation, rule), ro.calibrate(blocks, formulation, rule)
     assert here.converged == there.converged
     assert here.weight == pytest.approx(there.weight, rel=1e-5)  # sums in another order, through an interior point
-    np.testing.assert_allclose(here.z, there.z, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(here.z, there.z, rtol=0, atol=2e-6)
