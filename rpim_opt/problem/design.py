@@ -341,7 +341,7 @@ class Observability(Brief):
         Largest over smallest singular value that is not zero.
     raw_condition
         |U| |U^-1| of the Jacobian in millimetres and radians, neither whitened nor scaled (paper, Eq. 24);
-        infinite or above 1e15 where it is singular.
+        infinite where it is singular.
 
     Examples
     --------
@@ -417,6 +417,7 @@ def observe(problem: Source) -> Observability:
         configurations += len(np.unique(part.data.configuration))
         U = reduced_rows(part.jacobian(x) * units, U)
     raw = np.linalg.svd(U, compute_uv=False)
+    tiny = 1e-15 * raw[0]  # rounding, another on every processor
     redundant, base = _combinations(A, rank, free, blind)
     return Observability(
         names=free.names,
@@ -427,7 +428,7 @@ def observe(problem: Source) -> Observability:
         redundant=redundant,
         base=base,
         condition=float(s[0] / s[rank - 1]),
-        raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > 0 else float("inf"),
+        raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > tiny else float("inf"),
     )
 
 
