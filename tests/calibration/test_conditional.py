@@ -84,8 +84,8 @@ def test_a_derivative_that_is_not_the_residuals_certifies_nothing() -> None:
     assert certified(ro.tikhonov, right, 1.0, result.z, 1.0, residual=residual).holds(result.z)
 
 
-@pytest.mark.parametrize("name", ["position", "paper_arm", "rank_deficient", "pose", "distance", "scara"])
-@pytest.mark.parametrize("bound", [0.05, 0.3, 1.0, 3.0])
+@pytest.mark.parametrize("name", ["paper_arm", "rank_deficient", "pose", "distance"])
+@pytest.mark.parametrize("bound", [0.05, 1.0])
 @pytest.mark.parametrize("kind", ["slack", "bound", "norm"])
 def test_variables_of_ones_own_in_constraints_are_solved(name: str, bound: float, kind: str) -> None:
     def constraint(z: Any, _: Any) -> list[Any]:
