@@ -7,7 +7,6 @@ import importlib
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from functools import cache
 from graphlib import TopologicalSorter
 from types import ModuleType
@@ -72,18 +71,21 @@ def tree(module: str) -> ast.Module:
     return ast.parse(MODULES[module].read_text(encoding="utf-8"))
 
 
-def imported(module: str) -> Iterator[str]:
-    """Yield the modules that a module imports, also inside functions and for types alone."""
+@cache
+def imported(module: str) -> list[str]:
+    """Return the modules that a module imports, also inside functions and for types alone."""
+    found = []
     for node in ast.walk(tree(module)):
         if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
+            found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{module}: imports are absolute"
             name = node.module or ""
             # ``from rpim_opt.convex import select`` imports a module, too
             inner = [f"{name}.{alias.name}" for alias in node.names]
             modules = [each for each in inner if each.removeprefix("rpim_opt.") in MODULES]
-            yield from modules or [name]
+            found += modules or [name]
+    return found
 
 
 @cache

@@ -603,6 +603,7 @@ DOCUMENTS = {
 }
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("name", DOCUMENTS)
 def test_every_command_has_a_document(monkeypatch, capsys, desk, name) -> None:
     arguments, keys = DOCUMENTS[name]

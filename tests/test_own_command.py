@@ -62,7 +62,6 @@ def test_a_command_that_cannot_be_loaded_does_not_hide_the_others(folder: Path) 
     assert done.returncode == 0, done.stderr
     assert "cannot be loaded: No module named 'no_such_module'" in done.stdout
     assert sum(line.startswith("  robots ") for line in done.stdout.splitlines()) == 1
-    assert run(folder, "robots").returncode == 0
 
 
 def test_an_interrupt_while_commands_are_loaded_is_one_word(tmp_path: Path) -> None:

@@ -98,6 +98,7 @@ for _page, _snippet in BLOCKS:
         SHELL.setdefault(_page, []).append(_snippet)
 
 
+@pytest.mark.usefixtures("undrawn")
 @pytest.mark.parametrize("page", SHELL)
 def test_commands(page: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """The commands of a page, one after the other in one folder, print all of what it shows."""

@@ -378,7 +378,7 @@ def test_a_byte_of_a_journal_that_changed_costs_no_result(toy, tmp_path: Path) -
     fresh, _ = run_study("toy", out=tmp_path / "fresh")
     rng = np.random.default_rng(0)
     refused = 0
-    for _ in range(40):
+    for _ in range(15):
         content = bytearray(before)
         content[rng.integers(len(content))] ^= 1 << int(rng.integers(8))
         journal.write_bytes(content)
