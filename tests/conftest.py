@@ -54,6 +54,7 @@ LONG = {
         "irb120-joint 3 coupled to 2",
     ),
     "tests/calibration/test_causes.py::test_another_unit_from_halfway_on_is_named": ("",),
+    "tests/store/test_problems.py::test_a_simulated_problem_reproduces_its_reference": ("camera",),
     "tests/test_commands.py::test_two_units_that_are_wrong_are_both_named": ("",),
     "tests/calibration/test_causes.py::test_misread_orientations_are_named": ("",),
     "tests/calibration/test_causes.py::test_a_table_in_the_standard_convention_is_named": ("",),

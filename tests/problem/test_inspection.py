@@ -28,20 +28,11 @@ def changed(name: str, q=lambda q: q, y=lambda y: y) -> ro.CalibrationProblem:
     return problem.on(replace(problem.data, blocks=blocks))
 
 
-def flip(i: int):
-    def turned(q: np.ndarray) -> np.ndarray:
-        q[..., i] *= -1
-        return q
-
-    return turned
-
-
 MISTAKES = {
     "degrees as radians": ("position", {"q": np.degrees}, "degrees, not radians"),
     "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
     "millimetres as inches": ("position", {"y": lambda y: 25.4 * y}, "in mm, not inches"),
     "a frame flipped": ("markers", {"y": lambda y: y * [1, -1, 1]}, "mirrored"),
-    "joint 3 the other way": ("seven_axis", {"q": flip(2)}, "joint 3 reversed"),
 }
 
 
