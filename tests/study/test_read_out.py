@@ -119,7 +119,7 @@ def test_of_many_methods_the_best_have_a_profile_of_their_own() -> None:
 def test_problems_come_as_a_pair_or_as_a_file() -> None:
     pair = (POSITION.problem, POSITION.validation)
     (alone,) = sources_of(pair)
-    assert (alone.label, alone.instance(0).problem) == ("problem", POSITION.problem)
+    assert (alone.label, alone.instance(0).problem) == ("ABB IRB 120-3/0.58", POSITION.problem)
     (file,) = sources_of(ROOT / "problems" / "position" / "problem.toml")
     assert file.label == "position"
 
