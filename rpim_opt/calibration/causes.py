@@ -21,10 +21,11 @@ from rpim_opt.problem.diagnosis import (
     moved_far,
     odd_columns,
     part_way,
-    rounded_joints,
+    rounded,
     rows_without_values,
     shared_rows,
     transmission,
+    unrelated_rows,
 )
 from rpim_opt.problem.misreadings import Better, better_reading, lost_row
 from rpim_opt.problem.problem import CalibrationProblem
@@ -113,10 +114,10 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
     found = found or list(transmission(problem, result.x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
-    found = found or list(rounded_joints(problem, error))
+    found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be
         return found
-    return list(part_way(ordered)) or list(odd_columns(problem))
+    return list(part_way(ordered)) or list(odd_columns(problem)) or list(unrelated_rows(problem, error))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

@@ -52,6 +52,10 @@ FLAT = 1e-3
 """A coordinate that spreads less than this part of another one is hardly measured."""
 FEWEST = 6
 """Rows on either side of a change, or of which copies are told."""
+BEYOND_REACH = 3.0
+"""Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
+UNRELATED = 0.5
+"""Part of the spread of positions that a fit leaves where joint values do not explain them."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
@@ -387,6 +391,14 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
             labels = [data.label[i] for i in block.row[same & (y[:, 0] == value)]]
             what = f"{_rows(labels, 'has', 'have')} {value:g} for every measured coordinate"
             yield f"{what}: no measurement? Leave out what is none ([exclude])."
+        reach = max(float(np.abs(arm.mdh[:, [1, 3]]).sum()) for arm in problem.arms.values())
+        away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
+        labels = [data.label[i] for i in block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]]
+        if labels:
+            yield (
+                f"{_rows(labels, 'is', 'are')} farther from the others than the arm is long: was a decimal point lost, "
+                "or is it another unit?"
+            )
 
 
 def _rows(labels: list[str], of_one: str, of_several: str) -> str:
@@ -486,8 +498,19 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
         )
 
 
-def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
-    """Say whether joint values are rounded so that this explains the RMS error [m] of a fit."""
+def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
+    """Say whether joint or measured values are rounded so that this explains the RMS error [m] of a fit."""
+    for block in problem.data.blocks:
+        lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
+        unit = _rounded_to(1e3 * block.y[:, lengths])
+        made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
+        if ALIKE[0] * made < error < ALIKE[1] * made:
+            yield (
+                f"measured values are rounded to {unit.max():g} mm: that alone contributes {three_digits(1e3 * made)} "
+                f"mm, the residual RMS is {three_digits(1e3 * error)} mm: export more decimals, or state that "
+                "as their noise."
+            )
+            return
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
@@ -503,6 +526,20 @@ def rounded_joints(problem: CalibrationProblem, error: float) -> Iterator[str]:
                 "export them with more decimals."
             )
             return
+
+
+def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
+    """Say that the RMS error [m] of a fit is nearly that of positions of which nothing is known."""
+    points = points_of(problem)
+    if points is None:
+        return
+    spread = float(np.sqrt(np.sum(np.var(points.y, axis=0))))
+    if error > UNRELATED * spread:
+        yield (
+            f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, their "
+            f"spread is {three_digits(1e3 * spread)} mm): do the rows of the two belong together? Join them by a "
+            "column that both have, or by time."
+        )
 
 
 def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
@@ -538,6 +575,19 @@ def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
             unsigned += [*("xyz" if y.min() >= 0 else "")]
         if unsigned and len(q) >= 2 * FEWEST:
             yield f"no value of column {joined(unsigned)} is negative: were signs lost?"
+
+
+def _rounded_to(values: Array) -> Array:
+    """Return the units (N, c) that values are rounded to: 100, 10 or 1 for all, or their last of 3 or 4 digits."""
+    exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
+    for unit in (
+        *(np.full(values.shape, each) for each in (100.0, 10.0, 1.0)),
+        10 ** (exponents - 2),
+        10 ** (exponents - 3),
+    ):
+        if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < 1e-6:
+            return unit
+    return np.zeros(values.shape)
 
 
 def decimals_of(values: Array) -> int | None:

@@ -179,6 +179,10 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
 
     turning = np.array(robot.joint_dimensions) == "angle"
     eye = np.eye(robot.dof)
+    remedy = "sum them up from row to row"
+    yield Reading(
+        "joint values read as absolute, not as increments", remedy, lambda of: replace(of, q=np.cumsum(of.q, axis=0))
+    )
     for factor, (unit, remedy) in ANGLES.items():
         yield of(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
     for (factor, (unit, _)), i in product(list(ANGLES.items())[:2], np.flatnonzero(turning)):
@@ -212,12 +216,21 @@ def _of_positions() -> Iterator[Reading]:
         for axis, of_axis in zip("xyz", np.eye(3), strict=True):
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
+    remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
+    yield Reading("columns x, y, z that are azimuth, elevation and distance", remedy, _from_angles)
     remedy = "change the sign of one coordinate, or exchange two"
     yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
 
 
 def _scaled(what: str, remedy: str, factors: Array | float) -> Reading:
     return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
+
+
+def _from_angles(points: Points) -> Points:
+    azimuth, elevation = np.radians(points.y[:, :2].T / 1e-3)  # degrees were read as millimetres
+    flat = np.cos(elevation)
+    directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+    return replace(points, y=points.y[:, [2]] * directions)
 
 
 def _of_poses() -> Iterator[Reading]:

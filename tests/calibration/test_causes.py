@@ -12,7 +12,7 @@ from rpim_opt.calibration import likely_causes
 from rpim_opt.calibration.causes import _in_table_order
 from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together
-from rpim_opt.problem.misreadings import lost_row
+from rpim_opt.problem.misreadings import better_reading, lost_row
 from tests.calibration import mistakes
 from tests.calibration.mistakes import (
     COUNT,
@@ -352,3 +352,20 @@ def test_a_constant_error_of_distances_is_named() -> None:
     result = ro.calibrate(problem.on(replace(problem.data, blocks=blocks)))
     assert not result.verdict.delivered
     assert "measured distances are 4.7" in likely_causes(result)[1]
+
+
+def angles_of(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Azimuth and elevation in degrees, written in columns of millimetres."""
+    azimuth, elevation = np.arctan2(y[:, 1], y[:, 0]), np.arcsin(y[:, 2] / np.linalg.norm(y, axis=1))
+    return 1e-3 * np.degrees(azimuth), 1e-3 * np.degrees(elevation)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "named"),
+    [
+        (joints(lambda q: np.diff(q, axis=0, prepend=0.0)), "not as increments"),
+        (values(lambda y: np.column_stack([*angles_of(y), np.linalg.norm(y, axis=1)])), "azimuth, elevation and dist"),
+    ],
+)
+def test_increments_and_angles_are_named(wrong, named: str) -> None:
+    assert named in better_reading(wrong(simulated_arm("ur5e"))).sentence

@@ -8,7 +8,14 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import contact_sentences, moved_far, rounded_joints, shared_rows
+from rpim_opt.problem.diagnosis import (
+    contact_sentences,
+    moved_far,
+    rounded,
+    rows_without_values,
+    shared_rows,
+    unrelated_rows,
+)
 from tests.simulate import simulated
 
 
@@ -51,21 +58,41 @@ def test_rows_of_the_validation_set_that_are_copies_are_named() -> None:
 
 def test_where_no_points_are_measured_nothing_is_suspected() -> None:
     distance = ro.load("distance").problem
-    assert list(rounded_joints(distance, 1e-3)) == []
+    assert list(rounded(distance, 1e-3)) == []
     assert list(moved_far(distance)) == []
     few = simulated(("theta2",), 8)[0]
     assert list(moved_far(few)) == []
 
 
-def test_rounded_joints_are_named_where_that_explains_the_fit() -> None:
+def test_rounded_values_are_named_where_that_explains_the_fit() -> None:
     problem, _ = simulated(("theta2",), 30)
+    y = problem.data.blocks[0].y
     q = np.radians(np.degrees(problem.data.q).round(1))
-    rounded = problem.on(ro.Dataset.of(q, problem.data.blocks[0].y, 5e-5))
-    assert list(rounded_joints(rounded, 10.0)) == []  # metres are not explained by tenths of a degree
-    made = [size for size in np.geomspace(1e-5, 1e-1, 60) if list(rounded_joints(rounded, float(size)))]
+    coarse = problem.on(ro.Dataset.of(q, y, 5e-5))
+    assert list(rounded(coarse, 10.0)) == []  # metres are not explained by tenths of a degree
+    made = [size for size in np.geomspace(1e-5, 1e-1, 60) if list(rounded(coarse, float(size)))]
     assert made
     assert 1e-4 < np.median(made) < 3e-3
-    assert list(rounded_joints(problem, float(np.median(made)))) == []
+    assert list(rounded(problem, float(np.median(made)))) == []
+    (text,) = rounded(problem.on(ro.Dataset.of(problem.data.q, y.round(2), 5e-5)), 4e-3)
+    assert text.startswith(
+        "measured values are rounded to 10 mm: that alone contributes 5 mm, the residual RMS is 4 mm"
+    )
+
+
+def test_rows_that_do_not_belong_together_are_named() -> None:
+    problem, _ = simulated(("theta2",), 30)
+    assert list(unrelated_rows(problem, 0.05)) == []
+    (text,) = unrelated_rows(problem, 1.0)
+    assert "do the rows of the two belong together?" in text
+
+
+def test_a_lost_decimal_point_is_named() -> None:
+    problem, _ = simulated(("theta2",), 30)
+    block = problem.data.blocks[0]
+    far = np.where(np.arange(30)[:, None] == 4, 1e3 * block.y, block.y)
+    (text,) = rows_without_values(problem.on(replace(problem.data, blocks=(replace(block, y=far),))))
+    assert text.startswith(f"row {problem.labels[4]} is farther from the others than the arm is long")
 
 
 def test_readings_of_one_configuration_are_said_to_agree() -> None:
