@@ -34,6 +34,8 @@ DIFFERENCE = 1e-4
 """Change of a solution, in scales, over which it is differentiated."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
+PROXIMAL = 1e-7
+"""Weight of the distance from the last minimum, beside the mean sensitivity, where the solver fails without it."""
 STATUS = {
     "PrimalInfeasible": "infeasible",
     "AlmostPrimalInfeasible": "infeasible_inaccurate",
@@ -574,8 +576,7 @@ class Program(Brief):
         """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
         try:
             with phase("solve"):
-                loss, rows, squares = self.structure.loss, self._rows, self._squares
-                found = minimum(loss, rows, self._warm, weight, squares, damping, accuracy)
+                found = self._minimum(weight, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
@@ -584,6 +585,19 @@ class Program(Brief):
             _, s, V = self.model.svd
             z = z - V[s == 0].T @ (V[s == 0] @ z)
         return self._at(z, weight, self._duals(found), found.iterations)
+
+    def _minimum(self, weight: float, damping: Damping | None, accuracy: float) -> Point:
+        """Return the minimum by the structure of the loss; where rounding stops the solver, by a proximal step."""
+        of = self.structure.loss, self._rows, self._warm, weight, self._squares
+        try:
+            return minimum(*of, damping, accuracy)
+        except Unsolved as error:
+            if damping is not None or str(error) in STATUS:
+                raise
+        A = self.rows[0]
+        n = A.shape[1]
+        centre = np.zeros(n) if self._warm.z is None else self._warm.z
+        return minimum(*of, Damping(centre, np.full(n, PROXIMAL * np.linalg.norm(A) / np.sqrt(n))))
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""

@@ -162,3 +162,43 @@ def test_reml_says_what_it_cannot_choose() -> None:
     chosen = ro.reml(ro.convex.pose(ro.tikhonov, sphere.linearize(np.zeros(len(sphere.parameters.free)))))
     assert (chosen.weight, chosen.interior) == (1.0, False)
     assert "stated noise and scales are used" in chosen.note
+
+
+RULES = [ro.l_curve, ro.corner, ro.k_fold, ro.leave_one_out, ro.two_step]
+
+
+@pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)
+def test_a_weight_at_which_the_solver_fails_is_skipped(rule: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    solve, failed = ro.convex.Program.solve, []
+
+    def failing(program: ro.convex.Program, weight: float, **options: Any) -> ro.convex.Estimate:
+        if not failed or weight == failed[0]:
+            failed.append(weight)
+            raise ro.NoSolutionFound("minimax", weight, "NumericalError")
+        return solve(program, weight, **options)
+
+    program = ro.convex.pose(ro.minimax, model())
+    monkeypatch.setattr(ro.convex.Program, "solve", failing)
+    choice = rule(program)
+    assert failed
+    assert choice.weight not in failed
+    assert rule is ro.two_step or "1 weight skipped, where the solver failed" in choice.note
+    assert len(choice.weights) == len(choice.score)
+    assert np.isfinite(choice.score).all()
+    monkeypatch.setattr(ro.convex.Program, "solve", lambda *given, **options: failing(given[0], failed[0]))
+    with pytest.raises(ro.NoSolutionFound):
+        rule(program)
+
+
+def test_a_tiny_weight_of_redundant_parameters_is_no_failure() -> None:
+    problem = ro.load("position").problem
+    x = (
+        problem.parameters.free.scale
+        * np.random.default_rng(0).normal(size=(2, len(problem.parameters.free)))[1]
+        * 1e-3
+    )
+    m = problem.linearize(x)
+    absolute = ro.Formulation("L1", loss=cp.norm1, penalty=cp.sum_squares)
+    program = ro.convex.pose(absolute, m.scaled(np.where(m.group == 19, 0.0, 1.0)))
+    path = program.path(np.geomspace(1e-12, 1e-6, 13))
+    assert np.ptp([estimate.objective for estimate in path]) < 1e-4

@@ -8,7 +8,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.program import Estimate, Program
-from rpim_opt.convex.rules.selection import Selection, least_between, on_squares, weight_grid
+from rpim_opt.convex.rules.selection import Selection, least_between, on_squares, skipped, solved, weight_grid
 
 SLOWEST = 1e-200
 """Squared speed below which a curve stands still."""
@@ -36,12 +36,17 @@ def l_curve(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1.8e-05', True)
     """
+    failed = 0
     if program.closed_form:
         weights = weight_grid(program)
         score = _curvature(program, weights)
     else:
-        weights = weight_grid(program, GRID)
-        score = menger(_points(program.path(weights)))
+        every = weight_grid(program, GRID)
+        points = _points(solved(program, every))
+        kept = np.isfinite(points[:, 0])
+        failed = int(np.count_nonzero(~kept))
+        weights = every[kept]
+        score = menger(points[kept])
     best = int(np.argmax(score))
     if not program.linear_penalty:
         best = _first_corner(score)
@@ -51,6 +56,7 @@ def l_curve(program: Program) -> Selection:
         note = (
             f"the L-curve has no corner: the weight is the {'lower' if best == 0 else 'upper'} edge of "
             f"{weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a weight of your own, may serve better"
+            f"{skipped(failed)}"
         )
         return Selection(float(weights[best]), "l_curve", weights, score, interior=False, note=note)
     weight = float(weights[best])
@@ -58,7 +64,7 @@ def l_curve(program: Program) -> Selection:
         refined, opposite = least_between(lambda tried: -_curvature(program, tried), weights, best)
         if -opposite > score[best]:  # the search sees one maximum of several
             weight = refined
-    return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve")
+    return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve" + skipped(failed))
 
 
 def _first_corner(score: Array) -> int:
@@ -71,9 +77,9 @@ def _first_corner(score: Array) -> int:
     return int(sharp[0]) if len(sharp) else int(np.argmax(score))
 
 
-def _points(estimates: list[Estimate]) -> Array:
-    """Return ln |A z - b| and ln |z| of estimates, (K, 2)."""
-    squares = [[max(each.loss, TINY), max(each.penalty, TINY)] for each in estimates]
+def _points(estimates: list[Estimate | None]) -> Array:
+    """Return ln |A z - b| and ln |z| of estimates, (K, 2); NaN of those that there are not."""
+    squares = [[max(each.loss, TINY), max(each.penalty, TINY)] if each else [np.nan, np.nan] for each in estimates]
     return 0.5 * np.log(squares)
 
 
@@ -138,16 +144,19 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     def curvature(*places: float) -> float:
         for t in places:
             if t not in seen:
-                seen[t] = _points(program.path([np.exp(t)]))[0]
+                seen[t] = _points(solved(program, [float(np.exp(t))]))[0]
         return float(menger(np.array([seen[t] for t in places]))[1])
 
     best = _by_golden_sections(curvature, low, high, tolerance)
-    order = sorted(seen)
+    order = [t for t in sorted(seen) if np.isfinite(seen[t]).all()]
+    if not order:
+        program.solve(float(np.exp(best)))  # raises what the solver says
     points = np.array([seen[t] for t in order])
     interior = bool(low + 0.1 < best < high - 0.1)
     note = "corner of the L-curve by golden sections"
     if not interior:
         note = "the search ended at an edge: the L-curve has no corner"
+    note += skipped(len(seen) - len(order))
     return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
 
 

@@ -12,7 +12,17 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.rules.curve import l_curve
 from rpim_opt.convex.rules.scores import Rule, Squared, influence, linear_rule
-from rpim_opt.convex.rules.selection import Score, Selection, edge, on_squares, searched, weight_grid, with_rows
+from rpim_opt.convex.rules.selection import (
+    Score,
+    Selection,
+    edge,
+    on_squares,
+    searched,
+    skipped,
+    solved,
+    weight_grid,
+    with_rows,
+)
 
 SOME = 6
 """Configurations that are left out by solving, to see how exact the approximation is."""
@@ -64,8 +74,8 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     chosen = _least(program, "leave_one_out", _left_out_error(program))
     if not chosen.interior or not _approximates(program):
         return chosen
-    note = f"smallest error of configurations left out one by one, {_how_exact(program, chosen.weight)}"
-    return replace(chosen, note=note)
+    how = f"left out one by one, {_how_exact(program, chosen.weight)}"
+    return replace(chosen, note=chosen.note.replace("held out", how))
 
 
 @on_squares
@@ -117,14 +127,16 @@ def two_step(program: Program) -> Selection:
     level = _end_of_fall(program, coarse)
     fine = level * np.linspace(0.563 / 3.063, 5.063 / 3.063, 10)
     score = _left_out_error(program)(fine)
-    best = int(np.argmin(score))
+    best = int(np.nanargmin(score))
+    failed = np.isnan(score)
     interior = 0 < best < len(fine) - 1
     note = "the paper's two steps: residual norm, then held-out error"
     if not interior:
         note += (
             "; the held-out error is smallest at an edge of the ten weights, so a wider range of weights may be better"
         )
-    return Selection(float(fine[best]), "two_step", fine, score, interior, note)
+    note += skipped(int(failed.sum()))
+    return Selection(float(fine[best]), "two_step", fine[~failed], score[~failed], interior, note)
 
 
 def _end_of_fall(program: Program, weights: Array) -> float:
@@ -132,8 +144,8 @@ def _end_of_fall(program: Program, weights: Array) -> float:
     some = len(weights) if program.closed_form else AHEAD
     residual = np.empty(0)
     while len(residual) < len(weights):
-        more = program.path(weights[len(residual) : len(residual) + some])
-        residual = np.append(residual, np.sqrt([estimate.loss for estimate in more]))
+        more = solved(program, weights[len(residual) : len(residual) + some])
+        residual = np.append(residual, np.sqrt([each.loss if each else np.nan for each in more]))
         flat = residual[1:] >= 0.99 * residual[:-1]
         if flat.any():
             return float(weights[np.argmax(flat)])
@@ -159,8 +171,10 @@ def _least(program: Program, name: str, error: Score) -> Selection:
     else:
         weights, score, best = searched(error, weight_grid(program, COARSE))
     interior = 0 < best < len(weights) - 1
+    failed = np.isnan(score)
     note = "smallest error of configurations held out" if interior else edge(best)
-    return Selection(float(weights[best]), name, weights, score, interior, note)
+    note += skipped(int(failed.sum()))
+    return Selection(float(weights[best]), name, weights[~failed], score[~failed], interior, note)
 
 
 # --- errors of what is left out --------------------------------------------------------------------------------
@@ -278,7 +292,7 @@ def _approximately(program: Program) -> Predicted:
     def norms(estimate: Estimate) -> Array:
         D, U = program.derivative(estimate)
         r = model.A @ estimate.z - model.b
-        found = np.zeros(sum(len(configurations) for _, configurations in rows))
+        found = np.zeros(count)
         for places, configurations in rows:
             A = model.A[places]
             hat = np.einsum("gin,nr,gjr->ijg", A, D, U[places], optimize=True)
@@ -286,7 +300,9 @@ def _approximately(program: Program) -> Predicted:
             found[configurations] = np.linalg.norm(_solved(M, r[places.T]), axis=0)
         return found
 
-    return lambda weights: np.array([norms(estimate) for estimate in program.path(weights)])
+    count = sum(len(configurations) for _, configurations in rows)
+    nothing = np.full(count, np.nan)
+    return lambda weights: np.array([norms(each) if each else nothing for each in solved(program, weights)])
 
 
 def _how_exact(program: Program, weight: float) -> str:
@@ -323,23 +339,26 @@ class Folds:
         return self._whole.apart(self._whole.model.scaled(kept))
 
     def norms(self, weights: Array) -> Array:
-        """Return the norms (K, N) of the residuals of what is left out, in the order of the parts."""
+        """Return the norms (K, N) of the residuals of what is left out, in the order of the parts.
+
+        They are NaN at a weight at which the solver fails.
+        """
         whole, model = self._whole, self._whole.model
         idle = [whole.idle(weight) for weight in weights]
-        solved = whole.path(weights) if any(map(len, idle)) else []
+        of_all = solved(whole, weights) if any(map(len, idle)) else []
         found = []
         for k, out in enumerate(self._rows):
             program = self._kept[k] if self._kept else self._without(out)
             left_out = model.group[out]
             same: dict[float, Array] = {}
-            for there, at_rest in zip(solved, idle, strict=False):
-                if not np.isin(left_out, at_rest).all():
+            for there, at_rest in zip(of_all, idle, strict=False):
+                if there is None or not np.isin(left_out, at_rest).all():
                     continue
                 if program.objective(there.z, there.weight) <= there.objective * (1 + SAME):  # zero residuals cost none
                     same[there.weight] = there.z
-            others = program.path([weight for weight in weights if weight not in same])
-            same |= {estimate.weight: estimate.z for estimate in others}
-            Z = np.array([same[weight] for weight in weights])
+            others = solved(program, [weight for weight in weights if weight not in same])
+            same |= {each.weight: each.z for each in others if each}
+            Z = np.array([same.get(weight, np.full(model.A.shape[1], np.nan)) for weight in weights])
             squares = (Z @ model.A[out].T - model.b[out]) ** 2
             _, which = np.unique(left_out, return_inverse=True)
             sums = np.zeros((which.max() + 1, len(weights)))

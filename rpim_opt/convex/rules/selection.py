@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
 from typing import Any
@@ -10,11 +10,11 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.minimization import least
 from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.convex.expressions import cp
-from rpim_opt.convex.program import Program
+from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.problem.linear import LinearModel
 
@@ -139,6 +139,32 @@ def edge(best: int) -> str:
     return EDGES["lower" if best == 0 else "upper"]
 
 
+def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate | None]:
+    """Return the solutions at weights (K,), None where the solver fails.
+
+    NoSolutionFound where it fails at all of several, and where constraints contradict each other.
+    """
+    if program.closed_form:
+        return list(program.path(weights))
+    found: dict[float, Estimate | None] = {}
+    failure = None
+    for weight in sorted(weights, reverse=True):
+        try:
+            found[weight] = program.solve(weight)
+        except NoSolutionFound as error:
+            if error.conflict is not None:
+                raise
+            found[weight], failure = None, error
+    if failure and len(found) > 1 and not any(found.values()):
+        raise failure
+    return [found[weight] for weight in weights]
+
+
+def skipped(count: int) -> str:
+    """Return what a note adds about weights at which the solver failed."""
+    return f"; {counted(count, 'weight')} skipped, where the solver failed" if count else ""
+
+
 def with_rows(program: Program, name: str) -> LinearModel:
     """Return the model for a rule that leaves rows out, if it has its rows."""
     if program.model.stands_for is not None:
@@ -215,13 +241,14 @@ def least_between(score: Score, weights: Array, best: int) -> tuple[float, float
 def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
     """Return weights (K,), their scores and the place of the least, from a coarse grid halved about its best.
 
-    It ends where the neighbours' scores do not differ from the best's, or their weights hardly from its own.
+    It ends where the neighbours' scores do not differ from the best's, or their weights hardly from its own; or where
+    a score is NaN: there the solver failed.
     """
     weights, found = np.array(grid), score(grid)
     while True:
-        best = int(np.argmin(found))
+        best = int(np.nanargmin(found))
         around = found[max(best - 1, 0) : best + 2]
-        flat = np.ptp(around) <= SAME_SCORE * np.max(np.abs(around))
+        flat = not np.ptp(around) > SAME_SCORE * np.max(np.abs(around))
         if not 0 < best < len(weights) - 1 or flat or weights[best + 1] <= SAME_WEIGHT * weights[best - 1]:
             return weights, found, best
         between = np.sqrt(weights[best - 1 : best + 1] * weights[best : best + 2])
