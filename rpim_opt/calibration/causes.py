@@ -8,12 +8,14 @@ from typing import cast
 
 import numpy as np
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import BAD, NOISY, kept_rows, noise_ratio, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import (
+    computed_columns,
     copied_rows,
     exchanged_rows,
     left_out_together,
@@ -29,11 +31,14 @@ from rpim_opt.problem.diagnosis import (
 )
 from rpim_opt.problem.misreadings import Better, better_reading, lost_row
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.frames import settled
 
 HOPELESS = 20.0
 """Residuals over the stated noise from which something is said even if nothing explains them."""
 SCALES = 10.0
 """Scales by which a parameter of the robot may deviate."""
+LARGEST_CURVE = 0.01
+"""Standard deviation of transmission errors [rad] that no gear exceeds: real ones are below a milliradian."""
 LARGEST = {"length": 0.02, "angle": 0.05}
 """A machined and assembled robot deviates by less than this [m, rad]."""
 
@@ -73,6 +78,8 @@ def likely_causes(result: Outcome) -> list[str]:
         return []
     problem = cast(CalibrationProblem, result.problem)
     shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
+    if len(problem.arms) == 1:
+        shared += computed_columns(problem)
     if result.learned is not None:
         shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
     if result.mapping is not None:
@@ -87,7 +94,7 @@ def likely_causes(result: Outcome) -> list[str]:
         for figure, ratio in zip(figures, ratios, strict=True)
         if ratio > NOISY
     ]
-    signs += _large(result, problem)
+    signs += [*_curves(result), *_large(result, problem)]
     head: list[str] = []
     causes: list[str] = []
     if signs:
@@ -112,12 +119,33 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if better is not None:
         return [*rows_without_values(problem), better.sentence]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
-    found = found or list(transmission(problem, result.x))
+    found = found or list(transmission(*_geometry(result, problem)))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be
         return found
     return list(part_way(ordered)) or list(odd_columns(problem)) or list(unrelated_rows(problem, error))
+
+
+def _curves(result: Outcome) -> Iterator[str]:
+    """Say that transmission errors are beyond those of gears, or take up what is no transmission error."""
+    if result.learned is None or result.learned.curves is None:
+        return
+    size, ratio = result.learned.curves.size.value, result.noise_test().ratio
+    if size > LARGEST_CURVE:
+        yield f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)"
+    if ratio > NOISY:
+        yield f"residuals {three_digits(ratio)} times the stated noise, the freedom of transmission errors counted"
+
+
+def _geometry(result: Outcome, problem: CalibrationProblem) -> tuple[CalibrationProblem, Array]:
+    """Return the problem without model extensions, and its solution: curves take up ratios and scales of all kinds."""
+    added = () if result.learned is None else result.learned.added
+    if not added:
+        return problem, result.x
+    p = problem.parameters
+    alone = problem.identifying(p.identified & ~np.isin(p.names, added))
+    return alone, settled(alone)
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

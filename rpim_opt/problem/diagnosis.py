@@ -52,6 +52,8 @@ FLAT = 1e-3
 """A coordinate that spreads less than this part of another one is hardly measured."""
 FEWEST = 6
 """Rows on either side of a change, or of which copies are told."""
+LINEAR, EXACT = 13, 1e-5
+"""Coefficients of a coordinate by position and rotation of the flange, and what no measurement comes up to [m]."""
 BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
 UNRELATED = 0.5
@@ -445,6 +447,23 @@ def copied_rows(data: Dataset) -> Iterator[str]:
                 f"{copies} of {len(rows)} rows repeat others to the last digit (first {named}): copies are no "
                 "measurements, and make uncertainties too small; leave them out."
             )
+
+
+def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
+    """Say which coordinates, not all, are exact functions of the nominal robot: they were computed, not measured.
+
+    A coordinate of a point in any frame, of any reflector, is linear in position and rotation of the nominal flange.
+    """
+    points = points_of(problem)
+    if points is None or points.seen or len(points.row) < 2 * LINEAR or len(points.tools) > 1:
+        return
+    T = forward_kinematics(problem.robot, points.q)
+    X = np.column_stack([T[:, :3, 3], T[:, :3, :3].reshape(len(T), 9), np.ones(len(T))])
+    left = points.y - X @ np.linalg.lstsq(X, points.y, rcond=None)[0]
+    exact = np.sqrt(np.sum(left**2, axis=0) / (len(X) - LINEAR)) < EXACT
+    if exact.any() and not exact.all():
+        named = joined([axis for axis, k in zip("xyz", exact, strict=True) if k])
+        yield f"column {named} follows from the nominal robot to {1e3 * EXACT:g} mm: was it computed, not measured?"
 
 
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:

@@ -13,6 +13,7 @@ from rpim_opt.calibration.causes import _in_table_order
 from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together
 from rpim_opt.problem.misreadings import better_reading, lost_row
+from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from tests.calibration import mistakes
 from tests.calibration.mistakes import (
     COUNT,
@@ -369,3 +370,22 @@ def angles_of(y: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 )
 def test_increments_and_angles_are_named(wrong, named: str) -> None:
     assert named in better_reading(wrong(simulated_arm("ur5e"))).sentence
+
+
+def test_a_coordinate_that_was_computed_is_named() -> None:
+    """x and y measured, z of the nominal robot in the same frame: the fit is fair, and the robot wrong by 2 mm."""
+    problem = simulated_arm("ur5e")
+    known = problem.parameters.nominal[np.isin(problem.parameters.names, [f"base_{c}" for c in FRAME])]
+    tool = problem.parameters.nominal[np.isin(problem.parameters.names, [f"tool_{c}" for c in FRAME])]
+    flange = ro.robot.forward_kinematics(problem.robot, problem.data.blocks[0].q[:, 0])
+    z = (numeric_frame(known) @ flange @ numeric_frame(tool))[:, 2, 3]
+    causes = likely_causes(ro.calibrate(values(lambda y: np.column_stack([y[:, :2], z]))(problem)))
+    assert "column z follows from the nominal robot" in causes[-1]
+
+
+def test_a_gear_ratio_is_no_transmission_error() -> None:
+    """Curves of joint 1 take up a ratio that is 1 % off, and are wrong elsewhere."""
+    problem = joints(lambda q: q * [1.01, 1, 1, 1, 1, 1])(simulated_arm("kr6_r900"))
+    result = ro.calibrate(problem, model="auto")
+    assert not result.verdict.delivered
+    assert "joint 1 turns" in result.verdict.reasons[-1]
