@@ -308,7 +308,7 @@ def _judged(
         far = np.linalg.norm(there - said[0], axis=-1).max(axis=-1)
         others.append(Alternative(sign[i], zeros[i], _apart(there, said[0]), elsewhere[int(np.argmax(far))]))
     nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
-    left_handed = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), SHORT, zeros=True, robust=True)
+    left_handed = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), LONG, zeros=True, noise=LEAST_NOISE)
     small_zeros = np.abs(_gauged(robot, left_handed.zero[0])).max() < NEAR_ZERO
     left_first = float(left[first])
     return JointMapping(
