@@ -81,6 +81,11 @@ class Rows:
         return np.concatenate([[0], np.cumsum(self.sizes)[:-1]])
 
     @cached_property
+    def even(self) -> bool:
+        """Whether all entries have as many equations."""
+        return self.sizes is None or np.ptp(self.sizes) == 0
+
+    @cached_property
     def squares(self) -> Squares:
         """|A z - b|^2, reduced."""
         return Squares.of_factor(self.triangle)
@@ -120,7 +125,7 @@ class Rows:
 class Newton:
     """One search for the minimum of loss(A z - b) + damping(z) + weight penalty(z) subject to constraints.
 
-    ``small`` is the program of squares, penalty and constraints, ``exact`` those with so many rows as they are;
+    ``small`` is the program of squares, penalty and constraints, ``some`` those with some rows as they are;
     ``kink`` the largest jump of the loss's slope, 0 where it is smooth; ``accuracy`` the part of the loss that may be
     left.
     """
@@ -132,7 +137,7 @@ class Newton:
     weight: float
     damping: Damping | None
     kink: float
-    exact: dict[int, Small]
+    some: dict[tuple[int, int], Small]
     accuracy: float = 0.0
     steps: int = 0
     x: Array = field(default_factory=lambda: np.zeros(0))
@@ -171,7 +176,7 @@ class Newton:
         H = gram(U, wide)
         bent = np.flatnonzero(np.abs(along - across) > 1e-9 * across.max(initial=0.0))
         if len(bent):
-            if np.ptp(sizes) == 0:
+            if self.rows.even:
                 d = int(sizes[0])
                 turned = np.einsum("kd,kdn->kn", unit.reshape(-1, d)[bent], U.reshape(-1, d, U.shape[1])[bent])
             else:
@@ -317,12 +322,11 @@ class Newton:
             r = self._residual(z)
             near = self._filled(near, r)
             gradient, H = self._model(r, 0.0, near)
-            A, b = self.rows.of(near)
             small = self.small
             exact: tuple[Array, ...] = ()
             if len(near):
-                small = self._with_rows(near)
-                exact = (A, b)
+                small = with_some(self.loss, self.rows, self.penalty, near, small.rows, self.some)
+                exact = self.rows.of(near)
             try:
                 point = self._solved(z, gradient, H, small, *exact)
             except (Unsolved, np.linalg.LinAlgError):
@@ -348,27 +352,29 @@ class Newton:
 
     def _filled(self, near: np.ndarray, r: Array) -> np.ndarray:
         """Return entries and the smallest others, so many that their number comes again."""
-        if not len(near) or not self._alike:
+        if not len(near) or not (self.loss.uniform and self.rows.even):
             return near
         count = min(-(-len(near) // ROUND) * ROUND, self.loss.variable.size)
         order = np.argsort(np.abs(self.rows.entries(r)))
         return np.sort(np.concatenate([near, order[~np.isin(order, near)][: count - len(near)]]))
 
-    @property
-    def _alike(self) -> bool:
-        """Whether one small program serves any entries of a number."""
-        return self.loss.uniform and (self.rows.sizes is None or np.ptp(self.rows.sizes) == 0)
 
-    def _with_rows(self, near: np.ndarray) -> Small:
-        """Return the small program with the rows of some entries as they are."""
-        if self._alike and len(near) in self.exact:
-            return self.exact[len(near)]
-        expression, own = self.loss.some(near)
-        sizes = None if self.rows.sizes is None else self.rows.sizes[near]
-        made = Small(self.penalty, self.small.rows, Canonical(expression, [], own), sizes)
-        if self._alike:
-            self.exact[len(near)] = made
-        return made
+def with_some(
+    loss: Loss, rows: Rows, penalty: Canonical, which: np.ndarray, squares: int, kept: dict[tuple[int, int], Small]
+) -> Small:
+    """Return the small program with some entries of a loss as they are, beside so many rows of squares.
+
+    Where all entries have the same function, one program serves any entries of a number: ``kept`` has it.
+    """
+    key = len(which), squares
+    if key in kept:
+        return kept[key]
+    expression, own = loss.some(which)
+    sizes = None if rows.sizes is None else rows.sizes[which]
+    made = Small(penalty, squares, Canonical(expression, [], own), sizes)
+    if loss.uniform and rows.even:
+        kept[key] = made
+    return made
 
 
 def _poor(H: Array) -> bool:
@@ -515,9 +521,10 @@ class Loss:
         return np.inf, np.nan
 
     def some(self, which: np.ndarray) -> tuple[Any, Any]:
-        """Return the sum of some entries, and the variable (k,) of their own that it is an expression of."""
+        """Return the sum of some entries and the threshold, and the variable (k,) of their own that it is of."""
         entries, own = self._alone(which)
-        return cp.sum(entries), own
+        total = cp.sum(entries)
+        return total if self.threshold is None else total + self.threshold, own
 
     def _alone(self, which: np.ndarray) -> tuple[Any, Any]:
         """Return some of the entries (k,) as an expression of a variable of their own, and that variable."""

@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.solvers.conic import EQUILIBRATED, Canonical, Damping, Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows, kink_of
+from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows, kink_of, with_some
 
 GENERATIONS = 40
 """Working sets of entries before all rows are taken."""
@@ -31,7 +31,6 @@ class Warm:
     width: float = 0.0
     count: int = 0
     small: dict[int, Small] = field(default_factory=dict)
-    exact: dict[int, Small] = field(default_factory=dict)
     direct: dict[int, Small] = field(default_factory=dict)
     some: dict[tuple[int, int], Small] = field(default_factory=dict)
     kink: float = -1.0
@@ -107,7 +106,7 @@ def _separable(
     if z is None or x is None or not known:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.penalty.at]
-    search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, warm.exact, accuracy)
+    search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, warm.some, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
@@ -163,7 +162,8 @@ def _coupled(
         outside = np.ones(loss.variable.size, dtype=bool)
         outside[working] = False
         slope = np.where(rows.spread(outside), tangent.slope, 0.0)
-        small = _some(loss, rows, warm, working, len(terms.y))
+        small = with_some(loss, rows, warm.penalty, working, len(terms.y), warm.some)
+        small.attempts = (EQUILIBRATED,)
         part: Any = small.loss
         part.price(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
         try:
@@ -187,20 +187,6 @@ def _coupled(
             break
         tangent, working = there, more
     return _all_rows(loss, rows, warm, weight, squares, damping)
-
-
-def _some(loss: Loss, rows: Rows, warm: Warm, working: np.ndarray, squares: int) -> Small:
-    """Return the small program with some entries of a loss with a threshold as they are, beside so many squares."""
-    key = len(working), squares
-    if key in warm.some:
-        return warm.some[key]
-    expression, own = loss.some(working)
-    sizes = None if rows.sizes is None else rows.sizes[working]
-    made = Small(warm.penalty, squares, Canonical(expression + loss.threshold, [], own), sizes)
-    made.attempts = (EQUILIBRATED,)
-    if loss.uniform and (rows.sizes is None or np.ptp(rows.sizes) == 0):  # one program serves any entries of a number
-        warm.some[key] = made
-    return made
 
 
 class Tangent:
