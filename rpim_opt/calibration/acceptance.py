@@ -24,12 +24,16 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Requirement
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.linear import Machine, identified_of, require_robot
 from rpim_opt.problem.workspace import in_base, markers
+from rpim_opt.robot.parameter_names import own_name
 
 Verdict = Literal["accepted", "rejected", "undecided"]
+DECISIVE = 0.5
+"""What knowing a part of the robot leaves of the bound where that part decides it."""
 FEWEST = 5
 """Held-out rows below which they say too little of the intervals."""
 MOST = 3
@@ -417,6 +421,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     scatter, least = scatter_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += _against(requirement, least, seen)
     lacking += _wide(requirement.limit, mapped.largest, scatter)
+    if np.isfinite(mapped.largest) and max(requirement.limit, scatter) < mapped.largest:
+        lacking += _decisive(result, mapped)
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "undecided"
@@ -499,6 +505,35 @@ def _wide(limit: float, bound: float, scatter: float) -> list[str]:
         f"repeatability would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` "
         "names the configurations that help most."
     ]
+
+
+def _decisive(result: Calibration, found: Workspace) -> list[str]:
+    """Say which part of the robot decides the largest bound: by C given that part, C - C_k C_kk^-1 C_k'."""
+    free = result.problem.parameters.free
+    names = [own_name(name) for name in free.names]
+    parts = {
+        "the place of the reflector (tool_x, tool_y, tool_z)": [name.startswith("tool_") for name in names],
+        "the base": [name.startswith("base_") for name in names],
+        "the transmission errors": [name.startswith("transmission") for name in names],
+    }
+    parts["the links and joint offsets"] = ~np.any(list(parts.values()), axis=0)
+    q = found.q[-1:]
+    J = result.problem.sample().measuring(q, position, found.region.marker).jacobian(result.x)
+    C = result.covariance
+    whole = result.predict(q, found.region.marker).covariance
+    left = {}
+    for part, members in parts.items():
+        k = np.flatnonzero(members)
+        G = J @ C[:, k]
+        known = whole - G @ np.linalg.pinv(C[np.ix_(k, k)], hermitian=True) @ G.T
+        left[part] = float(distance_quantile(known, result.freedom, found.requirement.confidence)[0])
+    part = min(left, key=left.__getitem__)
+    if not left[part] < DECISIVE * found.largest:
+        return []
+    text = f"The bound rests on {part}: known exactly, it would be {1e3 * left[part]:.3f} mm."
+    if "reflector" in part:
+        text += " State what is known of it ([prior] known), or measure with the wrist turned further."
+    return [text]
 
 
 def _against(requirement: Requirement, least: float, seen: Checked | None) -> list[str]:

@@ -306,3 +306,19 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
     for wrong in (["--limit", "0"], ["--box", "1,2"]):
         assert run(monkeypatch, "accept", out, *wrong) == 2
     assert run(monkeypatch, "calibrate", "position", "--box", "0,800,-900,900,0,900") == 2
+
+
+def test_what_a_wide_bound_rests_on_is_named() -> None:
+    """A wrist that hardly turned, and a region in which it turns: base and curves have no part in that."""
+    problem = ro.load("position").problem
+    block = problem.data.blocks[0]
+    q = block.q.copy()
+    q[..., 3:] *= 0.02
+    still = problem.on(replace(problem.data, blocks=(replace(block, q=q),)))
+    y = still.modelled(np.zeros(len(still.parameters.free)))[0] + 3e-5 * np.random.default_rng(0).normal(size=(40, 3))
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, q=q, y=y),))), ro.tikhonov, 1.0)
+    found = accept(result, Requirement(1e-3, joints=((4, (-2, 2)), (5, (-2, 2)))))
+    (text,) = (each for each in found.reasons if each.startswith("The bound rests on"))
+    assert "links and joint offsets" in text
+    known = float(text.split("would be ")[1].split(" mm")[0])
+    assert known < 0.5e3 * found.bound
