@@ -13,6 +13,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import Columns
+from rpim_opt.basics.units import dimension_of, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose
@@ -181,9 +182,16 @@ def rows_of(found: Understanding, columns: Columns, arm: Described, kind: Measur
         return read_data(columns, arm.robot, noise, kind)
     except InputError as error:
         row, mark, ours = error.where.partition(", column ")
-        own = {each.name: each.column for table in found.tables for each in table.meant}
+        own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
         where = f"{row}{mark}'{own[ours]}'" if own.get(ours, ours) != ours else error.where
-        raise InputError(where, error.found, error.accepted, error.file or found.file) from None
+        accepted = error.accepted
+        lengths = [
+            name for table in found.tables for name in table.left_out if dimension_of(split(name)[1]) == "length"
+        ]
+        lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
+        if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
+            accepted += f", or rename '{lengths[0]}'"
+        raise InputError(where, error.found, accepted, error.file or found.file) from None
 
 
 def understand_of(

@@ -29,6 +29,8 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR
+from rpim_opt.problem.registration.frames import MISPLACED
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -45,6 +47,8 @@ BLOCK = 8192
 """Rows that are worked on together, so that what they need stays in the processor's cache."""
 REACHED = 1e-7
 """A target counts as reached when no more than this is left [m, rad]."""
+KNOWN_TOOL = 0.01
+"""Largest scale [m, rad] of a reflector that is known: a wider one states no TCP."""
 BANK = 2000
 TRIALS = 12
 """Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
@@ -210,8 +214,9 @@ def compensate(
     tool
         (6,) a tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the robot has
         exactly there. By default the reflector of the calibration: the controller's robot has it at its nominal place
-        (as stated, or where registration puts it), the real one as identified. The flange frame is that of the DH
-        table, after the last joint.
+        (as stated, or where registration puts it), the real one as identified; a nominal place that the identified one
+        contradicts is no TCP, and both have it as identified. The flange frame is that of the DH table, after the last
+        joint.
     marker
         Which reflector, when there are several.
     base
@@ -281,7 +286,7 @@ def compensate(
     whole["status"] = tuple(whole["status"].tolist())
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
     outside = result.outside(commands)
-    return Compensation(arm, targets.label, **whole, outside=outside, note=note, point=cell.point(tool is not None))
+    return Compensation(arm, targets.label, **whole, outside=outside, note=note, point=cell.point)
 
 
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
@@ -390,6 +395,7 @@ class _Cell(NamedTuple):
     marker: str
     noise: Array
     level: float
+    point: str
 
     @classmethod
     def of(
@@ -421,6 +427,19 @@ class _Cell(NamedTuple):
         elif marker not in known:
             raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
         values = parameters.values(x)
+        at = [parameters.names.index(tool_prefix(marker) + c) for c in FRAME]
+        point = f"Moved is the tool as stated, at {placed(values[at])} in the flange frame."
+        if tool is None:
+            where = f"nominally (stated, or registered) at {placed(parameters.nominal[at])} in the flange frame"
+            known_to = MISPLACED * (np.minimum(parameters.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)
+            if (np.abs(x[at]) > known_to).any():
+                where = f"as identified at {placed(values[at])} in the flange frame; its nominal place is no TCP, as "
+                where += f"the data contradict it ({placed(parameters.nominal[at])})"
+                parameters = replace(parameters, nominal=parameters.nominal.copy())
+                parameters.nominal[at] = values[at]
+                x = x.copy()
+                x[at] = 0.0
+            point = f"Moved is the reflector, {where}: a controller with another TCP needs --tool."
         nominal = dict(zip(parameters.names, parameters.nominal.tolist(), strict=True))
         identified = dict(zip(parameters.names, values.tolist(), strict=True))
         moved = np.eye(4)
@@ -447,16 +466,8 @@ class _Cell(NamedTuple):
             marker,
             position_noise(measured),
             result.variance_factor,
+            point,
         )
-
-    def point(self, stated: bool) -> str:
-        """Say which point is moved, and where the controller's robot has it."""
-        p = self.problem.parameters
-        at = [p.names.index(tool_prefix(self.marker) + c) for c in FRAME]
-        if stated:
-            return f"Moved is the tool as stated, at {placed(p.nominal[at])} in the flange frame."
-        where = f"nominally (stated, or registered) at {placed(p.nominal[at])} in the flange frame"
-        return f"Moved is the reflector, {where}: a controller with another TCP needs --tool."
 
     def compensated(
         self, q: Array | None, poses: Array | None, torque: Array | None, payload: Array | None, largest: float

@@ -347,3 +347,12 @@ def test_each_of_the_fewer_has_its_own_partner() -> None:
     assert list(zip(left.tolist(), right.tolist(), strict=True)) == [(0, 0), (1, 1), (3, 5)]
     assert (turned[1].tolist(), turned[0].tolist()) == (left.tolist(), right.tolist())
     np.testing.assert_allclose(turned[2], -apart)
+
+
+def test_a_length_of_another_name_is_offered(monkeypatch, capsys, tmp_path, arm) -> None:
+    path = tmp_path / "train.csv"
+    path.write_text(text([[*HEAD[:7], "wire_mm"]], [[*row[:8]] for row in ROWS]))
+    assert new(monkeypatch, arm, tmp_path / "cell", path, "--measurement", "distance") == 2
+    said = capsys.readouterr().err
+    assert "train.csv, the header: found no column for 'distance'" in said
+    assert ", or rename 'wire_mm'." in said

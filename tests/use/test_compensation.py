@@ -342,6 +342,31 @@ def test_a_tool_of_ones_own_is_taken_as_it_is() -> None:
     assert (found.std > ro.use.compensate(result, q).std).all()  # the flange is known less than the reflector
 
 
+def test_a_reflector_that_the_data_contradict_is_no_tcp() -> None:
+    """Zeros of a folder whose reflector was not known would else be moved to where the real one is."""
+    result, q = known(), commands(ARM, 10)
+    p = result.problem.parameters
+    at = [p.names.index(f"tool_{c}") for c in "xyz"]
+    x = np.zeros(len(p))
+    x[p.identified] = result.x
+    place = p.values(x)[at]
+    nominal = p.nominal.copy()
+    nominal[at], x[at] = place - [0.11, -0.03, 0.26], [0.11, -0.03, 0.26]
+    scale = p.scale.copy()
+    scale[at] = 0.1
+    far = replace(p, nominal=nominal, scale=scale)
+    found = ro.use.compensate(
+        replace(result, problem=result.problem.with_parameters(far), x=x[p.identified]), q, orientation=False
+    )
+    nominal[at] = place
+    x[at] = 0.0
+    stated = replace(result, problem=result.problem.with_parameters(replace(far, nominal=nominal)), x=x[p.identified])
+    assert found.q == pytest.approx(ro.use.compensate(stated, q, orientation=False).q, abs=1e-9)
+    assert "as identified at" in found.point
+    assert "its nominal place is no TCP" in str(found)
+    assert "nominally (stated, or registered)" in ro.use.compensate(result, q).point
+
+
 def test_several_reflectors_and_torques() -> None:
     instance = ro.load("markers")
     result = ro.calibrate(instance.problem, instance.formulation, 1.0)

@@ -214,6 +214,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         stem = INDEX_BEFORE.sub("", stem).strip().lower()
         if stem in JOINT_NAMES:
             continue
+        stem = stem.removesuffix("_i")
         key = SHEET.get(stem, stem) + (f"_{unit}" if unit else "")
         if key in columns:
             raise InputError("the header", ", ".join(raw.columns), "every column once", path)
