@@ -98,6 +98,10 @@ class WeightChoice:
         last = turns[-4:]
         if len(last) == 4 and _same(last[0], last[2]) and _same(last[1], last[3]):
             return self._settled_between(last[2], last[3])
+        if self.robust and len(self.answers) >= 4 and not _same(*self.answers[-2:], SAME_ROBUST):
+            a, b, c, d = self.answers[-4:]
+            if _same(a, c, SAME_ROBUST) and _same(b, d, SAME_ROBUST):  # closer to each other than `SAME`
+                return self._settled_between(c, d)
         if self.settled and len(last) >= 3 and _same(last[-1], last[-3], SAME_SEARCH):  # leads where it led before
             return self._settled_between(last[-2], last[-1])
         if len(turns) >= MOST_ANSWERS:
@@ -111,7 +115,9 @@ class WeightChoice:
         if low > 0 and high <= 10 * low:
             weight = float(np.sqrt(low * high))
             which = f"their geometric mean, {weight:.2g}, is used"
-        note = f"The rule {name} alternates between {one:.2g} and {other:.2g}: {which}."
+        note = ""
+        if not _same(one, other):
+            note = f"The rule {name} alternates between {one:.2g} and {other:.2g}: {which}."
         return replace(self, weight=weight, settled=True, final=True, note=note)
 
 

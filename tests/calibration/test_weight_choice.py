@@ -7,6 +7,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -269,3 +270,10 @@ def test_a_rule_is_asked_at_last_where_passes_run_out_on_the_way(monkeypatch: py
     assert not result.converged
     assert result.selection is not None
     assert result.weight == 3.0
+
+
+def test_two_answers_hardly_apart_of_a_robust_loss_end_between_them() -> None:
+    absolute = ro.Formulation("tilted", loss=lambda r: cp.sum(cp.maximum(0.9 * r, -0.1 * r)), penalty=cp.sum_squares)
+    result = ro.calibrate(ro.load("position").problem, absolute, ro.l_curve, max_iterations=100)
+    assert result.converged
+    assert "alternates" not in result.message
