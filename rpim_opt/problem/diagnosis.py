@@ -393,7 +393,9 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
             labels = [data.label[i] for i in block.row[same & (y[:, 0] == value)]]
             what = f"{_rows(labels, 'has', 'have')} {value:g} for every measured coordinate"
             yield f"{what}: no measurement? Leave out what is none ([exclude])."
-        reach = max(float(np.abs(arm.mdh[:, [1, 3]]).sum()) for arm in problem.arms.values())
+        arm = problem.arms[block.robot]
+        sliding = [i for i, dimension in enumerate(arm.joint_dimensions) if dimension == "length"]
+        reach = float(np.abs(arm.mdh[:, [1, 3]]).sum() + np.ptp(block.q[..., sliding], axis=(0, 1)).sum())
         away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
         labels = [data.label[i] for i in block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]]
         if labels:
@@ -520,6 +522,8 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Say whether joint or measured values are rounded so that this explains the RMS error [m] of a fit."""
     for block in problem.data.blocks:
+        if len(block.y) < FEWEST:  # lengths of a drawing are round
+            continue
         lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
         unit = _rounded_to(1e3 * block.y[:, lengths])
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))

@@ -95,6 +95,18 @@ def test_a_lost_decimal_point_is_named() -> None:
     assert text.startswith(f"row {problem.labels[4]} is farther from the others than the arm is long")
 
 
+def test_travel_of_a_rail_is_reach() -> None:
+    robot = ro.robot.Robot("rail", np.zeros((1, 4)), joint_types=("prismatic",))
+    q = np.append(np.linspace(0, 0.5, 20), 8.0)[:, None]
+    y = q * [0.0, 0.0, 1.0] + 1e-3 * np.arange(21)[:, None] * [1.0, 2.0, 0.0]
+    problem = ro.problem_from(robot, ro.Dataset.of(q, y, 5e-5), ("base_*",), base=np.zeros(6))
+    assert list(rows_without_values(problem)) == []
+
+
+def test_round_lengths_of_a_drawing_are_no_rounded_measurements() -> None:
+    assert list(rounded(ro.load("datum_cube").problem, 0.03)) == []
+
+
 def test_readings_of_one_configuration_are_said_to_agree() -> None:
     problem, _ = simulated(("theta2", "tool_x", "base_*"), 12)
     y = problem.data.blocks[0].y
