@@ -96,9 +96,9 @@ def test_a_lost_decimal_point_is_named() -> None:
 
 
 def test_travel_of_a_rail_is_reach() -> None:
-    robot = ro.robot.Robot("rail", np.zeros((1, 4)), joint_types=("prismatic",))
+    robot = ro.robot.Robot("rail", np.zeros((1, 5)), joint_types=("prismatic",))
     q = np.append(np.linspace(0, 0.5, 20), 8.0)[:, None]
-    y = q * [0.0, 0.0, 1.0] + 1e-3 * np.arange(21)[:, None] * [1.0, 2.0, 0.0]
+    y = [0.1, 0.2, 0.3] + q * [0.0, 0.0, 1.0] + 1e-3 * np.arange(21)[:, None] * [1.0, 2.0, 0.0]
     problem = ro.problem_from(robot, ro.Dataset.of(q, y, 5e-5), ("base_*",), base=np.zeros(6))
     assert list(rows_without_values(problem)) == []
 
