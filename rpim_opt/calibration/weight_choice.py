@@ -98,7 +98,7 @@ class WeightChoice:
         last = turns[-4:]
         if len(last) == 4 and _same(last[0], last[2]) and _same(last[1], last[3]):
             return self._settled_between(last[2], last[3])
-        if self.robust and len(self.answers) >= 4 and not _same(*self.answers[-2:], SAME_ROBUST):
+        if self.robust and len(self.answers) >= 4 and not _same(self.answers[-2], self.answers[-1], SAME_ROBUST):
             a, b, c, d = self.answers[-4:]
             if _same(a, c, SAME_ROBUST) and _same(b, d, SAME_ROBUST):  # closer to each other than `SAME`
                 return self._settled_between(c, d)

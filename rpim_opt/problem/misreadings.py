@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import reduce
 from itertools import combinations, permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -127,7 +127,7 @@ class Reading(NamedTuple):
 
     what: str
     remedy: str
-    change: Callable[[Points], Points] = lambda points: points
+    change: Callable[[Any], Any] = lambda points: points
     robot: Robot | None = None
     others: tuple[Reading, ...] = ()
 

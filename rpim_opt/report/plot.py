@@ -459,7 +459,7 @@ def _boxes(ax: Axes, left: Array, right: Array, low: Array, high: Array, hints: 
     from matplotlib.collections import PolyCollection
 
     corners = np.array([[left, low], [left, high], [right, high], [right, low]]).transpose(2, 0, 1)
-    boxes: Any = ax.add_collection(PolyCollection(corners, lw=0, **style))
+    boxes: Any = ax.add_collection(PolyCollection(list(corners), lw=0, **style))
     boxes.hints = hints
     boxes.sticky_edges.y.extend(low)
     ax.autoscale_view()

@@ -516,7 +516,8 @@ class Loss:
 
         for far in (1.0 + np.abs(v).max()) * 10.0 ** np.arange(DECADES):
             if rise(-far) <= 0 <= rise(far):
-                t = float(bisect(rise, -far, far, xtol=EXACT * far, rtol=EXACT))
+                root: Any = bisect(rise, -far, far, xtol=EXACT * far, rtol=np.float64(EXACT))
+                t = float(root)
                 return self.rate * t + float(np.sum(at(t)[0])), t
         return np.inf, np.nan
 

@@ -200,7 +200,8 @@ class Tangent:
         self.value, t = loss.best(self.v)
         self._entries, self._positive = loss.at_threshold(t), loss.positive
         values, pull = self._entries(self.v)
-        self.pull, self.by_threshold = one * pull, one * loss.by_threshold(self.v)(t)[1]
+        by_threshold: Any = loss.by_threshold(self.v)
+        self.pull, self.by_threshold = one * pull, one * by_threshold(t)[1]
         self.constant = values - pull * self.v - self.by_threshold * t
         self.slope = self.pull
         if loss.positive:

@@ -354,6 +354,7 @@ def _with_fixtures(robot: Robot, parameters: Parameters, data: Dataset, names: s
     scale = np.where(own, FIXTURE, np.where(tools, REFLECTOR, parameters.scale))
     free = replace(parameters, identified=own | tools, scale=scale)
     problem = whole = CalibrationProblem(robot, free, data)
+    x = np.zeros(len(free.free))
     for _ in range(TRIMMED):  # gross outliers would pull the start
         try:
             x = settled(problem, STEPS)
