@@ -259,7 +259,8 @@ def _whole(
 
 def _joined(table: Understood, options: TableOptions, notes: Sequence[str]) -> Understood:
     """Return what was understood of a file, in which the column by which rows were joined is not left out."""
-    used = {name for name in table.raw if any(note.startswith(f"joined by column '{name.lower()}'") for note in notes)}
+    by = [note.removeprefix("joined by ").partition(":")[0] for note in notes if note.startswith("joined by ")]
+    used = {name for name in table.raw if f"column '{name.lower()}'" in by or name in " = ".join(by).split(" = ")}
     if any(note.startswith("joined by the nearest time") for note in notes):
         clock = time_column(table.raw) if options.key.lower() in ("", "time") else options.key
         used = {name for name in table.raw if name.lower() == str(clock).lower()}

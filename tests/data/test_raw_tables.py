@@ -213,7 +213,8 @@ def test_two_tables_are_joined_by_what_both_have(tmp_path: Path) -> None:
     found = together(two(tmp_path), ARM, position)
     assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([402, 401])
     assert list(found.columns["q1_deg"]) == ["3", "1"]
-    by_row = together(two(tmp_path), ARM, position, "row")
+    other_names = VALUES.replace("b,", "c,").replace("a,4", "d,4")
+    by_row = together(two(tmp_path, values=other_names), ARM, position, "row")
     assert list(by_row.columns["q1_deg"]) == ["1", "3"]
 
 
@@ -223,7 +224,8 @@ def test_two_tables_are_joined_by_what_both_have(tmp_path: Path) -> None:
         (JOINTS, VALUES + "c,1,2,3\n", "row", "2 rows of joints and 3 measured, accepted: as many of both"),
         (JOINTS.replace("b,3", "a,3"), VALUES, "", "'a' twice in"),
         (JOINTS, VALUES, "time", "found 'time'"),
-        (JOINTS.replace("name", "one"), VALUES.replace("name", "other"), "", "no column in both"),
+        (JOINTS, VALUES, "row", "2 of 2 rows whose name is the name of another row"),
+        (JOINTS.replace("name", "one"), "other,X [mm],Y [mm],Z [mm]\nc,402,6,7\nd,401,5,6\n", "", "no column in both"),
     ],
 )
 def test_tables_that_cannot_be_joined(tmp_path: Path, joints: str, values: str, key: str, said: str) -> None:

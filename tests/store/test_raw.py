@@ -356,3 +356,22 @@ def test_a_length_of_another_name_is_offered(monkeypatch, capsys, tmp_path, arm)
     said = capsys.readouterr().err
     assert "train.csv, the header: found no column for 'distance'" in said
     assert ", or rename 'wire_mm'." in said
+
+
+def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, arm) -> None:
+    """Running numbers of both files do not: the tracker's rows have another order."""
+    joints = tmp_path / "robot.csv"
+    points = tmp_path / "tracker.csv"
+    joints.write_text(text([["No", "Pose", *HEAD[1:7]]], [[str(i), *row[:7]] for i, row in enumerate(ROWS, start=1)]))
+    other_order = [[str(i), row[0], *row[7:]] for i, row in enumerate(ROWS[::-1], start=1)]
+    points.write_text(text([["No", "Point Name", *HEAD[7:]]], other_order))
+    for more in ([], ["--key", "Point Name"]):
+        assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--dry-run", *more) == 0
+        assert f"joined by Pose = Point Name: {COUNT} rows of {COUNT}" in capsys.readouterr().out
+    assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "row") == 2
+    said = capsys.readouterr().err
+    assert f"{COUNT - COUNT % 2} of {COUNT} rows whose Pose is the Point Name of another row" in said
+    points.write_text(text([["ID", "Point Name", *HEAD[7:]]], [[f"x{row[0]}", *row[1:]] for row in other_order]))
+    assert new(monkeypatch, arm, tmp_path / "cell", [points, joints]) == 2
+    assert "columns 'ID' and 'Point Name' for label" in capsys.readouterr().err
+    assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "Point Name") == 0

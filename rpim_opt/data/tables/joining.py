@@ -25,6 +25,8 @@ UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
 """What a unit is in lower case (`str.casefold`)."""
+SAME = 0.8
+"""Share of the shorter one's values that two columns of other names have in common where they are one key."""
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
@@ -150,29 +152,63 @@ def _keys(
     moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
 ) -> tuple[str, list[str], list[str]]:
     """Return what the key is, and those of the rows with joints and of the measured ones."""
+    left, right = _raw(moving), _raw(seen)
+    pairs = [pair for pair in _pairs(moving, seen) if key in ("", "row") or key.lower() in map(str.lower, pair)]
+    names = [pair for pair in pairs if not _running(left[pair[0].lower()])]
+    pair = next(iter(names or pairs), None) if len(names or pairs) == 1 else None
     if key == "row":
         count = _count(joints)
         if _count(values) != count:
             found = f"{count} rows of joints and {_count(values)} measured"
             raise InputError("--key row", found, "as many of both, or a column that both have")
+        if names and pair:
+            own, others = (_normal(of[name.lower()]) for of, name in zip((left, right), pair, strict=True))
+            there = set(others)
+            other = sum(a != b and a in there for a, b in zip(own, others, strict=True))
+            if other:
+                found = f"{other} of {count} rows whose {pair[0]} is the {pair[1]} of another row"
+                raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
         numbers = [str(i) for i in range(1, count + 1)]
         return "the number of the row", numbers, numbers
     if "label" in joints and key in ("", "label"):
         labels = _normal(joints["label"])
         for column in ("label", "configuration"):
             others = _normal(values.get(column, ()))
-            if set(labels) & set(others):
+            if set(labels) & set(others) and not (names and _running(labels)):
                 return "label", labels, others
-    left, right = _raw(moving), _raw(seen)
     common = [name for name in left if name in right]
     name = key.lower()
-    if not key and len(common) == 1:
+    if not key and len(common) == 1 and not names:
         name = common[0]
+    if pair and name not in common:
+        return " = ".join(pair), _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
     if name not in common:
         found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {moving[0].file} and {seen[0].file}"
         accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
         raise InputError("--key", found, f"{accepted} for the nearest time")
     return f"column '{name}'", _normal(left[name]), _normal(right[name])
+
+
+def _pairs(moving: Sequence[Understood], seen: Sequence[Understood]) -> list[tuple[str, str]]:
+    """Return the columns of joints' and of measured tables, labels or left out, that name every row alike."""
+    sides = []
+    for tables in (moving, seen):
+        raw = _raw(tables)
+        names = ("", "label", "configuration")
+        free = [each.column for each in tables[0].meant if each.name in names and each.column.lower() in raw]
+        cells = {name: _normal(raw[name.lower()]) for name in free}
+        sides.append({name: set(keys) for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)})
+    return [
+        (name, other)
+        for name, keys in sides[0].items()
+        for other, others in sides[1].items()
+        if len(keys & others) >= SAME * min(len(keys), len(others))
+    ]
+
+
+def _running(cells: Sequence[Any]) -> bool:
+    """Whether cells count the rows."""
+    return _normal(cells) == [str(i) for i in range(1, len(cells) + 1)]
 
 
 def _raw(tables: Sequence[Understood]) -> Mapping[str, list[Any]]:

@@ -186,6 +186,7 @@ def _readings(
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature whose unit is not there")
     _leave_out(read, targets)
+    _one_label(read, table, options.key)
     return read, rotation
 
 
@@ -333,6 +334,16 @@ def _leave_out(read: Readings, targets: bool) -> None:
                 why = "a commanded value is no measurement"
         if why:
             read[name] = Reading("", "", why)
+
+
+def _one_label(read: Readings, table: Columns, key: str) -> None:
+    """Leave out other labels than the stated key, or than the one that does more than count the rows."""
+    labels = [name for name, each in read.items() if each.stem == "label"]
+    count = [str(i) for i in range(1, len(next(iter(table.values()), ())) + 1)]
+    stated = [name for name in labels if name.lower() == key.lower()]
+    chosen = stated or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
+    if len(labels) > 1 and len(chosen) == 1:
+        read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
 
 
 # --- our names and units -------------------------------------------------------------------------------------------
