@@ -360,8 +360,8 @@ def validate(
     In the table of --out, sigmas is a row's error over its predicted standard deviation, and allowed_sigmas what the
     largest of all these rows exceeds with probability 0.01.
 
-    Exit code 1 if an error is above the limit, the errors are larger than the nominal robot's, or a mistake in the
-    measurements is likely.
+    Exit code 1 if an error is above the limit, the errors are clearly larger than the nominal robot's (mean difference
+    of their squares above three standard errors), or a mistake in the measurements is likely.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):

@@ -98,6 +98,9 @@ class Prior:
     def known(cls, text: str, value: float | None = None, *, sd: float | None = None) -> Prior:
         """Return the prior that also knows a linear combination of parameters.
 
+        Where prior scales and noise are estimated, the default, its standard deviation is absolute; with one weight,
+        given or of a rule, the weight and the estimated noise multiply the statement as they do all of the prior.
+
         Parameters
         ----------
         text
@@ -215,7 +218,7 @@ class Prior:
         Raises
         ------
         InputError
-            For names or patterns that the table has not, units that do not fit, values far from nominal.
+            For names or patterns that the table has not, units that do not fit, statements on values far from nominal.
         """
         free = parameters.free
         identified = parameters.identified

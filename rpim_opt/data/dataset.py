@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.text import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.measurements.measurement import Measurement
@@ -302,7 +302,7 @@ class Dataset(Tabled):
         y: Array,
         sigma: float | Array,
         label: tuple[str, ...] = (),
-        measurement: Measurement = position,
+        measurement: Measurement | str = position,
         *,
         torque: Array | None = None,
         payload: Array | None = None,
@@ -323,7 +323,7 @@ class Dataset(Tabled):
         label
             N row labels; numbers from 1 by default.
         measurement
-            What the instrument sees.
+            What the instrument sees, or the name of a ready type, ``"cable"``.
         torque, approach
             Joint torques [Nm], and directions of the last movement (-1, 0 or +1), (N, dof) or (N, p, dof) as q.
         payload
@@ -336,7 +336,8 @@ class Dataset(Tabled):
         Raises
         ------
         InputError
-            For shapes that do not fit together, numbers that are not finite, or a deviation that is not positive.
+            For an unknown name, shapes that do not fit together, numbers that are not finite, or a deviation that is
+            not positive.
 
         Examples
         --------
@@ -346,6 +347,10 @@ class Dataset(Tabled):
         >>> len(data), data.label
         (2, ('1', '2'))
         """
+        if isinstance(measurement, str):
+            from rpim_opt.data.measurements.registry import MEASUREMENTS  # types of which import this module
+
+            measurement = pick(MEASUREMENTS, measurement, "measurement")
         q = np.asarray(q, dtype=float)
         y = np.asarray(y, dtype=float)
         if q.ndim == 2:

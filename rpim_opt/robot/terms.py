@@ -283,7 +283,11 @@ def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | N
     # an effect may take a whole chain to write down: not for a parameter that is not there
     if sizes and all(ca.SX(size).is_zero() for size in sizes):
         return None
-    moves = term.moves(joint, *sizes)
+    try:
+        moves = term.moves(joint, *sizes)
+    except (AttributeError, TypeError) as error:
+        accepted = f"moves({', '.join([term.at, *(entry.stem for entry in term.entries)])}) of what `Joint` has"
+        raise InputError(f"term '{term.name}'", f"{type(error).__name__}: {error}", accepted) from error
     if isinstance(moves, list | tuple):
         moves = ca.vertcat(*moves)
     moves = ca.SX(moves)

@@ -47,7 +47,7 @@ class Validation:
     touched
         How far touches are from their points and planes, the worst first.
     remarks
-        What a reader of errors of touches has to know.
+        What a reader of the errors has to know: of touches, and that the calibration is not delivered.
     mistake
         Another reading of the measurements that fits far better, in a sentence; empty where there is none.
     """
@@ -170,6 +170,8 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     error = result.errors(data)
     touched = scatter(data, nominal, error)
     remarks = list(shared_rows(problem.data, data))
+    if not result.verdict.delivered:
+        remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
         remarks += [*contact_remarks(problem), *known_points(problem, data)]
     return Validation(

@@ -76,3 +76,10 @@ def test_limits_carry_the_unit_of_their_joint(tmp_path: Path) -> None:
     path.write_text('name = "r"\ncoupling = [[1, 0]]\n[[joint]]\n')
     with pytest.raises(ro.InputError, match=r"coupling: .* 1 rows of 1 numbers"):
         ro.read_robot(path)
+
+
+def test_a_ready_measurement_is_known_by_its_name() -> None:
+    data = ro.Dataset.of(np.zeros((2, 6)), [[0.3], [0.4]], 1e-4, measurement="cable")
+    assert list(data.blocks[0].measurement.columns) == ["distance"]
+    with pytest.raises(ro.InputError, match=r"measurement: found 'cabel', accepted: .*did you mean cable"):
+        ro.Dataset.of(np.zeros((2, 6)), [[0.3], [0.4]], 1e-4, measurement="cabel")

@@ -463,3 +463,10 @@ def test_backlash_of_a_users_own_needs_directions() -> None:
     problem, _ = simulated(ALL)
     with pytest.raises(ro.InputError, match="without directions of approach"):
         problem.with_model(ro.Model([ro.robot.Term(moves, scales)]))
+
+
+@pytest.mark.parametrize("moves", [lambda joint, size: size * joint.speed, lambda joint: joint.q])
+def test_a_term_that_cannot_be_called_is_refused(moves: Callable) -> None:
+    term = ro.robot.Term(moves, {"odd_mrad": 0.1})
+    with pytest.raises(ro.InputError, match=r"term 'odd'.*accepted: moves\(joint, odd\)"):
+        ro.load("position").problem.with_model(ro.Model([term]))
