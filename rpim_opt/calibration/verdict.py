@@ -105,7 +105,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
     if np.mean(~kept) > EXCLUDED:
         reasons.append(f"{(~kept).sum()} of {len(kept)} rows are outliers, more than {EXCLUDED:.0%}.")
-    reasons += [*_held_out(result), *_computed(result), *causes]
+    reasons += [*_worse(result), *_held_out(result), *_computed(result), *causes]
     return Verdict(tuple(dict.fromkeys(reasons)))
 
 
@@ -242,6 +242,17 @@ def _deviations(result: Outcome) -> Iterator[str]:
         worst = max(worst, (float(abs(x)) / largest, said))
     if worst[1]:
         yield worst[1]
+
+
+def _worse(result: Outcome) -> Iterator[str]:
+    """Say that the robot misses the identification rows by more than the nominal one: a penalty far too heavy."""
+    nominal, identified = result.nominal_errors(), result.errors()
+    if worse_than_nominal(nominal, identified):
+        yield (
+            f"Errors on the identification rows are larger than the nominal robot's: RMS "
+            f"{three_digits(1e3 * rms(identified))} mm against "
+            f"{three_digits(1e3 * rms(nominal))} mm: too large a weight."
+        )
 
 
 def _held_out(result: Outcome) -> Iterator[str]:

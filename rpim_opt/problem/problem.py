@@ -738,7 +738,7 @@ def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
 
 
 def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
-    """Return patterns of parameters; ``"auto"`` stands for geometry, Hayati's beta where it is needed, and frames."""
+    """Return patterns of parameters; ``"auto"``: geometry, beta where it is needed, frames, own parameters of types."""
     if patterns != "auto":
         return patterns
     kinds = [block.measurement for block in data.blocks]
@@ -747,4 +747,6 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
         kept.append(BASE)
     kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
     geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
+    own = {of_fixture(name, block.fixture) for block in data.blocks for name in block.measurement.parameters}
+    places.append([name for name in parameters.names if name in own and not PLACES.fullmatch(name)])
     return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

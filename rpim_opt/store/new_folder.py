@@ -146,6 +146,7 @@ def new_problem(
         "data": Path(found.file).name,
         "count": len(rows),
         "validation": said,
+        "fixture": kind.start is not None,
         "reading": [(name, toml(text)) for name, text in replace(found.options, joints=arm.names).texts().items()],
     }
     try:

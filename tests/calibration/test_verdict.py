@@ -136,3 +136,13 @@ def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
     assert run(monkeypatch, "accept", folder, "--limit", "500") == 1
     assert run(monkeypatch, "report", folder) == 0
     assert "should not be used" in (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def test_a_weight_that_makes_a_robot_worse_than_nominal_is_no_delivery() -> None:
+    """The penalty holds reflector and base, too, which the nominal robot has fitted."""
+    problem = ro.load("position").problem
+    nominal = problem.parameters.nominal.copy()
+    nominal[-1] += 0.02  # the reflector's start, 20 mm off
+    off = problem.with_parameters(replace(problem.parameters, nominal=nominal))
+    result = ro.calibrate(off, ro.tikhonov, weight=1e9)
+    assert any("larger than the nominal robot's" in reason for reason in result.verdict.reasons)

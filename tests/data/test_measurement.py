@@ -198,3 +198,14 @@ def test_what_a_script_says_of_its_values_reaches_the_reader() -> None:
         ro.read_data(table, robot, {"distance_mm": 0.01}, probe)
     with pytest.raises(ro.InputError, match="the probe: found no calibration"):
         ro.read_data(table | {"z_mm": [1, 1]}, robot, {"distance_mm": 0.01}, probe)
+
+
+def test_auto_identifies_the_parameters_of_a_type_of_ones_own() -> None:
+    """A height gauge whose table tilts and whose zero is not known: without these the robot would take them up."""
+    gauge = ro.data.Measurement(
+        "gauge", lambda T, tilt, zero: T[2, 3] + tilt * T[0, 3] + zero, {"z": "length"},
+        parameters={"tilt": "", "zero": "length"},
+    )  # fmt: skip
+    q = np.random.default_rng(0).uniform(-1, 1, (30, 6))
+    data = ro.Dataset.of(q, np.ones((30, 1)), 1e-4, measurement=gauge)
+    assert {"tilt", "zero"} <= set(ro.problem_from("irb120", data).parameters.free.names)

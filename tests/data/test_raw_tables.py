@@ -218,6 +218,14 @@ def test_two_tables_are_joined_by_what_both_have(tmp_path: Path) -> None:
     assert list(by_row.columns["q1_deg"]) == ["1", "3"]
 
 
+def test_a_common_column_counts_beside_a_pair_of_other_names(tmp_path: Path) -> None:
+    joints = "stamp,Alpha,J1 [deg],J2 [deg]\n7,a,1,2\n9,b,3,4\n"
+    values = "stamp,Beta,X [mm],Y [mm],Z [mm]\n9,b,402,6,7\n7,a,401,5,6\n"
+    found = together(two(tmp_path, joints, values), ARM, position)
+    assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([402, 401])
+    assert list(found.columns["q1_deg"]) == ["3", "1"]
+
+
 @pytest.mark.parametrize(
     ("joints", "values", "key", "said"),
     [

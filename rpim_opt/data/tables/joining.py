@@ -178,7 +178,7 @@ def _keys(
                 return "label", labels, others
     common = [name for name in left if name in right]
     name = key.lower()
-    if not key and len(common) == 1 and not names:
+    if not key and len(common) == 1 and not (names and pair):
         name = common[0]
     if pair and name not in common:
         return " = ".join(pair), _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
