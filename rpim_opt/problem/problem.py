@@ -18,6 +18,7 @@ from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
+from rpim_opt.data.measurements.registry import READY
 from rpim_opt.problem.contact import Things, Touches, contrasted, of_rows
 from rpim_opt.problem.linear import Identified, LinearModel, Reweigh, identified_of
 from rpim_opt.problem.noise import Equations, Scatter, Stack, equation_numbers
@@ -747,6 +748,7 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
         kept.append(BASE)
     kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
     geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
-    own = {of_fixture(name, block.fixture) for block in data.blocks for name in block.measurement.parameters}
+    others = [block for block in data.blocks if block.measurement not in READY.values()]
+    own = {of_fixture(name, block.fixture) for block in others for name in block.measurement.parameters}
     places.append([name for name in parameters.names if name in own and not PLACES.fullmatch(name)])
     return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]
