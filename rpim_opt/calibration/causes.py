@@ -78,8 +78,6 @@ def likely_causes(result: Outcome) -> list[str]:
         return []
     problem = cast(CalibrationProblem, result.problem)
     shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
-    if len(problem.arms) == 1:
-        shared += computed_columns(problem)
     if result.learned is not None:
         shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
     if result.mapping is not None:
@@ -100,7 +98,7 @@ def likely_causes(result: Outcome) -> list[str]:
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
-        causes = _found(result, problem)
+        causes = [*_found(result, problem), *(computed_columns(problem) if len(problem.arms) == 1 else ())]
     elif not kept.all():
         causes = list(_of_rows(problem))
     if causes or shared:

@@ -185,9 +185,8 @@ def rows_of(found: Understanding, columns: Columns, arm: Described, kind: Measur
         own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
         where = f"{row}{mark}'{own[ours]}'" if own.get(ours, ours) != ours else error.where
         accepted = error.accepted
-        lengths = [
-            name for table in found.tables for name in table.left_out if dimension_of(split(name)[1]) == "length"
-        ]
+        others = [(name, split(name)[1]) for table in found.tables for name in table.left_out]
+        lengths = [name for name, unit in others if unit and dimension_of(unit) == "length"]
         lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
         if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
             accepted += f", or rename '{lengths[0]}'"
