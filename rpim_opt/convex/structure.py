@@ -215,8 +215,13 @@ class Structure:
     def on_squares(self) -> Structure:
         """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
         made = copy.copy(self)
-        for name in ("quadratic_of_r", "loss", "joint", "inner", "by_configuration"):
+        for name in ("quadratic_of_r", "loss", "loss_of_r", "limit_of_norms", "joint", "inner", "by_configuration"):
             vars(made).pop(name, None)
+        if self._called is not None:  # the functions of penalty and constraints are not called again
+            r = cp.Variable(self.n + 1, name="r")
+            loss = Term(cp.sum_squares(r), r)
+            live = (loss.expression, *self._called.live[1:])
+            made._called = replace(self._called, r=r, loss=loss, live=live)
         made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation", largest=float("inf"))
         made.equations, made.limited = self.n + 1, False
         made.constrained = bool(self.formulation.constraints)

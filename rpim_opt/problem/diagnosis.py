@@ -521,32 +521,29 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Say whether joint or measured values are rounded so that this explains the RMS error [m] of a fit."""
+    found: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
     for block in problem.data.blocks:
         if len(block.y) < FEWEST:  # lengths of a drawing are round
             continue
         lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
         unit = _rounded_to(1e3 * block.y[:, lengths])
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
-        if ALIKE[0] * made < error < ALIKE[1] * made:
-            yield (
-                f"measured values are rounded to {unit.max():g} mm: that alone contributes {three_digits(1e3 * made)} "
-                f"mm, the residual RMS is {three_digits(1e3 * error)} mm: export more decimals, or state that "
-                "as their noise."
-            )
-            return
+        remedy = "export more decimals, or state that as their noise"
+        found.append((f"measured values are rounded to {unit.max(initial=0.0):g} mm", made, remedy))
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
     for unit, size in (("deg", np.pi / 180), ("rad", 1.0)):
         decimals = decimals_of(_all_q(problem.data)[:, turning] / size)
-        if decimals is None:
-            continue
-        made = size * 10.0**-decimals / np.sqrt(12) * arm
+        if decimals is not None:
+            step = 10.0**-decimals
+            remedy = "export them with more decimals"
+            found.append((f"joint values are rounded to {step:g} {unit}", size * step / np.sqrt(12) * arm, remedy))
+    for what, made, remedy in found:
         if ALIKE[0] * made < error < ALIKE[1] * made:
             yield (
-                f"joint values are rounded to {10.0**-decimals:g} {unit}: that alone contributes "
-                f"{three_digits(1e3 * made)} mm, the residual RMS is {three_digits(1e3 * error)} mm: "
-                "export them with more decimals."
+                f"{what}: that alone contributes {three_digits(1e3 * made)} mm, the residual RMS is "
+                f"{three_digits(1e3 * error)} mm: {remedy}."
             )
             return
 
@@ -741,8 +738,9 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         slopes = A / free.scale
         places = [free.names.index(zeros[i]) for i, _ in pairs]
         gears = [slopes[:, [k]] * q[:, [j]] for k, (_, j) in zip(places, pairs, strict=True)]
-        whitening = np.linalg.norm(A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1)
-        along = lengths[problem.owners] * whitening[:, None]
+        along = lengths[problem.owners]
+        if lengths.any():
+            along *= (np.linalg.norm(A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1))[:, None]
         for k, way in enumerate(ways):
             along[:, k] += np.sum(slopes[:, base] * way[problem.owners], axis=1)
         return [*gears, along[:, [0]], along[:, [1]]]
@@ -761,7 +759,8 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         yield f"measured lengths are {100 * factor:+.2g} % too long: {left}; check the scale of the instrument."
     else:
         far = three_digits(1e3 * factor)
-        yield f"measured distances are {far} mm too long: {left}; check its zero and the reflector's radius."
+        remedy = "check the instrument's zero and the reflector's radius"
+        yield f"measured distances are {far} mm too long: {left}; {remedy}."
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
@@ -771,16 +770,7 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """
     free = problem.parameters.free
     data = problem.data
-    markers = {marker for block in data.blocks for marker in block.markers}
-    parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
-    fixtures = set()
-    for block in data.blocks:
-        names = list(block.measurement.parameters)
-        if names:
-            fixtures.add(names[0].split("_")[0])
-            parts.setdefault(names[0].split("_")[0], set()).update(of_fixture(name, block.fixture) for name in names)
-    for i, kind in enumerate(problem.robot.joint_types, start=1):
-        parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
+    parts, fixtures = _movable(problem)
     of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
     if len(of["base"]) < len(FRAME):
         of["base"] = []
@@ -802,6 +792,23 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
             f"them, and fit a {what} that moved (that leaves {100 * found.left:.0f} % of the residuals): "
             f"{causes.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
         )
+
+
+def _movable(problem: CalibrationProblem) -> tuple[dict[str, set[str]], set[str]]:
+    """Return the parameters of what may move while rows are measured, and which of that are fixtures (anchors)."""
+    blocks = problem.data.blocks
+    markers = {marker for block in blocks for marker in block.markers}
+    parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
+    fixtures = set()
+    for block in blocks:
+        names = list(block.measurement.parameters)
+        if names:
+            what = names[0].split("_")[0]
+            fixtures.add(what)
+            parts.setdefault(what, set()).update(of_fixture(name, block.fixture) for name in names)
+    for i, kind in enumerate(problem.robot.joint_types, start=1):
+        parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
+    return parts, fixtures
 
 
 # What touches say

@@ -321,4 +321,13 @@ def test_what_a_wide_bound_rests_on_is_named() -> None:
     (text,) = (each for each in found.reasons if each.startswith("The bound rests on"))
     assert "links and joint offsets" in text
     known = float(text.split("would be ")[1].split(" mm")[0])
-    assert known < 0.5e3 * found.bound
+    # given those, the covariance of the rest is the inverse of its own block of the precision
+    names = result.problem.parameters.free.names
+    rest = np.array([name.startswith(("tool_", "base_")) for name in names])
+    worst = found.workspace.q[-1:]
+    G = result.problem.measuring(worst, ro.data.measurements.position.position).jacobian(result.x)[:, rest]
+    C = result.covariance
+    given = G @ np.linalg.inv(np.linalg.inv(C)[np.ix_(rest, rest)]) @ G.T
+    J = result.problem.measuring(worst, ro.data.measurements.position.position).jacobian(result.x)
+    reached = result.predict(worst).covariance[0] - J @ C @ J.T
+    assert known == pytest.approx(1e3 * distance_quantile((given + reached)[None], result.freedom, 0.95)[0], abs=1e-3)

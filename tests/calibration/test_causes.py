@@ -319,7 +319,7 @@ def test_a_table_in_the_standard_convention_is_named() -> None:
 
 
 def cable(outliers: bool = False, **changes: np.ndarray) -> ro.Calibration:
-    """Calibrate with the lengths of one cable whose anchor nobody has stated."""
+    """Calibrate with the lengths of one cable whose anchor is not stated."""
     problem = ro.load("cable").problem
     data = problem.data.take(np.sort(problem.data.blocks[0].row))
     block = replace(data.blocks[0], **changes)

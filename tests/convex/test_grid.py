@@ -120,3 +120,13 @@ def test_the_grid_is_as_wide_as_it_says() -> None:
     assert {name for name, _, _ in SAMPLE} == set(CASES)
     used = [problem_name for _, problem_name, _ in SAMPLE]
     assert min(used.count(name) for name in PROBLEMS) >= 5
+
+
+def test_the_squares_of_a_robust_loss_are_squares_for_a_stated_solver_too() -> None:
+    """What rules see of a robust loss, where its own solver fails and CVXPY's stands in."""
+    problem = ro.load("blunders").problem
+    program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
+    squares = program.on_squares(program.trusted(program.solve(1.0).z))
+    found, stated = squares.solve(1.0), squares.solve(1.0, solver="CLARABEL")
+    assert stated.loss == pytest.approx(found.loss, rel=1e-6)
+    np.testing.assert_allclose(stated.z, found.z, atol=1e-5)

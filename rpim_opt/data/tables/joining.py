@@ -162,12 +162,7 @@ def _keys(
             found = f"{count} rows of joints and {_count(values)} measured"
             raise InputError("--key row", found, "as many of both, or a column that both have")
         if names and pair:
-            own, others = (_normal(of[name.lower()]) for of, name in zip((left, right), pair, strict=True))
-            there = set(others)
-            other = sum(a != b and a in there for a, b in zip(own, others, strict=True))
-            if other:
-                found = f"{other} of {count} rows whose {pair[0]} is the {pair[1]} of another row"
-                raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
+            _require_order(_normal(left[pair[0].lower()]), _normal(right[pair[1].lower()]), pair)
         numbers = [str(i) for i in range(1, count + 1)]
         return "the number of the row", numbers, numbers
     if "label" in joints and key in ("", "label"):
@@ -187,6 +182,15 @@ def _keys(
         accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
         raise InputError("--key", found, f"{accepted} for the nearest time")
     return f"column '{name}'", _normal(left[name]), _normal(right[name])
+
+
+def _require_order(own: Sequence[str], others: Sequence[str], pair: tuple[str, str]) -> None:
+    """Refuse rows in an order that the names in two columns contradict."""
+    there = set(others)
+    wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
+    if wrong:
+        found = f"{wrong} of {len(own)} rows whose {pair[0]} is the {pair[1]} of another row"
+        raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
 
 
 def _pairs(moving: Sequence[Understood], seen: Sequence[Understood]) -> list[tuple[str, str]]:
