@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import signal
 import sys
 from typing import Any
 
@@ -11,6 +12,8 @@ import pytest
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 """Modules are compiled once, not in each of the processes that tests start."""
+if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # as a shell starts jobs in the background, and these programs
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 SMOKE = (
     "tests/test_architecture.py",
     "tests/test_cli.py",

@@ -146,12 +146,17 @@ def mutant(file: str, number: int) -> Mutant:
     return Mutant(file, line, run, before, after, source)
 
 
-def drawn(count: int, files: Sequence[str] = (), seed: int = 19) -> list[tuple[str, int]]:
-    """Draw places at random, each as likely; the first of many are those of few."""
+def drawn(count: int, files: Sequence[str] = (), seed: int = 34) -> list[tuple[str, int]]:
+    """Draw lines at random, each as likely, and one place of each; the first of many are those of few."""
     files = files or sorted(str(file.relative_to(PACKAGE)) for file in PACKAGE.rglob("*.py"))
-    known = [(file, i) for file in files for i, _ in enumerate(list(places(_tree(file))))]
-    random.Random(seed).shuffle(known)
-    return known[:count]
+    lines: dict[tuple[str, int], list[int]] = {}
+    for file in files:
+        for number, place in enumerate(places(_tree(file))):
+            lines.setdefault((file, getattr(place.node, "lineno", 0)), []).append(number)
+    order = list(lines)
+    chance = random.Random(seed)
+    chance.shuffle(order)
+    return [(line[0], chance.choice(lines[line])) for line in order][:count]
 
 
 def _tree(file: str) -> ast.Module:

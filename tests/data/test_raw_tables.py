@@ -15,6 +15,7 @@ from rpim_opt.basics.tables import read_grid
 from rpim_opt.basics.units import parse_units
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
+from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.understanding import Understood, understand
 
@@ -64,6 +65,14 @@ REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     ),
     "a quote that does not end": (HEAD + 'P1,1,2,3,4,"5\nP2,1,2,3,4,5\n', {}, "line "),
 }  # fmt: skip
+
+
+def test_points_of_several_arrays_are_named_by_array_and_key(tmp_path: Path) -> None:
+    homes = '<Data name="home"><Value key="0" j1="1"/></Data><Data name="cell"><Value key="0" x="7"/></Data>'
+    path = write(tmp_path, homes + '<Data name="calib"><Value j1="2"/><Value j1="3"/></Data>', "raw.dtx")
+    columns = read_raw(path).columns
+    assert list(columns["label"]) == ["home[0]", "calib[0]", "calib[1]"]
+    assert list(columns["J1 [deg]"]) == ["1", "2", "3"]
 
 
 @pytest.mark.parametrize("what", REFUSED)

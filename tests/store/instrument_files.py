@@ -390,6 +390,10 @@ STRANGERS: dict[str, Shape] = {
     "VAL3": program(
         "p.dtx", lines('<Value key="{}" j1="{}" j2="{}" j3="{}" j4="{}" j5="{}" j6="{}"/>\n'), key="row"
     ),
+    "VAL3, points without a key, which VAL3 counts from 0": many(
+        ("p.dtx", lines('<Value j1="{1}" j2="{2}" j3="{3}" j4="{4}" j5="{5}" j6="{6}"/>\n')),
+        ("points.csv", text([["Point", *HEAD[7:]]], [[str(i), *row] for i, row in enumerate(POINTS)])),
+    ),
     "Yaskawa job": program("P.JBI", "///POSTYPE ANGLE\n" + lines("C{:05d}={},{},{},{},{},{}\n"), key="row"),
     "KUKA, inline axes": program("m.src", lines("PTP {{A1 {1},A2 {2},A3 {3},A4 {4},A5 {5},A6 {6}}}\n"), key="row"),
     "RAPID, MoveAbsJ alone": program("m.mod", lines("MoveAbsJ [[{1},{2},{3},{4},{5},{6}],[9E9,9E9]],v9;\n"), key="row"),

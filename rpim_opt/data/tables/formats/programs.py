@@ -24,7 +24,7 @@ ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
-STAUBLI = re.compile(r"<Value\s([^<>]{0,2000})>")
+STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
 KUKA_NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **dict(zip("XYZ", PLACE, strict=True)),
               **{turn: f"commanded {turn} [deg]" for turn in "ABC"}}  # fmt: skip
@@ -115,11 +115,20 @@ def read_yaskawa(text: str) -> Rows:
 
 
 def read_staubli(text: str) -> Rows:
-    """Return the points by their keys."""
-    found = [dict(re.findall(r'\b(\w+)\s*=\s*"([^"]*)"', fields)) for fields in STAUBLI.findall(text)]
-    found = [each for each in found if "j1" in each] or found
-    rows = [{new: each[name] for name, new in STAUBLI_NAMES.items() if name in each} for each in found]
-    return _rows([(each.get("key", ""), row) for each, row in zip(found, rows, strict=True)])
+    """Return the points by their keys, from 0 where they have none; those of several arrays as ``array[key]``."""
+    array, i = "", -1
+    found = []
+    for element, fields in STAUBLI.findall(text):
+        given = dict(re.findall(r'\b(\w+)\s*=\s*"([^"]*)"', fields))
+        if element == "Data":
+            array, i = given.get("name", ""), -1
+            continue
+        i += 1
+        values = {new: given[name] for name, new in STAUBLI_NAMES.items() if name in given}
+        found.append((array, given.get("key", str(i)), values))
+    found = [each for each in found if "J1 [deg]" in each[2]] or found
+    several = len({array for array, _, _ in found}) > 1
+    return _rows([(f"{array}[{key}]" if several else key, values) for array, key, values in found])
 
 
 def _has_abb(text: str) -> bool:
@@ -134,5 +143,5 @@ FORMATS = (
         "URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)) is not None, read_urscript
     ),
     TableFormat("Yaskawa job", (".jbi",), lambda text: YASKAWA.search(text) is not None, read_yaskawa),
-    TableFormat("VAL3 data", (".dtx",), lambda text: STAUBLI.search(text) is not None, read_staubli),
+    TableFormat("VAL3 data", (".dtx",), lambda text: "<Value" in text, read_staubli),
 )
