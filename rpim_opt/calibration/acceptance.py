@@ -514,7 +514,7 @@ def _decisive(result: Calibration, found: Workspace) -> list[str]:
     parts = {
         "the place of the reflector (tool_x, tool_y, tool_z)": [name.startswith("tool_") for name in names],
         "the base": [name.startswith("base_") for name in names],
-        "the transmission errors": [name.startswith("transmission") for name in names],
+        "the transmission errors": free.of_curves,
     }
     parts["the links and joint offsets"] = ~np.any(list(parts.values()), axis=0)
     q = found.q[-1:]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,10 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, table
 from rpim_opt.basics.units import display
+from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.covariance import NoiseTest, coverage_factor
 from rpim_opt.calibration.outcome import Outcome, Prediction
+from rpim_opt.robot.terms import transmission
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -117,7 +119,9 @@ class Uncertainty(Tabled):
          a2            mm     -0.2622     0.0069     0.0005        0.0069        0.0138
         """
         rows: list[list[str]] = []
-        for row in self._frame_rows():
+        for row, of_curve in zip(self._frame_rows(), self.result.problem.parameters.free.of_curves, strict=True):
+            if of_curve:
+                continue
             name = row["parameter"] + (" *" if row["held_back"] else "")
             rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
         expanded = f"U, k = {self.coverage_factor:.2f}"
@@ -161,6 +165,60 @@ def known_covariance(result: Outcome) -> Array | None:
         return result.covariance
     except InputError:
         return None
+
+
+class TransmissionError(NamedTuple):
+    """What a joint (from 1) turns further than its values ``q`` (K,), and its standard uncertainty [rad].
+
+    ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS of what the error moves in the
+    measured lengths [m].
+    """
+
+    joint: int
+    q: Array
+    error: Array
+    standard: Array
+    measured: tuple[float, float]
+    effect: float
+
+    @property
+    def inside(self) -> np.ndarray:
+        """(K,) which values are within those measured."""
+        return (self.q >= self.measured[0]) & (self.q <= self.measured[1])
+
+    @property
+    def rms(self) -> float:
+        """RMS within the measured range [rad]."""
+        return float(np.sqrt(np.mean(self.error[self.inside] ** 2)))
+
+
+def transmission_errors(result: Outcome) -> list[TransmissionError]:
+    """Return the curves of the joints, four values a period of the finest harmonic; none where none were admitted."""
+    free = result.problem.parameters.free
+    if not free.of_curves.any():
+        return []
+    C = known_covariance(result)
+    part = next(iter(result.problem.rows()))
+    J = part.jacobian(result.x)
+    length = np.zeros(len(J), dtype=bool)
+    for stack in part.stacks(joints=False):
+        length[stack.index] = stack.length
+    rows = max(len(np.unique(part.owners[length])), 1)
+    found = []
+    for curve in part.robot.model.curves:
+        place = [free.names.index(name) for name in transmission(curve).names(curve.joint)]
+        q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
+        columns = series([curve._replace(joint=1)], q[:, None], np.ones((len(q), 1)))
+        variance = np.full(len(q), np.nan)
+        if C is not None:
+            variance = np.sum((columns @ C[np.ix_(place, place)]) * columns, axis=1)
+        at = part.joint_values[:, curve.joint - 1]
+        effect = np.linalg.norm(J[np.ix_(length, place)] @ result.x[place]) / np.sqrt(rows)
+        ends = float(at.min()), float(at.max())
+        found.append(
+            TransmissionError(curve.joint, q, columns @ result.x[place], np.sqrt(variance), ends, float(effect))
+        )
+    return found
 
 
 def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:

@@ -12,10 +12,10 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
-from rpim_opt.bayes.prior import BASE, SESSIONS, family_of
+from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.uncertainty import known_covariance
+from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
 from rpim_opt.calibration.verdict import Verdict, rms
 from rpim_opt.convex.select import disagreement
 from rpim_opt.data.dataset import Dataset
@@ -84,19 +84,33 @@ def turned_frames(result: Outcome) -> list[str]:
 
 
 def parameter_table(result: Outcome) -> str:
-    """Return the identified parameters as a table of text."""
-    return table(*columns(result))
+    """Return the identified parameters as a table of text, and the joints' transmission errors as another."""
+    head, rows = curve_columns(result)
+    return "\n\n".join([table(*columns(result)), *([table(head, rows)] if rows else [])])
 
 
 def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of identified parameters."""
     cells = []
-    for row in parameter_rows(result):
-        if family_of(row["name"]) != "transmission":
+    for row, of_curve in zip(parameter_rows(result), result.problem.parameters.free.of_curves, strict=True):
+        if not of_curve:
             figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
             std = "-" if row["std"] is None else f"{row['std']:.4f}"
             cells.append([row["name"], row["unit"], *figures, std])
     return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
+
+
+def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
+    """Return head and cells of the table of transmission errors, over the measured range of each joint."""
+    cells = []
+    for curve in transmission_errors(result):
+        inside = curve.inside
+        sizes = [curve.rms, np.abs(curve.error[inside]).max(), np.median(curve.standard[inside])]
+        low, high = np.degrees(curve.measured)
+        figures = [f"{1e3 * size:.3f}" for size in (*sizes, curve.effect)]
+        cells.append([f"joint {curve.joint}", f"{low:.1f} to {high:.1f}", *figures])
+    head = ["transmission error", "measured [deg]", "RMS [mrad]", "maximum [mrad]", "std, median [mrad]"]
+    return [*head, "at the tool, RMS [mm]"], cells
 
 
 def sentences(result: Outcome, verdict: Verdict) -> list[str]:

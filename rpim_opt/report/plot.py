@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import Uncertainty
+from rpim_opt.calibration.uncertainty import TransmissionError, Uncertainty
 from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import Selection, weight_grid
@@ -141,7 +141,7 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     ('deviation from nominal [deg]', 13)
     """
     free = result.problem.parameters.free
-    own = np.flatnonzero(~free.of_frames & (np.array(free.dimensions) == dimension))
+    own = np.flatnonzero(~free.of_frames & ~free.of_curves & (np.array(free.dimensions) == dimension))
     ax = _axes(ax, len(own))
     unit, si = display(dimension)
     x = result.x[own] / si
@@ -170,6 +170,18 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     ax.set(xlim=(-reach, reach), xlabel=f"deviation from nominal [{unit}]{cut}")
     _name(ax, "y", names)
     return _with_legend(ax)
+
+
+def transmission_error(curve: TransmissionError, factor: float, largest: float, ax: Axes) -> None:
+    """Draw a joint's transmission error with its interval, of a coverage factor, up to a largest value [rad]."""
+    at, error, half = np.degrees(curve.q), 1e3 * curve.error, 1e3 * factor * curve.standard
+    low, high = np.degrees(curve.measured)
+    ax.axvspan(low, high, color=COLORS["before"], alpha=0.2, lw=0, label="measured")
+    ax.fill_between(at, error - half, error + half, color=COLORS["after"], alpha=0.3, lw=0, label="95 % interval")
+    ax.plot(at, error, color=COLORS["after"], lw=1.2, label="error")
+    ax.set(xlabel=f"joint {curve.joint} [deg]", ylabel="error [mrad]", xlim=(at[0], at[-1]))
+    ax.set_ylim(-1e3 * largest, 1e3 * largest)
+    _with_legend(ax)
 
 
 def active_tolerance(result: Calibration) -> Array:

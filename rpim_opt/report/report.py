@@ -22,8 +22,16 @@ from rpim_opt.calibration.acceptance import Acceptance, Workspace
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import Uncertainty
-from rpim_opt.calibration.words import HEADER, noise_sentence, scatter, scatter_rows, turned_frames, weight_lines
+from rpim_opt.calibration.uncertainty import Uncertainty, transmission_errors
+from rpim_opt.calibration.words import (
+    HEADER,
+    curve_columns,
+    noise_sentence,
+    scatter,
+    scatter_rows,
+    turned_frames,
+    weight_lines,
+)
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
@@ -249,6 +257,8 @@ def _parameters(content: Content) -> Iterator[Block]:
     held = {each.name for each in result.held}
     rows = []
     for i, row in enumerate(result.parameter_rows()):
+        if free.of_curves[i]:
+            continue
         _, si = display(free.dimensions[i])
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in held:
@@ -264,7 +274,7 @@ def _parameters(content: Content) -> Iterator[Block]:
         rows = [row[:-1] for row in rows]
     yield "text", weight_lines(result)
     yield "text", [note, *turned_frames(result)]
-    own = np.array(free.dimensions)[~free.of_frames]
+    own = np.array(free.dimensions)[~free.of_frames & ~free.of_curves]
     drawn = []
     for dimension in ("length", "angle"):
         if dimension in own:
@@ -272,6 +282,24 @@ def _parameters(content: Content) -> Iterator[Block]:
             title, caption = f"Deviations of the {dimension} parameters", f"The robot's own {dimension} parameters."
             drawn.append(figure(draw, title, caption, 80.0 + 17 * np.count_nonzero(own == dimension)))
     yield "beside", [("table", Table("Identified parameters", head, rows)), ("figures", drawn)]
+    yield from _transmission(result)
+
+
+def _transmission(result: Calibration) -> Iterator[Block]:
+    curves = transmission_errors(result)
+    if not curves:
+        return
+    yield "heading", "Transmission errors of the joints"
+    yield "text", ["A joint turns further than its value by this error: beyond the measured range its size is known."]
+    yield "table", Table("Within the measured range", *curve_columns(result))
+    factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
+    largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
+    drawn = []
+    for each in curves:
+        draw = partial(plot.transmission_error, each, factor, largest)
+        caption = f"Joint {each.joint}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
+        drawn.append(figure(draw, f"Transmission error of joint {each.joint}", caption, 200.0))
+    yield "figures", drawn
 
 
 # --- diagnostics -------------------------------------------------------------------------------------------
@@ -310,7 +338,8 @@ def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
 
 
 def _identifiability(result: Calibration) -> Iterator[Block]:
-    found = observe(result.problem)
+    parameters = result.problem.parameters
+    found = observe(result.problem.identifying(parameters.identified & ~parameters.of_curves))
     text = f"{found.configurations} configurations. {summary.identifiability(result)}"
     redundant = [f"{combination(each)}" for each in found.redundant]
     if result.record.earlier:

@@ -16,6 +16,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.data.record import Requirement
+from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
 
@@ -197,9 +198,13 @@ def headline(result: Calibration) -> str:
 
 
 def identifiability(result: Calibration) -> str:
-    """Return how many combinations of the parameters the data identify."""
+    """Return how many combinations of the parameters the data identify, coefficients of curves apart."""
     model = result.program.model
-    return f"{model.rank} of {len(result.x)} parameter combinations are identifiable from {model.equations} equations."
+    parameters = ~result.problem.parameters.free.of_curves
+    s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
+    text = f"{np.sum(s > RANK_TOLERANCE * s[0])} of {parameters.sum()} parameter combinations are identifiable"
+    apart = "" if parameters.all() else ", apart from the transmission errors of the joints"
+    return f"{text} from {model.equations} equations{apart}."
 
 
 def warnings(result: Calibration) -> list[str]:

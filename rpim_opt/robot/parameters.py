@@ -190,6 +190,11 @@ class Parameters(Tabled):
         return np.array([not of_joint(name) and name not in self.terms for name in self.names])
 
     @property
+    def of_curves(self) -> np.ndarray:
+        """(P,) which are coefficients of the joints' transmission errors: hundreds, that say little one by one."""
+        return np.array([own_name(name).startswith("transmission") for name in self.names], dtype=bool)
+
+    @property
     def placed(self) -> np.ndarray:
         """(P,) which of these may be anywhere: all but the session offsets, which are as small as their scales."""
         return self.of_frames & ~np.array([of_session(name) for name in self.names], dtype=bool)

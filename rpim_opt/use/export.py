@@ -19,10 +19,10 @@ from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, w
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.prior_terms import prior_penalty
-from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import Described, placed, same_place
@@ -31,7 +31,6 @@ from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_
 from rpim_opt.robot.formats.urdf import read_urdf, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
-from rpim_opt.robot.terms import transmission
 
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
@@ -214,24 +213,15 @@ def _without_extensions(result: Calibration, added: Sequence[str]) -> Calibratio
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     """Write four rows a period of the finest harmonic, with standard deviations; say how large the errors are."""
-    curves = result.problem.robot.model.curves
+    curves = transmission_errors(result)
     if not curves:
         accepted = "one with transmission errors of joints (model 'auto', where the data support them)"
         raise InputError("the calibration", "no transmission error", accepted)
-    free = result.problem.parameters.free.names
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
-    sizes = []
     for curve in curves:
-        place = [free.index(name) for name in transmission(curve).names(curve.joint)]
-        q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
-        values = np.zeros((len(q), curve.joint))
-        values[:, -1] = q
-        columns = series((curve,), values, np.ones_like(values))
-        correction = 1e3 * columns @ result.x[place]
-        std = 1e3 * np.sqrt(np.sum((columns @ result.covariance[np.ix_(place, place)]) * columns, axis=1))
-        sizes.append(f"joint {curve.joint} {np.sqrt(np.mean(correction**2)):.3f}")
-        rows = zip(np.degrees(q), correction, std, strict=True)
+        rows = zip(np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard, strict=True)
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
+    sizes = [f"joint {curve.joint} {1e3 * curve.rms:.3f}" for curve in curves]
     write_text(target, "\n".join(lines) + "\n")
     return [
         f"Transmission errors (RMS, mrad): {joined(sizes)}. A joint stands at angle_deg plus the correction: subtract "

@@ -7,6 +7,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import words
+from rpim_opt.calibration.uncertainty import transmission_errors
+from rpim_opt.report import report
 from tests.simulate import ARM
 
 ROBOT = dataclasses.replace(
@@ -56,7 +58,14 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     assert rms(result.errors(others)) < 1.4 * floor < rms(ro.calibrate(result.stated).errors(others)) / 2
     assert 0.90 < ro.use.validate(result, others).coverage <= 0.99
     assert "Transmission error of joints (1 sigma)" in str(result)
-    assert "transmission2_c1" not in words.parameter_table(result)
+    text = words.parameter_table(result) + ro.calibration.Uncertainty(result).budget()
+    assert "transmission2_c1" not in text
+    assert text.count("joint 2") == 1
+    assert any(row["name"] == "transmission2_c1" for row in result.parameter_rows())
+    page = report.page(result)
+    assert "transmission2_c1" not in page
+    assert "Joint 2: 0." in page
+    assert "parameter combinations are identifiable from 360 equations, apart from the transmission errors" in page
 
 
 def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
@@ -82,6 +91,10 @@ def test_corrections_are_a_table(rippled, tmp_path):
     table = np.genfromtxt(tmp_path / "joints.csv", delimiter=",", skip_header=1)
     rows = table[(table[:, 0] == 2) & (np.abs(table[:, 1]) < 50)]
     q = np.radians(rows[:, 1])
+    curve = transmission_errors(result)[1]
+    assert np.allclose(np.interp(q, curve.q, 1e3 * curve.error), rows[:, 2], atol=1e-4)
+    assert 0.8 < curve.rms / (SIZE / np.sqrt(2)) < 1.2
+    assert 0.3 < curve.effect / curve.rms < 1.0  # [m/rad]: how far the tool is
     wave = 1e3 * SIZE * np.cos(CYCLES * q + 0.5)
     slow = np.polynomial.Polynomial.fit(q, rows[:, 2] - wave, 4)  # geometry may stand for it
     assert rms(rows[:, 2] - wave - slow(q)) < 0.2 * 1e3 * SIZE
