@@ -133,6 +133,10 @@ Noise = Annotated[
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or the folder it lies in.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
+Sheet = Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")]
+Key = Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")]
+TimeTolerance = Annotated[Number, Option(help="Join files by the nearest time, at most so many seconds apart.")]
+Several = "several files are stacked, or joined as by new."
 Type = Annotated[Text, Option(help="Which of the result's measurement types, if there are several.")]
 Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
 Largest = Annotated[Number, Option(help="Largest error that is allowed [mm]; exit code 1 above.")]
@@ -176,12 +180,10 @@ def new(
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     units: Units = "",
     dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
-    sheet: Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")] = "",
+    sheet: Sheet = "",
     columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = "",
-    key: Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")] = "",
-    time_tolerance: Annotated[
-        Number, Option(help="Join files by the nearest time, at most so many seconds apart.")
-    ] = None,
+    key: Key = "",
+    time_tolerance: TimeTolerance = None,
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
     rotation: Annotated[str, Option(help="What rx, ry, rz are: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
@@ -347,8 +349,11 @@ def report(
 @app.command()
 def validate(
     result: Result,
-    data: Annotated[Path, Argument(help="New measurements, in the same instrument's frame.")],
+    data: Annotated[list[Path], Argument(help=f"New measurements, in the same instrument's frame; {Several}")],
     units: Units = "",
+    key: Key = "",
+    time_tolerance: TimeTolerance = None,
+    sheet: Sheet = "",
     measurement: Type = None,
     limit: Largest = None,
     out: Table = None,
@@ -368,12 +373,13 @@ def validate(
         from rpim_opt.use.reading import read_measurements
         from rpim_opt.use.validation import validate
 
-        rows, left_out = read_measurements(loaded, data, measurement, units)
-        found = validate(loaded, rows)
+        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
+        read = read_measurements(loaded, data, measurement, options)
+        found = validate(loaded, read.data)
     text, kept = _against(limit, "error", found.largest)
     document = {**found.content(), "limit_mm": limit, "within_limit": kept}
     written = console.written_to(out, found.csv())
-    _answer("\n".join([str(found), *text]), document, as_json, written, left_out)
+    _answer("\n".join([str(found), *text]), document, as_json, written, read.left_out, read.notes)
     if kept is False or found.mistake or found.worse:
         raise typer.Exit(1)
 
@@ -383,8 +389,13 @@ def accept(
     result: Result,
     limit: Tolerance = None,
     box: Box = None,
-    data: Annotated[File, Option(help="New measurements that check it, instead of those it has.")] = None,
+    data: Annotated[
+        list[Path] | None, Option(help=f"New measurements that check it, instead of those it has; {Several}")
+    ] = None,
     units: Units = "",
+    key: Key = "",
+    time_tolerance: TimeTolerance = None,
+    sheet: Sheet = "",
     measurement: Type = None,
     allow_code: Code = False,
     as_json: Json = False,
@@ -397,13 +408,11 @@ def accept(
         from rpim_opt.calibration.acceptance import accept
         from rpim_opt.use.reading import read_measurements
 
-        rows = None
-        left_out: tuple[str, ...] = ()
-        if data is not None:
-            rows, left_out = read_measurements(loaded, data, measurement, units)
+        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
+        read = read_measurements(loaded, data, measurement, options) if data else None
         say("searching for the maximum uncertainty")
-        found = accept(loaded, console.required(limit, box, loaded.record.requirement), rows)
-    _answer(found, found.content(), as_json, left_out=left_out)
+        found = accept(loaded, console.required(limit, box, loaded.record.requirement), read and read.data)
+    _answer(found, found.content(), as_json, left_out=read.left_out if read else (), notes=read.notes if read else ())
     _end_by(found.content())
 
 
@@ -438,8 +447,13 @@ def iso9283(
 @app.command()
 def update(
     result: Result,
-    data: Annotated[Path, Argument(help="New measurements of the same robot, in the same instrument's frame.")],
+    data: Annotated[
+        list[Path], Argument(help=f"New measurements of the same robot, in the same instrument's frame; {Several}")
+    ],
     units: Units = "",
+    key: Key = "",
+    time_tolerance: TimeTolerance = None,
+    sheet: Sheet = "",
     measurement: Type = None,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
@@ -456,12 +470,13 @@ def update(
         from rpim_opt.use.reading import read_measurements
         from rpim_opt.use.recalibration import update
 
-        rows, left_out = read_measurements(loaded, data, measurement, units)
+        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
+        read = read_measurements(loaded, data, measurement, options)
         patterns = reset.replace(",", " ").split()
-        found = update(loaded, rows, prior_inflation=prior_inflation, reset=patterns, progress=say)
+        found = update(loaded, read.data, prior_inflation=prior_inflation, reset=patterns, progress=say)
         updated = found.result
-        updated = replace(updated, record=replace(updated.record, files={data.name: sha256_of(data)}))
-    _answer(found, found.content(), as_json, _saved(updated, out), left_out)
+        updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
+    _answer(found, found.content(), as_json, _saved(updated, out), read.left_out, read.notes)
     if not (found.explained and updated.verdict.delivered):
         raise typer.Exit(1)
 
@@ -469,8 +484,13 @@ def update(
 @app.command()
 def monitor(
     result: Result,
-    checks: Annotated[Path, Argument(help="Check readings; a column time, timestamp or date orders them.")],
+    checks: Annotated[
+        list[Path], Argument(help=f"Check readings; a column time, timestamp or date orders them; {Several}")
+    ],
     units: Units = "",
+    key: Key = "",
+    time_tolerance: TimeTolerance = None,
+    sheet: Sheet = "",
     measurement: Type = None,
     out: Annotated[File, Option(help="The chart over time: .html, or its points as .csv.")] = None,
     allow_code: Code = False,
@@ -483,12 +503,13 @@ def monitor(
     with _loaded(result) as (loaded, _):
         from rpim_opt.report.page import written_checks
         from rpim_opt.use.monitoring import monitor
-        from rpim_opt.use.reading import read_checks
+        from rpim_opt.use.reading import read_measurements
 
-        read = read_checks(loaded, checks, measurement, units)
-        found = monitor(loaded, read.data, read.when, read.times)
+        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
+        read = read_measurements(loaded, checks, measurement, options)
+        found = monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
         written = written_checks(found, out, loaded.record.title)
-    _answer(found, found.content(), as_json, written, read.left_out)
+    _answer(found, found.content(), as_json, written, read.left_out, read.notes)
     if found.drifts:
         raise typer.Exit(1)
 
@@ -560,7 +581,7 @@ def compensate(
         from rpim_opt.use.compensation import compensate
         from rpim_opt.use.reading import read_commands
 
-        read, left_out = read_commands(loaded, targets, units)
+        read, left_out = read_commands(loaded, targets, console.table_options(units))
         say("compensating")
         found = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
@@ -791,13 +812,14 @@ def _answer(
     as_json: bool,
     written: Sequence[Path] | None = None,
     left_out: Sequence[str] | None = None,
+    notes: Sequence[str] = (),
 ) -> None:
-    """Print what was found, columns that were left out, and files that were written."""
-    lines = [str(text)] if str(text) else []
+    """Print what was found, how tables were read, columns that were left out, and files that were written."""
+    lines = [*([str(text)] if str(text) else []), *notes]
     if left_out:
         lines.append(f"Columns that were left out: {', '.join(left_out)}.")
     lines += [f"Written: {file}" for file in written or ()]
-    more = {"left_out": left_out, "written": written}
+    more = {"left_out": left_out, "tables": notes or None, "written": written}
     console.show("\n".join(lines), {**document, **{k: v for k, v in more.items() if v is not None}}, as_json)
 
 

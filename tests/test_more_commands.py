@@ -78,3 +78,47 @@ def test_touches_are_designed_at_a_point(monkeypatch: pytest.MonkeyPatch, capsys
     assert "3 of 8 configurations, D-optimal" in capsys.readouterr().out
     assert run(monkeypatch, *asked[:-1], "here") == 2
     assert "x,y,z [mm]" in capsys.readouterr().err
+
+
+def test_two_logs_are_read_alike_by_every_command_that_takes_measurements(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any
+) -> None:
+    """The key that ``new`` took stays; a later one of another name is stated."""
+    problem = ro.load("position").problem
+    robot = tmp_path / "robot.csv"
+    ro.use.export_files(ro.calibrate(problem, weight=1e9), mdh=robot, despite_verdict=True)
+
+    def logs(name: str, rows: Any, key: str) -> list[str]:
+        table = np.column_stack([np.degrees(problem.data.q[rows]), 1e3 * problem.data.blocks[0].y[rows]])
+        texts = [[f"P{i}", *(f"{v:.5f}".replace(".", ",") for v in row)] for i, row in enumerate(table)]
+        paths = [tmp_path / f"{name}_joints.csv", tmp_path / f"{name}_tracker.csv"]
+        joints = [[key, *(f"Achse {i} [Grad]" for i in range(1, 7))], *(row[:7] for row in texts)]
+        values = [[key, "Zeit", "X [mm]", "Y [mm]", "Z [mm]"]]
+        values += [[row[0], f"2026-03-{i + 1:02d}", *row[7:]] for i, row in enumerate(texts)]
+        paths[0].write_text("\n".join(map(";".join, joints)), encoding="utf-8")
+        paths[1].write_text("\n".join(map(";".join, [values[0], *reversed(values[1:])])), encoding="utf-8")
+        return [str(path) for path in paths]
+
+    joints, tracker = logs("first", slice(0, 25), "Messpunkt")
+    cell = str(tmp_path / "cell")
+    asked = ["new", cell, "--robot", str(robot), "--dh", "modified", "--data", joints, "--data", tracker]
+    assert run(monkeypatch, *asked, "--key", "Messpunkt") == 0
+    assert ro.load(cell).record.reading["key"] == "Messpunkt"
+    assert run(monkeypatch, "calibrate", cell, "--out", cell, "--json") == 0
+    later = logs("later", slice(25, 33), "Messpunkt")
+    capsys.readouterr()
+    found = {}
+    for command, *options in (
+        ["validate", cell, *later],
+        ["update", cell, *later],
+        ["monitor", cell, *later],
+        ["accept", cell, "--limit", "9", "--data", later[0], "--data", later[1]],
+    ):
+        assert run(monkeypatch, command, *options, "--json") == 0, command
+        found[command] = json.loads(capsys.readouterr().out)
+        assert found[command]["tables"][-1].endswith("8 rows of 8 with joints and 8 measured.")
+    assert found["validate"]["identified"]["count"] == 8
+    assert found["validate"]["left_out"] == []
+    other = logs("other", slice(25, 33), "Nummer")
+    assert run(monkeypatch, "validate", cell, *other, "--key", "Nummer") == 0
+    assert "joined by column 'nummer': 8 rows of 8" in capsys.readouterr().out

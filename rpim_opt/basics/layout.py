@@ -43,7 +43,8 @@ WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 UNITS_LINE = re.compile(r"\W*(?:units?|einheit(?:en)?|unités?|unidades|unità)\s*[:=]?\s+(.+)", re.IGNORECASE)
 """A line above the header that states units."""
 READING = (
-    "encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "constants", "joints",
+    "sheet", "encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "constants",
+    "key", "within", "joints",
 )  # fmt: skip
 """What a problem file remembers of how its tables were read, so that later ones are read alike."""
 
@@ -112,11 +113,14 @@ class TableOptions:
         found: dict[str, Any] = dict(texts)
         for name in ("columns", "constants", "joints"):
             found[name] = tuple(filter(None, texts.get(name, "").split(",")))
+        if "within" in texts:
+            found["within"] = numeral(texts["within"])
         return cls(**found)
 
     def texts(self) -> dict[str, str]:
-        """Return what is stated as texts, but for the sheet and for how several files are joined."""
+        """Return what is stated as texts."""
         said = {name: getattr(self, name) for name in READING}
+        said["within"] = "" if self.within is None else repr(self.within)
         units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
         said |= {"units": ",".join(units)}
         said |= {name: ",".join(getattr(self, name)) for name in ("columns", "constants", "joints")}

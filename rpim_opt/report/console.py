@@ -156,7 +156,7 @@ def required(limit: float | None, box: str | None, stated: Requirement | None) -
     return replace(stated, box=sides or stated.box)
 
 
-def table_options(units: str, columns: str, **stated: Any) -> TableOptions:
+def table_options(units: str, columns: str = "", **stated: Any) -> TableOptions:
     """Return what the options of a command state of its raw tables."""
     from rpim_opt.basics.layout import TableOptions
     from rpim_opt.basics.units import parse_units

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
@@ -12,7 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
-from rpim_opt.basics.tables import Columns
+from rpim_opt.basics.tables import Columns, read_columns
 from rpim_opt.basics.units import dimension_of, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
@@ -39,7 +39,7 @@ READINGS = {
 """What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
 NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
 """Standard deviations where the data state none."""
-Files = Sequence[tuple[Path, RawTable]]
+Files = Sequence[tuple[Path | None, RawTable]]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,8 +50,8 @@ class Understanding:
     ----------
     kind
         What was measured.
-    columns
-        One table with our names, texts and numbers as the files have them.
+    columns, raw
+        One table with our names, texts and numbers as the files have them; with theirs, of the same rows.
     tables
         What was understood of every file.
     notes
@@ -75,10 +75,16 @@ class Understanding:
 
     kind: Measurement
     columns: Columns
+    raw: Columns
     tables: tuple[Understood, ...]
     notes: tuple[str, ...]
     options: TableOptions
     file: str
+
+    @property
+    def left_out(self) -> tuple[str, ...]:
+        """The names of columns that mean nothing here, of all files."""
+        return tuple(dict.fromkeys(name for table in self.tables for name in table.left_out))
 
     @property
     def count(self) -> int:
@@ -175,9 +181,16 @@ def understand_tables(
     return found
 
 
-def rows_of(found: Understanding, columns: Columns, arm: Described, kind: Measurement) -> Dataset:
+def rows_of(
+    found: Understanding,
+    columns: Columns,
+    arm: Described,
+    kind: Measurement,
+    noise: Mapping[str, float] | None = None,
+) -> Dataset:
     """Return the measurements in understood columns; an error names the column as the file does."""
-    noise = {f"{name}_{NOISE[dimension][0]}": NOISE[dimension][1] for name, dimension in kind.noise.items()}
+    if noise is None:
+        noise = {f"{name}_{NOISE[dimension][0]}": NOISE[dimension][1] for name, dimension in kind.noise.items()}
     try:
         return read_data(columns, arm.robot, noise, kind)
     except InputError as error:
@@ -185,7 +198,7 @@ def rows_of(found: Understanding, columns: Columns, arm: Described, kind: Measur
         own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
         where = f"{row}{mark}'{own[ours]}'" if own.get(ours, ours) != ours else error.where
         accepted = error.accepted
-        others = [(name, split(name)[1]) for table in found.tables for name in table.left_out]
+        others = [(name, split(name)[1]) for name in found.left_out]
         lengths = [name for name, unit in others if unit and dimension_of(unit) == "length"]
         lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
         if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
@@ -194,18 +207,22 @@ def rows_of(found: Understanding, columns: Columns, arm: Described, kind: Measur
 
 
 def understand_of(
-    arm: Described, data: Sequence[str | Path], measurement: str | None = None, options: TableOptions | None = None
+    arm: Described,
+    data: Sequence[Any],
+    measurement: str | Measurement | None = None,
+    options: TableOptions | None = None,
+    targets: bool = False,
 ) -> Understanding:
-    """Return what raw tables of an arm say, as `understand_tables` does."""
+    """Return what raw tables of an arm say, files or data frames, as `understand_tables` does; or tables of targets."""
     options = options or TableOptions()
-    files = [(path, raw) for path in map(Path, data) for raw in _sheets(path, options)]
-    known = _known_type(files, measurement)
+    files = [each for source in data for each in _sheets(source, options)]
+    known = measurement if isinstance(measurement, Measurement) else _known_type(files, measurement)
     for kind in [known] if known else (pose, position):
-        tables = _tables(files, arm, kind, options)
+        tables = _tables(files, arm, kind, options, targets)
         if known or _has_all_values(tables, kind):
             found = _whole(files, arm, kind, options, tables)
             doubt = next((each.doubt for each in tables if each.doubt), "")
-            return _checked(found, files, arm, doubt) if doubt and kind.turning else found
+            return _checked(found, files, arm, doubt) if doubt and kind.turning and not targets else found
     names = ", ".join(name for _, raw in files for name in raw.columns)
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
@@ -225,21 +242,27 @@ def _has_all_values(tables: Sequence[Understood], kind: Measurement) -> bool:
     return any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms)))
 
 
-def _sheets(path: Path, options: TableOptions) -> list[RawTable]:
-    """Return the tables of a file: of the sheet that is called as stated, commas and all, or of several."""
+def _sheets(source: Any, options: TableOptions) -> Files:
+    """Return the tables of a source: of the sheet that is called as stated, commas and all, or of several."""
+    if not isinstance(source, str | Path):
+        return [(None, RawTable(read_columns(source)))]
+    path = Path(source)
     try:
-        return [read_raw(path, replace(options, sheet=options.sheet.strip()))]
+        return [(path, read_raw(path, replace(options, sheet=options.sheet.strip())))]
     except InputError as error:
         if error.where != "--sheet" or "," not in options.sheet:
             raise
-    return [read_raw(path, replace(options, sheet=sheet.strip())) for sheet in options.sheet.split(",")]
+    return [(path, read_raw(path, replace(options, sheet=sheet.strip()))) for sheet in options.sheet.split(",")]
 
 
-def _tables(files: Files, arm: Described, kind: Measurement, options: TableOptions) -> list[Understood]:
+def _tables(
+    files: Files, arm: Described, kind: Measurement, options: TableOptions, targets: bool = False
+) -> list[Understood]:
     tables = []
     for path, raw in files:
         try:
-            tables.append(replace(understand(raw, arm.robot, kind, options, arm.names), file=path.name))
+            found = understand(raw, arm.robot, kind, options, arm.names, targets)
+            tables.append(replace(found, file=path.name if path else "the table"))
         except InputError as error:
             raise error.within(path) from None
     return tables
@@ -253,7 +276,7 @@ def _whole(
     except InputError as error:
         raise error.within(files[0][0] if len(files) == 1 else None) from None
     shown = tuple(_joined(each, options, whole.notes) for each in tables)
-    return Understanding(kind, whole.columns, shown, whole.notes, options, str(files[0][0]))
+    return Understanding(kind, whole.columns, whole.raw, shown, whole.notes, options, str(files[0][0] or ""))
 
 
 def _joined(table: Understood, options: TableOptions, notes: Sequence[str]) -> Understood:
@@ -295,7 +318,8 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
         )
     if misfit[second] <= CLEARLY * misfit[best]:
         where = "the order of the quaternion"
-        raise InputError(where, f"no clear one ({figures})", "--quaternion wxyz or xyzw", first.file)
+        accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
+        raise InputError(where, f"no clear one ({figures})", accepted, first.file)
     note = (
         f"the quaternion's order is {best}: on the nominal robot it leaves {misfit[best]:.2f} deg, "
         f"{second} {misfit[second]:.1f} deg."

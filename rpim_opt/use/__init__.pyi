@@ -10,7 +10,6 @@ from .iso9283 import iso9283 as iso9283
 from .iso9283 import read_approaches as read_approaches
 from .monitoring import Monitoring as Monitoring
 from .monitoring import monitor as monitor
-from .reading import read_checks as read_checks
 from .reading import read_measurements as read_measurements
 from .reading import read_targets as read_targets
 from .recalibration import Update as Update

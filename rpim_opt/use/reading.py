@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -11,9 +11,9 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
-from rpim_opt.basics.layout import RawTable, TableOptions
-from rpim_opt.basics.tables import Columns, read_columns
-from rpim_opt.basics.units import UNITS, accepted_units, joint_columns, parse_units, split_unit
+from rpim_opt.basics.layout import TableOptions
+from rpim_opt.basics.tables import EXCEL, read_columns
+from rpim_opt.basics.units import UNITS, accepted_units, joint_columns, split_unit
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
@@ -23,8 +23,9 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Understood, understand
+from rpim_opt.robot.chain import Described
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.store.raw import Understanding, rows_of, understand_of
 
 PLACE = ("x_mm", "y_mm", "z_mm")
 
@@ -74,7 +75,7 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     try:
         return _targets(dict(read_columns(source)), robot)
     except InputError as error:
-        raise error.within(_file(source)) from None
+        raise error.within(source if isinstance(source, str | Path) else None) from None
 
 
 def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
@@ -104,59 +105,40 @@ def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
     )
 
 
-def read_commands(result: Calibration, source: str | Path, units: str = "") -> tuple[Targets, tuple[str, ...]]:
+def read_commands(
+    result: Calibration, source: str | Path, options: TableOptions | None = None
+) -> tuple[Targets, tuple[str, ...]]:
     """Return the targets of a table that is read as the calibration's own were, and the columns that were left out."""
-    robot = result.problem.robot
+    found = _understood(result, source, pose, options or TableOptions(), targets=True)
     try:
-        found = _understood(source, robot, pose, result.record.reading, units, targets=True)
-        return _targets(dict(found.columns), robot), found.left_out
+        if any(each.doubt == "quaternion" for each in found.tables):
+            raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
+        return _targets(dict(found.columns), result.problem.robot), found.left_out
     except InputError as error:
         raise error.within(source) from None
 
 
-class Checks(NamedTuple):
-    """Checks that were read: rows, their times (N,) [s] or None, the times as they stand there, columns left out."""
+class Measured(NamedTuple):
+    """Measurements of tables: rows, columns left out, how tables were joined, what was left out, the column of times.
+
+    ``clock`` is that column's name and cells, the first that is called time, timestamp or date; None without one.
+    """
 
     data: Dataset
-    when: Array | None
-    times: tuple[str, ...]
     left_out: tuple[str, ...]
+    notes: tuple[str, ...]
+    clock: tuple[str, tuple[str, ...]] | None
 
-
-def read_checks(result: Calibration, source: Any, measurement: str | None = None, units: str = "") -> Checks:
-    """Return check readings of a table with their times, where a column is called time, timestamp or date.
-
-    Parameters
-    ----------
-    result, source, measurement, units
-        As for `read_measurements`.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
-    >>> table = {"date": ["2026-03-01", "2026-04-01"], **{f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}}
-    >>> table |= {"x": [826.6, 810.0], "y": [98.0, 240.0], "z": [107.0, 254.0]}
-    >>> checks = ro.use.read_checks(result, table, units="deg,mm")
-    >>> checks.times, float(checks.when[1] - checks.when[0]) / 86400
-    (('2026-03-01', '2026-04-01'), 31.0)
-    """
-    data, left_out, raw = _read(result, source, measurement, units)
-    name = time_column(raw)
-    if name is None:
-        return Checks(data, None, (), left_out)
-    cells = list(raw[name])
-    try:
-        when = seconds(name, cells)
-    except InputError as error:
-        raise error.within(_file(source)) from None
-    return Checks(data, when, tuple(str(cell) for cell in cells), tuple(each for each in left_out if each != name))
+    @property
+    def when(self) -> Array | None:
+        """The rows' times (N,) [s]; None without a column of them."""
+        return None if self.clock is None else seconds(*self.clock)
 
 
 def read_measurements(
-    result: Calibration, source: Any, measurement: str | None = None, units: str = ""
-) -> tuple[Dataset, tuple[str, ...]]:
-    """Return the measurements of a table, whose columns are recognized by name, and columns that were left out.
+    result: Calibration, source: Any, measurement: str | None = None, options: TableOptions | None = None
+) -> Measured:
+    """Return the measurements of tables, whose columns are recognized by name, as ``rpim-opt new`` reads them.
 
     Rows that state no uncertainty have that of the calibration's data.
 
@@ -165,76 +147,66 @@ def read_measurements(
     result
         The calibration.
     source
-        A text, Excel or Parquet file as ``rpim-opt new`` takes it, or a data frame.
+        A text, Excel or Parquet file, a data frame, or a list of them, which are stacked or joined.
     measurement
         Which of the calibration's measurement types, where it has several.
-    units
-        Units of columns whose name carries none, ``"deg,mm"``.
+    options
+        What is stated of the tables; what is not, is as it was for the calibration's own.
 
     Examples
     --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
-    >>> table = {f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}
+    >>> table = {"date": ["2026-03-01", "2026-04-01"], **{f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}}
     >>> table |= {"x": [826.6, 810.0], "y": [98.0, 240.0], "z": [107.0, 254.0], "note": ["", "warm"]}
-    >>> data, left_out = ro.use.read_measurements(result, table, units="deg,mm")
-    >>> len(data), left_out
-    (2, ('note',))
+    >>> found = ro.use.read_measurements(result, table, options=ro.data.TableOptions(units="deg,mm"))
+    >>> len(found.data), found.left_out, float(found.when[1] - found.when[0]) / 86400
+    (2, ('note',), 31.0)
     """
-    return _read(result, source, measurement, units)[:2]
-
-
-def _file(source: Any) -> str | Path | None:
-    return source if isinstance(source, str | Path) else None
-
-
-def _read(
-    result: Calibration, source: Any, measurement: str | None, units: str
-) -> tuple[Dataset, tuple[str, ...], Columns]:
-    """Return measurements, columns left out, and all columns as they stand there, of the same rows."""
     robot = result.problem.robot
     blocks = result.problem.data.blocks
     types = {block.measurement.name: block.measurement for block in blocks if block.measurement not in KNOWN}
     if not measurement and len(types) != 1:
         raise InputError("measurement", "several", choices("", types))
     stated = pick(types, measurement or next(iter(types)), "measurement")
-    try:
-        found = _understood(source, robot, stated, result.record.reading, units)
-        kind = stated
-        if not found.stems >= set(stated.columns):  # poses may be validated by positions
-            parts = [part for part in stated.parts if not any(found.stems >= set(form) for form, _ in stated.forms)]
-            kind = next((part for part in parts if found.stems >= set(part.columns)), stated)
-        columns = found.columns
-        if found.left_out and not columns:
-            accepted = f"joints' values and {', '.join(kind.columns)}"
-            raise InputError("the header", f"nothing that is known among {', '.join(found.left_out)}"[:200], accepted)
-        board = board_of(result.problem.sample().data)
-        if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
-            columns = on_board(columns, board)
-        data = read_data(columns, robot, _noise(result, stated, kind), kind)
-    except InputError as error:
-        raise error.within(_file(source)) from None
-    return data, found.left_out, found.raw
+    found = _understood(result, source, stated, options or TableOptions())
+    stems = {split_unit(name)[0] for name in found.columns}
+    kind = stated
+    if not stems >= set(stated.columns):  # poses may be validated by positions
+        parts = [part for part in stated.parts if not any(stems >= set(form) for form, _ in stated.forms)]
+        kind = next((part for part in parts if stems >= set(part.columns)), stated)
+    columns = found.columns
+    if found.left_out and not columns:
+        accepted = f"joints' values and {', '.join(kind.columns)}"
+        known = f"nothing that is known among {', '.join(found.left_out)}"[:200]
+        raise InputError("the header", known, accepted, found.file)
+    board = board_of(result.problem.sample().data)
+    if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
+        columns = on_board(columns, board)
+    data = rows_of(found, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, _noise(result, stated, kind))
+    name = time_column(found.raw)
+    clock = None if name is None else (name, tuple(str(cell) for cell in found.raw[name]))
+    lost = tuple(column for column in found.left_out if column != name)
+    notes = [f"{each.file}: {note}" for each in found.tables for note in each.notes if "left out" in note]
+    return Measured(data, lost, (*notes, *found.notes), clock)
 
 
 def _understood(
-    source: Any, robot: Robot, kind: Measurement, reading: Mapping[str, str], units: str, targets: bool = False
-) -> Understood:
-    """Return what a table says, read as the calibration's own were; one that does not fit that, as it says itself."""
-    where = RawTable(read_columns(source)) if _file(source) is None else Path(source)
-    plain = TableOptions(units=parse_units(units))
-    if reading:
-        options = TableOptions.stated({**reading, "units": units or reading.get("units", "")})
-        try:
-            return understand(where, robot, kind, options, options.joints, targets)
-        except InputError as error:
-            with suppress(InputError):  # one that has our names already
-                return understand(where, robot, kind, plain, targets=targets)
-            raise error from None
-    found = understand(where, robot, kind, plain, targets=targets)
-    if found.doubt == "quaternion" and "qw" in kind.columns:
-        raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-    return found
+    result: Calibration, source: Any, kind: Measurement, stated: TableOptions, targets: bool = False
+) -> Understanding:
+    """Return what tables say, read as the calibration's own were; where that does not fit, as they say themselves."""
+    sources = source if isinstance(source, list | tuple) else [source]
+    reading = dict(result.record.reading)
+    if not all(Path(str(each)).suffix.lower() in EXCEL for each in sources):
+        reading.pop("sheet", None)
+    options = TableOptions.stated({**reading, **stated.texts()})
+    arm = Described(result.problem.robot, np.zeros(6), np.zeros(6), options.joints)
+    try:
+        return understand_of(arm, sources, kind, options, targets)
+    except InputError:
+        with suppress(InputError):  # one that has our names already
+            return understand_of(replace(arm, names=()), sources, kind, stated, targets)
+        raise
 
 
 def _noise(result: Calibration, stated: Measurement, kind: Measurement) -> dict[str, float]:

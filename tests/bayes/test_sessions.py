@@ -260,7 +260,7 @@ def test_a_raw_table_keeps_its_sessions_through_a_folder(
     assert found.data.sessions == data.sessions
     assert {"session_day_4_rz", "expansion"} <= set(found.parameters.free.names)
     assert found.parameters.nominal[found.parameters.names.index("reference_temperature")] == 273.15 + 21.0
-    again, left_out = ro.use.read_measurements(automatic, table)
+    again, left_out, *_ = ro.use.read_measurements(automatic, table)
     assert left_out == ()
     assert automatic.errors(again) == pytest.approx(automatic.errors(data), abs=1e-9)
 

@@ -187,7 +187,7 @@ def test_results_keep_what_a_camera_saw(tmp_path: Path) -> None:
     _, result = calibrated()
     ro.store.save_result(result, tmp_path / "result.json")
     again = ro.load_result(tmp_path / "result.json")
-    data, left_out = ro.use.read_measurements(again, FOLDER / "validation.csv")
+    data, left_out, *_ = ro.use.read_measurements(again, FOLDER / "validation.csv")
     assert left_out == ()
     assert again.errors(data, "pixel") == pytest.approx(result.errors(result.record.validation, "pixel"), abs=1e-9)
 

@@ -107,7 +107,7 @@ def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path)
     instance = ro.load(problem)
     result = instance.calibrate(weight=1.0, model="geometry")
     folder = Path(__file__).parents[2] / "problems" / problem
-    data, _ = ro.use.read_measurements(result, folder / "validation.csv")
+    data, *_ = ro.use.read_measurements(result, folder / "validation.csv")
     found = ro.use.validate(result, data)
     assert [each.identified for each in found.touched] == sorted((e.identified for e in found.touched), reverse=True)
     names = data.blocks[0].touched[:, 0]

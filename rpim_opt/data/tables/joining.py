@@ -35,9 +35,10 @@ Rows = Sequence[int]
 
 
 class Whole(NamedTuple):
-    """One table, and how it was put together, a sentence each."""
+    """One table: cells by our names, the same rows' by the files' names, and how it was put together in sentences."""
 
     columns: Columns
+    raw: Columns
     notes: tuple[str, ...]
 
 
@@ -64,15 +65,18 @@ def together(
         left, right, names, notes = _by_key(moving, seen, joints.columns, values.columns, key)
     else:
         left, right, names, notes = _by_time(moving, seen, values.columns, key, within)
-    own = {name: cells for name, cells in joints.columns.items() if name not in values.columns}
-    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in left] for name, cells in own.items()}
-    whole |= {name: [cells[i] for i in right] for name, cells in values.columns.items()}
+    whole = _chosen(joints.columns, left) | _chosen(values.columns, right)
     whole.pop("label", None)
     if len(set(names)) == len(names):
         whole = {"label": names, **whole}
     else:  # several measured values of a configuration
         whole.setdefault("configuration", names)
-    return Whole(whole, (*joints.notes, *values.notes, *notes))
+    raw = _chosen(joints.raw, left) | _chosen(values.raw, right)
+    return Whole(whole, raw, (*joints.notes, *values.notes, *notes))
+
+
+def _chosen(columns: Columns, rows: Rows) -> dict[str, Sequence[Any]]:
+    return {name: [cells[i] for i in rows] for name, cells in columns.items()}
 
 
 # --- below each other ----------------------------------------------------------------------------------------------
@@ -82,7 +86,7 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
     """Return the rows of several tables below each other, in the units of the first."""
     first = tables[0]
     if len(tables) == 1:
-        return Whole(first.columns, ())
+        return Whole(first.columns, first.raw, ())
     matched = [_matched(table, first) for table in tables]
     whole = {name: [cell for columns in matched for cell in columns[name]] for name in matched[0]}
     counts = ", ".join(f"{table.file} {_count(table.columns)}" for table in tables)
@@ -94,7 +98,7 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
             files = [str(i) for i in range(1, len(files) + 1)]
         names = [f"{file}:{name}" for file, table in zip(files, tables, strict=True) for name in _labels(table.columns)]
         notes.append("labels are there in several files: the file's name is put before them.")
-    return Whole({"label": names, **whole}, tuple(notes))
+    return Whole({"label": names, **whole}, _raw(tables), tuple(notes))
 
 
 def _count(columns: Columns) -> int:
