@@ -169,7 +169,7 @@ def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_pa
     path = tmp_path / "raw.csv"
     head = [*(f"J{i} [deg]" for i in range(1, 7)), "X [mm]", "Y [mm]", "Z [mm]", "Q0", "Q1", "Q2", "Q3"]
     path.write_text(",".join(head) + "\n" + ",".join(["1"] * 9 + ["1", "0", "0", "0"]) + "\n")
-    with pytest.raises(ro.InputError, match="no clear one .* accepted: --quaternion wxyz or xyzw, or names qw, qx"):
+    with pytest.raises(ro.InputError, match=r"no clear one .* accepted: --quaternion wxyz or xyzw, or names qw, qx"):
         ro.use.read_measurements(pose.calibrate(weight=1.0), path)
 
 
