@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
@@ -30,7 +31,9 @@ FAR = 3.0
 """How many scales the nominal values of a shared parameter may differ by: as much as a frame's before it is moved."""
 
 
-def together(*problems: CalibrationProblem, shared: Sequence[str], **named: CalibrationProblem) -> CalibrationProblem:
+def together(
+    *problems: CalibrationProblem, shared: Sequence[str] | Mapping[str, Sequence[str]], **named: CalibrationProblem
+) -> CalibrationProblem:
     """Return several problems as one: two arms and one tracker, one robot in two campaigns, one tool on two robots.
 
     A problem like any other: `calibrate` takes it with any formulation and selector, or learns its sizes, one for each
@@ -42,15 +45,17 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     problems
         In memory, of one robot each; called ``A``, ``B``, ...
     shared
-        Patterns of the parameters that are one and the same in all: ``["tool_*"]``. Their nominal values are those of
-        the first problem.
+        Patterns of the parameters that are one and the same in all problems that have them: ``["tool_*"]``. Their
+        nominal values are those of the first of these. Or patterns by the names of problems, each with its own: of two
+        arms of one cell and a camera elsewhere, the arms' ``base_*``. Joints of one URDF have parameters that can be
+        shared where chains branch, too, with ``read_urdf(..., origins=True)``.
     named
         Problems by the names that they are to have, ``left=problem``.
 
     Raises
     ------
     InputError
-        For fewer than two problems, a pattern that matches no parameter that all have, shared parameters that are
+        For fewer than two problems, a pattern that matches no parameter that several have, shared parameters that are
         stated differently, scatter (it is stated of the whole, or learned), data in blocks, and touches of a
         point that is elsewhere for another robot.
 
@@ -88,9 +93,9 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     tables = []
     for name, part in parts.items():
         p = part.parameters
-        if tables:
-            p = p.take(np.flatnonzero([own not in common for own in p.names]))
-        new = {own: own if own in common else f"{name}.{own}" for own in {*p.names, *p.terms}}
+        known = {own for table in tables for own in table.names}
+        p = p.take(np.flatnonzero([own not in common[name] or own not in known for own in p.names]))
+        new = {own: own if own in common.get(name, ()) else f"{name}.{own}" for own in {*p.names, *p.terms}}
         terms = tuple(new[own] for own in p.terms if own in p.names)
         tables.append(replace(p, names=tuple(new[own] for own in p.names), terms=terms))
     robots = {name: part.robot for name, part in parts.items()}
@@ -100,19 +105,28 @@ def together(*problems: CalibrationProblem, shared: Sequence[str], **named: Cali
     return whole
 
 
-def _common(parts: Mapping[str, CalibrationProblem], shared: Sequence[str]) -> tuple[str, ...]:
-    """Return the parameters that match one of the patterns and that all problems have, stated alike."""
+def _common(
+    parts: Mapping[str, CalibrationProblem], shared: Sequence[str] | Mapping[str, Sequence[str]]
+) -> dict[str, set[str]]:
+    """Return what every problem shares: parameters that match a pattern and that several have, stated alike."""
     if isinstance(shared, str):
         raise InputError("together, shared", f"'{shared}'", f"patterns in a list: ['{shared}']")
-    (first, one), *others = ((name, part.parameters) for name, part in parts.items())
-    everywhere = [name for name in one.names if all(name in p.names for _, p in others)]
-    for pattern in shared:
-        if not any(fits(name, pattern) for name in everywhere):
-            raise InputError("together, shared", f"'{pattern}'", known_patterns(everywhere, pattern) + ", of all")
-    common = tuple(name for name in everywhere if any(fits(name, pattern) for pattern in shared))
-    for name in common:
+    patterns = shared if isinstance(shared, Mapping) else dict.fromkeys(parts, shared)
+    count = Counter(name for part in parts.values() for name in part.parameters.names)
+    several = [name for name in count if count[name] > 1]
+    for pattern in chain.from_iterable(patterns.values()):
+        if not any(fits(name, pattern) for name in several):
+            raise InputError("together, shared", f"'{pattern}'", known_patterns(several, pattern) + ", of several")
+    having: dict[str, list[str]] = {}
+    for key, part in parts.items():
+        for name in part.parameters.names:
+            if count[name] > 1 and any(fits(name, pattern) for pattern in patterns.get(key, ())):
+                having.setdefault(name, []).append(key)
+    for name, (first, *others) in having.items():
+        one = parts[first].parameters
         i = one.names.index(name)
-        for key, p in others:
+        for key in others:
+            p = parts[key].parameters
             k = p.names.index(name)
             for what in ("dimensions", "scale", "tolerance", "identified"):
                 mine = getattr(one, what)[i]
@@ -124,7 +138,7 @@ def _common(parts: Mapping[str, CalibrationProblem], shared: Sequence[str]) -> t
             if apart > FAR * one.scale[i]:
                 found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} scales"
                 raise InputError(f"together, shared '{name}'", found, "one nominal value in all")
-    return common
+    return {key: {name for name, keys in having.items() if key in keys} for key in parts}
 
 
 def _concatenated(tables: Sequence[Parameters]) -> Parameters:

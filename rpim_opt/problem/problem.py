@@ -36,6 +36,7 @@ from rpim_opt.problem.row_functions import (
 )
 from rpim_opt.robot.evaluation import evaluate_rows
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.origins import ORIGIN
 from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters, with_terms
 from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
@@ -368,7 +369,8 @@ class CalibrationProblem(RobotModel):
             robot = self.arms[block.robot]
             names = p.names
             if block.robot:  # those of other robots keep their long names, which no formulation asks for
-                names = tuple(name.removeprefix(f"{block.robot}.") for name in names)
+                visible = set(p.places_of(block.robot).tolist())
+                names = tuple(own_name(name) if i in visible else f".{name}" for i, name in enumerate(names))
             loads = loads_of(robot, needed(robot, p.of_robot(block.robot)), self.data, block)
             self._structures[block] = Structure(
                 robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
@@ -747,8 +749,11 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
         kept.append(BASE)
     kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
+    if any(name.startswith(ORIGIN) for name in parameters.terms):  # in the place of the table's
+        kept[0] = re.compile(f"{ORIGIN}.*")
     geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
     others = [block for block in data.blocks if block.measurement not in READY.values()]
     own = {of_fixture(name, block.fixture) for block in others for name in block.measurement.parameters}
     places.append([name for name in parameters.names if name in own and not PLACES.fullmatch(name)])
-    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]
+    parallel = near_parallel(robot) if kept[0] is GEOMETRY else ()
+    return [*geometry, *parallel, *(name for names in places for name in names)]

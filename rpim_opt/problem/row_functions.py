@@ -20,7 +20,7 @@ from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, of_term, tool_prefix
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Dependencies, Posture, Symbol, Term, Transmission, dependencies
+from rpim_opt.robot.terms import Dependencies, Posture, Symbol, Term, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
@@ -57,7 +57,7 @@ class Structure(NamedTuple):
 
     def is_pure(self, measurement: Measurement) -> bool:
         """Return whether the functions depend on nothing but what is stated here."""
-        return measurement in _READY and all(isinstance(term, Transmission) for term in self.terms)
+        return measurement in _READY and all(term.ready for term in self.terms)
 
 
 class Kept:
@@ -329,7 +329,7 @@ def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block])
     """Refuse to identify from rows of a robot what needs columns that they do not have."""
     for name in parameters.free.names:
         sided = name.startswith("backlash") and of_term(name)
-        if not sided and any(not isinstance(term, Transmission) for term in robot.model.terms):
+        if not sided and not all(term.ready for term in robot.model.terms):
             sided = dependencies(robot.model, robot.joint_types, lambda other, name=name: other == name).approach
         if sided and all(block.approach is None for block in blocks):
             found = f"'{name}' without directions of approach"

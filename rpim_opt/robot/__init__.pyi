@@ -13,6 +13,7 @@ from .formats.universal_robots import read_ur_kinematics as read_ur_kinematics
 from .formats.universal_robots import write_ur_calibration as write_ur_calibration
 from .formats.universal_robots import write_ur_kinematics as write_ur_kinematics
 from .formats.urdf import read_urdf as read_urdf
+from .formats.urdf import write_origins as write_origins
 from .formats.urdf import write_urdf as write_urdf
 from .kinematics import forward_kinematics as forward_kinematics
 from .library import robots as robots

@@ -51,12 +51,14 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     raise InputError("key robot", f"'{name}'", accepted, file)
 
 
-def read_arm(file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "") -> Described:
+def read_arm(
+    file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "", origins: bool = False
+) -> Described:
     """Return the robot of a file, with base and tool where a URDF or a standard DH table states them."""
     if file.suffix in (".urdf", XACRO):
         from rpim_opt.robot.formats.urdf import read_urdf
 
-        return read_urdf(file, urdf_base, urdf_tip)
+        return read_urdf(file, urdf_base, urdf_tip, origins)
     if file.suffix == ".csv":
         return read_sheet(file, convention)
     if convention:

@@ -173,16 +173,16 @@ class Parameters(Tabled):
 
     def called(self, robot: str, own: str) -> str:
         """Return what the table calls one of several robots' own parameter: ``left.a2``, or ``a2`` if shared."""
-        if own in self.names or not robot:
-            return own
-        return f"{robot}.{own}"
+        called = f"{robot}.{own}"
+        return own if not robot or (own in self.names and called not in self.names) else called
 
     def places_of(self, robot: str) -> np.ndarray:
         """Return where the parameters of one of several robots stand (k,), those that it shares among them."""
         if not robot:
             return np.arange(len(self))
-        shared_or_own = ("", robot)
-        return np.flatnonzero([name.rpartition(".")[0] in shared_or_own for name in self.names])
+        known = {name for name in self.names if name.startswith(f"{robot}.")}
+        shared = {name for name in self.names if "." not in name and f"{robot}.{name}" not in known}
+        return np.flatnonzero([name in known or name in shared for name in self.names])
 
     @property
     def of_frames(self) -> np.ndarray:

@@ -7,7 +7,7 @@ import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, ClassVar, Literal, NamedTuple
 
 import casadi as ca
 
@@ -209,6 +209,7 @@ class Term:
     joints: Sequence[str | int] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
+    ready: ClassVar[bool] = False  # whether it follows from numbers alone, which a file holds
 
     def __post_init__(self) -> None:
         if self.at not in SIZES:
@@ -311,6 +312,7 @@ class Transmission(Term):
     """The term of `transmission`, with the numbers that it is made of."""
 
     curve: Curve = field(default_factory=lambda: Curve(1, 0.0, math.tau, 1))
+    ready = True
 
 
 @lru_cache(256)

@@ -31,9 +31,11 @@ from rpim_opt.data.record import Record
 from rpim_opt.data.tables.reading import read_data, robodk_columns
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import identified_of
+from rpim_opt.problem.multi_robot import together
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.robot.library import find_robot
+from rpim_opt.robot.origins import MOUNT, ORIGIN
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (
@@ -137,6 +139,7 @@ def load(
     variant: str | None = None,
     measurements: Sequence[Measurement] = (),
     model: KinematicModel | None = None,
+    chain: str | None = None,
 ) -> Instance:
     """Return a problem from its folder, or from the name of one that comes with the package.
 
@@ -151,6 +154,8 @@ def load(
         Measurement models of your own that the file may name.
     model
         Terms of your own: the file may identify and scale their parameters, its tables have the columns that they see.
+    chain
+        One of the file's ``[chain.NAME]`` tables alone; by default all of them are one problem.
 
     Raises
     ------
@@ -164,7 +169,9 @@ def load(
     >>> len(instance.problem.data), len(instance.validation), instance.formulation.name
     (16, 9, 'Tikhonov')
     """
-    stated = read_problem(name, variant, measurements, model)
+    stated = read_problem(name, variant, measurements, model, chain)
+    if stated.chains and chain is None:
+        return _of_chains(stated, {each: load(name, variant, measurements, model, each) for each in stated.chains})
     table = stated.table
     path = stated.path
     data, files, tools = _read_tables(stated)
@@ -210,6 +217,28 @@ def load(
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         held_out=table.held_out,
     )
+
+
+def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
+    """Return the problem of several chains of one URDF: formulation, prior and record are the first one's."""
+    count = Counter(name for part in parts.values() for name in part.problem.parameters.terms)
+    shared = [
+        f"{prefix}*" for prefix in (ORIGIN, MOUNT) if any(count[name] > 1 for name in count if name.startswith(prefix))
+    ]
+    more = stated.table.shared
+    by_chain = {name: [*shared, *(more.get(name, ()) if isinstance(more, dict) else more)] for name in parts}
+    try:
+        problem = together(**{name: part.problem for name, part in parts.items()}, shared=by_chain)
+    except InputError as error:
+        raise error.within(stated.path) from None
+    first, *others = parts.values()
+    record = first.record
+    for other in others:
+        files = {**record.files, **other.record.files}
+        record = replace(record, files=files, excluded={**record.excluded, **other.record.excluded})
+    validated = {name: part.validation for name, part in parts.items() if part.validation is not None}
+    validation = Dataset.of_robots(validated).grouped_by_points() if validated else None
+    return replace(first, problem=problem, record=replace(record, validation=validation), published={})
 
 
 _Options = ParamSpec("_Options")

@@ -234,6 +234,10 @@ class ProblemTable(Table):
     """Tolerance, confidence and region of the acceptance test."""
     variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
     """Overlays of any key, by name."""
+    chain: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    """Chains of one URDF, by name: overlays of any key."""
+    shared: list[Name] | dict[str, list[Name]] = Field(default_factory=list)
+    """Patterns of what chains share besides the origins of the URDF's joints; or by chain, what it shares."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -251,6 +255,7 @@ class ProblemFile:
     observations: tuple[Observation, ...]
     tools: Mapping[str, tuple[float, ...]]
     base: tuple[float, ...] | None
+    chains: tuple[str, ...] = ()
     board: Board | None = None
 
     def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
@@ -265,8 +270,9 @@ def read_problem(
     variant: str | None = None,
     measurements: Sequence[Measurement] = (),
     model: KinematicModel | None = None,
+    chain: str | None = None,
 ) -> ProblemFile:
-    """Return what a problem file states; arguments and errors as for `load`."""
+    """Return what a problem file states, of several chains of one, the first by default; the rest as for `load`."""
     folder = find_problem(name)
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
@@ -277,18 +283,24 @@ def read_problem(
     if variant is not None:
         variants = content.get("variant", {})
         own = {key: value for key, value in content.items() if key != "variant"}
-        table, placed = _checked(_overlay(own, pick(variants, variant, "variant", path)), kinds, path)
+        content = _overlay(own, pick(variants, variant, "variant", path))
+        table, placed = _checked(content, kinds, path)
+    chains = tuple(table.chain)
+    if chains:
+        own = {key: value for key, value in content.items() if key not in ("variant", "chain")}
+        table, placed = _checked(_overlay(own, table.chain[chain or chains[0]]), kinds, path)
     observations = _observations(table, kinds, path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
-    arm = _arm(table, path)
+    arm = _arm(table, path, bool(chains))
     if table.terms and model is None:
         model = KinematicModel([own_object(term, Term, "key terms", path) for term in table.terms])
     if model is not None:
         if not isinstance(model, KinematicModel):
             accepted = "a ro.robot.Model with terms of your own; extensions are chosen by calibrate(model='auto')"
             raise InputError("model", f"{model!r}"[:80], accepted)
-        arm = replace(arm, robot=replace(arm.robot, model=model))
+        terms = (*arm.robot.model.terms, *model.terms)
+        arm = replace(arm, robot=replace(arm.robot, model=KinematicModel(terms)))
     base = None
     if table.base != "auto":
         base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
@@ -301,6 +313,7 @@ def read_problem(
         observations=observations,
         tools=_tools(table, arm, path),
         base=base,
+        chains=chains,
         board=_board(table, path),
     )
 
@@ -334,7 +347,9 @@ def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[f
 def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
     """Yield the measurement types of a Python file that a problem file and its variants name."""
     variants = content.get("variant", {})
-    for table in (content, *(variants.values() if isinstance(variants, dict) else ())):
+    chains = content.get("chain", {})
+    overlays = [each for tables in (variants, chains) if isinstance(tables, dict) for each in tables.values()]
+    for table in (content, *overlays):
         if isinstance(table, dict):
             observations = table.get("observation", [])
             listed = [each for each in observations if isinstance(each, dict)] if isinstance(observations, list) else []
@@ -372,11 +387,12 @@ def _board(table: ProblemTable, path: Path) -> Board | None:
         raise InputError("key target", error.found, error.accepted, path) from None
 
 
-def _arm(table: ProblemTable, path: Path) -> Described:
+def _arm(table: ProblemTable, path: Path, origins: bool) -> Described:
     file = find_robot(table.robot, path.parent)
-    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip):
-        raise InputError("key urdf_base, urdf_tip", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
-    arm = read_arm(file, table.urdf_base, table.urdf_tip)
+    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or origins):
+        what = "chain" if origins else "urdf_base, urdf_tip"
+        raise InputError(f"key {what}", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
+    arm = read_arm(file, table.urdf_base, table.urdf_tip, origins=origins)
     turned = numeric_frame(arm.base)[:3, :3]
     gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
     return replace(arm, robot=replace(arm.robot, gravity=gravity))

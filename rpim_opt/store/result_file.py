@@ -38,8 +38,9 @@ from rpim_opt.problem.noise import Scatter
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.origins import Carried, carried_by, displaced
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Curve, Model, Term, Transmission, transmission
+from rpim_opt.robot.terms import Curve, Model, Term, transmission
 from rpim_opt.store.own_code import is_own, own_object
 from rpim_opt.store.serialize import digest, plain, structured
 
@@ -235,6 +236,8 @@ class Stored:
     """Terms of a script's own, without their functions."""
     transmission: tuple[Curve, ...]
     """Transmission errors of the joints."""
+    origins: dict[str, tuple[Carried, ...]]
+    """Origins of a URDF's joints that displace the robots' rows."""
     model: Parameters
     """All parameters: nominal, prior scale, tolerance, identified."""
     data: dict[str, Dataset]
@@ -279,6 +282,7 @@ def content(result: Calibration) -> dict[str, Any]:
         robots=dict(result.problem.arms),
         terms={name: _terms(robot.model, robot) for name, robot in result.problem.arms.items()},
         transmission=tuple(curve for robot in result.problem.arms.values() for curve in robot.model.curves),
+        origins={name: carried_by(robot.model.terms) for name, robot in result.problem.arms.items()},
         model=result.problem.parameters,
         data=_sets(result),
         scatter=result.problem.scatter,
@@ -352,7 +356,7 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
     """Return what a file says of a user's own terms on a robot: all but their functions."""
     terms = []
     for term in model.terms:
-        if not isinstance(term, Transmission):
+        if not term.ready:
             names = [name for i in term.places(robot.joint_types) for name in term.names(i)]
             terms.append(OwnTerm(term.at, names, dict(term.columns)))
     return terms
@@ -505,7 +509,8 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
         accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
         raise InputError("key terms", "; ".join(map(str, given)) or "no term given", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
-    return replace(robot, model=Model((*model.terms, *curves)))
+    origins = [displaced(carried) for carried in file.origins.get(name, ())]
+    return replace(robot, model=Model((*origins, *model.terms, *curves)))
 
 
 def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: str) -> Dataset:

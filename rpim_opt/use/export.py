@@ -28,9 +28,10 @@ from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
-from rpim_opt.robot.formats.urdf import read_urdf, write_urdf
+from rpim_opt.robot.formats.urdf import read_urdf, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
-from rpim_opt.robot.parameter_names import of_term, reflectors, tool_prefix
+from rpim_opt.robot.origins import MOUNT, ORIGIN
+from rpim_opt.robot.parameter_names import frame_of, of_term, own_name, reflectors, tool_prefix
 
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
@@ -129,11 +130,10 @@ def export_files(
     whole = result
     result, notes = geometry_alone(whole)
     note = result.verdict.require(despite_verdict)
-    robot = identified(result, marker).robot
     frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
-        (ur_kinematics, lambda source, target: write_ur_kinematics(source, robot, target)),
+        (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, marker).robot, target)),
         (ur_calibration, lambda source, target: export_ur_calibration(result, source, target)),
     ]
     sources = [(source, write) for source, write in corrected if source]
@@ -148,8 +148,8 @@ def export_files(
             raise InputError("--out", f"the original, {source}", "another place: the original stays")
         writers.append((target, partial(write, source)))
     plain = [
-        (mdh, partial(write_robot, robot)),
-        (robodk, partial(write_robodk, robot)),
+        (mdh, lambda target: write_robot(identified(result, marker).robot, target)),
+        (robodk, lambda target: write_robodk(identified(result, marker).robot, target)),
         (corrections, partial(_write_joint_corrections, whole)),
     ]
     writers += [(target, write) for target, write in plain if target]
@@ -278,6 +278,12 @@ def export_urdf(
     np.float64(0.001)
     """
     note = result.verdict.require(despite_verdict)
+    names = map(own_name, result.problem.parameters.free.names)
+    of = {name: x for name, x in zip(names, result.x, strict=True) if name.startswith((ORIGIN, MOUNT))}
+    if of:
+        prefixes = {frame_of(name) for name in of}
+        origins = {prefix: np.array([of.get(prefix + axis, 0.0) for axis in FRAME]) for prefix in prefixes}
+        return write_all([(Path(target), lambda path: write_origins(source, origins, path))], note)
     arm = identified(result, marker)
     own = read_urdf(source, root, tip)
     names = result.problem.parameters.names

@@ -38,6 +38,8 @@ from rpim_opt.robot.chain import (
 )
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Gravity, Robot, Vector
+from rpim_opt.robot.origins import Carried, Displaced, Origin, displaced, origin_prefix
+from rpim_opt.robot.terms import Model
 
 DEEPEST = 100
 """How deep elements may be nested."""
@@ -49,7 +51,7 @@ TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 """A tag: quoted values may hold a '>'."""
 
 
-def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None) -> Described:
+def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None, origins: bool = False) -> Described:
     """Return the chain between two links of a URDF file as a robot in modified DH with Hayati's beta.
 
     ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
@@ -66,18 +68,31 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
     or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints
     between base and tip, no or several candidates for base or tip.
 
+    With ``origins`` the parameters to identify are not those of the table but the origins of the file's joints, six
+    numbers each, ``origin_{joint}_x`` to ``_rz``, of fixed joints at the chain's ends ``mount_{joint}_x``: the same in
+    every chain that a joint is part of, so that `together` shares them. A first row that does not move stands for the
+    base link then: the table starts in that link's own frame.
+
     Examples
     --------
     >>> import rpim_opt as ro
     >>> arm = ro.read_urdf("arm.urdf", base="base", tip="tip")
     >>> arm.robot.dof, arm.names, arm.tool[:3]
     (1, ('j1',), array([0.4, 0. , 0. ]))
+    >>> ro.read_urdf("arm.urdf", origins=True).robot.model.names(("revolute",) * 2)[:2]
+    ('origin_j1_x', 'origin_j1_y')
     """
     urdf = _read(Path(path))
     steps = urdf.path_between(base, tip)
+    chain = _chain(urdf, steps)
+    if origins:
+        steps = [_still(steps[0].start, urdf.path), *steps]
+        chain = _chain(urdf, steps)
     joints = [step.joint for step in steps if step.joint.kind]
-    table, T_base, T_tool, G = describe(_chain(urdf, steps))
+    table, T_base, T_tool, G = describe(chain)
     names, joint_map, offsets = _followed(urdf, joints)
+    if origins:  # the first row has no joint
+        names, joint_map = names[1:], joint_map[:, 1:]
     T_top_base = np.linalg.inv(_product([step.constant for step in steps if step.up]))
     robot = Robot(
         name=urdf.name,
@@ -87,6 +102,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None)
         limits=np.array([urdf.joints[name].limits for name in names]),
         source=f"{urdf.path.name}, {steps[0].start} to {steps[-1].end}",
         gravity=_masses(urdf, steps, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
+        model=Model(_displacements(steps, table, G) if origins else ()),
     )
     for name, i in zip(names, robot.leading, strict=True):
         if joints[i].kind != urdf.joints[name].kind:
@@ -149,8 +165,8 @@ def write_urdf(
     size = reach(robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
     for between, old, new in zip(_rigid_parts(steps), [*chain.origins, chain.tail], [*origins, tail], strict=True):
-        if between:  # one origin takes the whole correction: of the joint after, before, or a fixed one
-            taker = 0 if between[0].up and not between[-1].joint.kind else len(between) - 1
+        if between:  # one origin takes the whole correction
+            taker = _taker(between)
             before = _product([step.constant for step in between[:taker]])
             after = _product([step.constant for step in between[taker + 1 :]])
             step = between[taker]
@@ -187,6 +203,49 @@ class _Step:
         return self.joint.parent if self.up else self.joint.child
 
 
+def _still(link: str, path: Path) -> _Step:
+    """Return a joint about z that carries a link and does not move."""
+    element = _Placed("joint", {"type": "revolute"})
+    for tag, attributes in (("parent", {"link": link}), ("child", {"link": link}), ("axis", {"xyz": "0 0 1"})):
+        element.append(_Placed(tag, attributes))
+    return _Step(_Joint(element, "", path), up=False)
+
+
+def _displacements(steps: Sequence[_Step], table: Array, G: Array) -> list[Displaced]:
+    """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
+    terms = []
+    for row, part in enumerate(_rigid_parts(steps)[1:], start=1):
+        F = numeric_link(beta=-table[row - 1, 4]) @ G[row - 1]
+        taker = _taker(part)
+        origins = []
+        for i, step in enumerate(part):
+            before, F = F, F @ step.constant
+            if step.joint.kind or i == taker:
+                prefix = origin_prefix(step.joint.name, bool(step.joint.kind))
+                origins.append(Origin(prefix, F if step.up else before, step.up))
+        if origins:
+            terms.append(displaced(Carried(row, tuple(origins))))
+    return terms
+
+
+def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
+    """Write a URDF file with displaced origins, every other byte as in the original.
+
+    ``deviations`` are six numbers each [m, rad], by the prefix of the parameters, ``origin_{joint}_``: x, y, z, roll,
+    pitch, yaw in the parent link's frame of what comes before the origin. Prefixes that no joint has are refused.
+    """
+    urdf = _read(Path(source))
+    edits: dict[tuple[int, int], str] = {}
+    known = {origin_prefix(joint.name, bool(joint.kind)): joint for joint in urdf.joints.values()}
+    for prefix, six in deviations.items():
+        if prefix not in known:
+            raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known), urdf.path)
+        joint = known[prefix]
+        T = numeric_frame(six) @ joint.origin
+        edits |= joint.origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
+    write_bytes(Path(target), spliced(urdf.data, edits))
+
+
 def _inverse(T: Array) -> Array:
     return np.asarray(np.linalg.inv(T), dtype=float)
 
@@ -206,6 +265,11 @@ def _rigid_parts(steps: Sequence[_Step]) -> list[list[_Step]]:
         if step.joint.kind:
             parts.append([])
     return parts
+
+
+def _taker(part: Sequence[_Step]) -> int:
+    """Return which origin of a rigid part takes its correction: of the joint after, before, or a fixed one."""
+    return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
 
 
 def _chain(urdf: _Urdf, steps: Sequence[_Step]) -> Chain:

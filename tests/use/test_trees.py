@@ -1,0 +1,132 @@
+"""Sensors on several links of one URDF: one calibration of its joints' origins, and one corrected file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+
+import rpim_opt as ro
+from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
+from tests.robot.test_exchange import between_links, text
+
+SIGMA = 1e-4
+NEW = 2000
+"""Configurations at which positions are predicted."""
+
+
+def random_tree(seed: int) -> tuple[str, list[str]]:
+    """Return a URDF of 2 to 4 branches on a trunk, 5 to 25 joints of all kinds, and its tips."""
+    rng = np.random.default_rng(seed)
+    links, joints, moving = ["root"], [], []
+
+    def add(kind: str, parent: str, tip: str = "") -> str:
+        i = len(joints) + 1
+        links.append(tip or f"link{i}")
+        xyz, rpy, axis = 0.3 * rng.normal(size=3), rng.uniform(-3, 3, 3), rng.normal(size=3)
+        rest = f'<axis xyz="{text(axis)}"/>'
+        same = [name for name, each in moving if (each == "prismatic") == (kind == "prismatic")]
+        if kind not in ("fixed", "continuous") and same and rng.random() < 0.2:
+            rest += f'<mimic joint="{rng.choice(same)}" multiplier="{rng.uniform(0.5, 1.5)!r}" offset="0.1"/>'
+        elif kind != "fixed":
+            moving.append((f"j-{i}", kind))
+        joints.append(
+            f'<joint name="j-{i}" type="{kind}"><parent link="{parent}"/><child link="{links[-1]}"/>'
+            f'<origin xyz="{text(xyz)}" rpy="{text(rpy)}"/>{rest}</joint>'
+        )
+        return links[-1]
+
+    kinds = ["revolute", "continuous", "prismatic", "fixed"]
+    branches = int(rng.integers(2, 5))
+    total = int(rng.integers(max(5, 2 * branches + 2), 26))
+    trunk = int(rng.integers(1, 3))
+    parent = add("revolute", "root")
+    for _ in range(trunk - 1):
+        parent = add(str(rng.choice(kinds)), parent)
+    counts = 1 + rng.multinomial(max(total - trunk - 2 * branches, 0), np.full(branches, 1 / branches))
+    tips = []
+    for k, count in enumerate(counts):
+        at = add("revolute", parent)
+        for _ in range(count - 1):
+            at = add(str(rng.choice(kinds, p=[0.5, 0.2, 0.1, 0.2])), at)
+        tips.append(add("fixed", at, f"tip{k}"))
+    return f'<robot name="t">{"".join(f"<link name={n!r}/>" for n in links)}{"".join(joints)}</robot>', tips
+
+
+def with_errors(path: Path, target: Path, seed: int) -> None:
+    """Write the file with errors of 1 mm and 1 mrad in the origin of every joint that moves."""
+    rng = np.random.default_rng([seed, 2])
+    tree = ElementTree.parse(path)
+    for joint in tree.getroot().findall("joint"):
+        origin = joint.find("origin")
+        if joint.get("type") == "fixed":
+            continue
+        place = np.array([*origin.get("xyz").split(), *origin.get("rpy").split()], dtype=float)
+        six = frame_numbers(numeric_frame(1e-3 * rng.normal(size=6)) @ numeric_frame(place))
+        origin.set("xyz", text(six[:3]))
+        origin.set("rpy", text(six[3:]))
+    tree.write(target)
+
+
+def drawn(arm: ro.robot.Described, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return joint values, angles of up to 2 rad and travels of up to 0.3 m."""
+    reach = np.where(np.array(arm.robot.joint_dimensions) == "angle", 2.0, 0.3)
+    return rng.uniform(-reach, reach, (count, arm.robot.dof))
+
+
+def chains(seed: int, tips: list[str]) -> dict[str, tuple[str, str]]:
+    """Return which links measure which: a tracker two tips, and where there are three tips, one of them the first."""
+    found = {"left": ("root", tips[0]), "right": ("root", tips[1])}
+    if len(tips) > 2:
+        found["head"] = (tips[2], tips[0])
+    return found
+
+
+SEEDS = [pytest.param(seed, marks=[] if seed < 8 else pytest.mark.slow) for seed in range(40)]
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_tree_is_calibrated_as_a_whole_and_written_into_one_file(
+    seed: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    content, tips = random_tree(seed)
+    Path("robot.urdf").write_text(content)
+    with_errors(Path("robot.urdf"), Path("true.urdf"), seed)
+    rng = np.random.default_rng([seed, 3])
+    lines = ['title = "tree"', 'robot = "robot.urdf"', 'identify = ["origin_*"]', "[noise]", "position_mm = 0.1"]
+    arms = {}
+    for name, (base, tip) in chains(seed, tips).items():
+        arms[name] = arm = ro.read_urdf("robot.urdf", base, tip, origins=True)
+        q = drawn(arm, 60, rng)
+        T = between_links(Path("true.urdf"), arm.names, base, tip, q)
+        y = T[:, :3, 3] + SIGMA * rng.normal(size=(60, 3))
+        columns = [f"q{i}_{'deg' if d == 'angle' else 'mm'}" for i, d in enumerate(arm.robot.joint_dimensions, 1)]
+        units = [np.degrees(1) if d == "angle" else 1e3 for d in arm.robot.joint_dimensions]
+        rows = [",".join(["label", *columns, "x_mm", "y_mm", "z_mm"])]
+        rows += [
+            ",".join([f"{name}{i}", *map(repr, row)]) for i, row in enumerate(np.hstack([q * units, 1e3 * y]).tolist())
+        ]
+        Path(f"{name}.csv").write_text("\n".join(rows) + "\n")
+        lines += [f"[chain.{name}]", f'urdf_base = "{base}"', f'urdf_tip = "{tip}"', f'identification = "{name}.csv"']
+    Path("problem.toml").write_text("\n".join(lines) + "\n")
+
+    result = ro.load(".").calibrate()
+    assert result.converged
+    ro.store.save_result(result, "result.json")
+    again = ro.load_result("result.json")
+    assert np.array_equal(again.problem.residual(result.x), result.problem.residual(result.x))
+    ro.use.export_urdf(result, "robot.urdf", "better.urdf")
+    for name, (base, tip) in chains(seed, tips).items():
+        arm = arms[name]
+        q = drawn(arm, NEW, rng)
+        written = between_links(Path("better.urdf"), arm.names, base, tip, q)
+        modelled = result.problem.measuring(q, robot=name).modelled(result.x)[0]
+        assert np.abs(written[:, :3, 3] - modelled).max() < 1e-12 * max(1.0, np.abs(modelled).max())
+        measured = between_links(Path("true.urdf"), arm.names, base, tip, q)[:, :3, 3] + SIGMA * rng.normal(
+            size=(NEW, 3)
+        )
+        floor = np.sqrt(np.mean((measured - modelled) ** 2)) / SIGMA
+        assert floor < 1.2
