@@ -565,7 +565,7 @@ def compensate(
     base: Annotated[bool, Option("--base", help="Correct for the base, too.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
     largest: Annotated[float, Option(help="Largest correction of a joint [rad or m].")] = 0.2,
-    limit: Annotated[Number, Option(help="Largest residual error [mm]; exit code 1 above.")] = None,
+    limit: Annotated[Number, Option(help="Largest residual error [mm]; rows above it are marked, exit code 1.")] = None,
     out: Table = None,
     despite_verdict: Despite = False,
     allow_code: Code = False,
@@ -573,7 +573,7 @@ def compensate(
 ) -> None:
     """Correct joint commands so that the real robot goes where the nominal one would.
 
-    Exit code 1 if the robot is not delivered.
+    Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or above the limit.
     """
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
@@ -587,9 +587,10 @@ def compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
+            limit=float("inf") if limit is None else 1e-3 * limit,
         )  # fmt: skip
     _answer_with_table(found, found.csv(), out, {**found.content(), "limit_mm": limit}, as_json, left_out)
-    if limit is not None and 1e3 * found.position_error.max() > limit:
+    if found.missed:
         raise typer.Exit(1)
 
 

@@ -448,7 +448,14 @@ def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, m
     assert document["nominal"]["position"]["mean_mm"] > 0.5
     with out.open() as stream:
         assert [row["status"] for row in csv.DictReader(stream)] == ["ok"] * 9
-    assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "0.01") == 1
+    assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "0.01", "--out", str(out)) == 1
+    assert "9 of 9 commands miss their target: do not run these rows." in capsys.readouterr().out
+    with out.open() as stream:
+        assert {row["status"] for row in csv.DictReader(stream)} == {"above the limit"}
+    assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "100") == 0
+    (tmp_path / "go.csv").write_text("label,x_mm,y_mm,z_mm\nP1,9000,0,100\n")
+    assert run(monkeypatch, *arguments) == 1  # unreachable, with or without a limit
+    assert "1 of 1 commands miss their target" in capsys.readouterr().out
 
 
 FORMULATIONS = {

@@ -179,6 +179,10 @@ def remarks(result: Outcome) -> list[str]:
     """Say what a reader must know besides the figures: outliers, active bounds, what did not converge."""
     lines = _outlying(result)
     lines += [_bound(result, held) for held in result.held[:MOST_BOUNDS]]
+    beyond = np.flatnonzero(np.abs(result.x) > 1.001 * result.problem.parameters.free.tolerance)
+    if len(beyond):
+        names = listed([result.problem.parameters.free.names[i] for i in beyond])
+        lines.append(f"Beyond their stated tolerance: {names}. It bounds the formulation 'bounded' alone.")
     lines += [price.sentence() for price in result.prices]
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result's file cannot hold: it cannot be solved again.")

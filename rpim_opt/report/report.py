@@ -119,6 +119,9 @@ def _headline(content: Content) -> Iterator[Block]:
             text = f"expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
         text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
         yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
+    elif summary.inconclusive(result, content.map):
+        text = summary.inconclusive(result, content.map).partition(": ")[2]
+        yield "verdict", {"kind": "undecided", "word": VERDICTS["undecided"], "text": text}
     elif result.verdict.delivered:
         text = "the fit gives no reason against using this robot; no limit to accept it by is stated."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}

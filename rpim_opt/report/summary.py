@@ -13,6 +13,7 @@ from rpim_opt.basics.text import counted, joined, listed, percent, table
 from rpim_opt.calibration import words
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.verdict import rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.data.record import Requirement
@@ -141,6 +142,17 @@ def workspace_sentence(found: Workspace) -> str:
     )
 
 
+def inconclusive(result: Calibration, found: Workspace | None) -> str:
+    """Say that the position reached is less certain than the nominal robot's error; empty where it is not."""
+    nominal = rms(headline_errors(result)[1])
+    if found is None or not _of_positions(result) or not found.typical > nominal:
+        return ""
+    return (
+        f"Inconclusive: the median U of {mm(1e3 * found.typical)} mm is above the nominal robot's error of "
+        f"{mm(1e3 * nominal)} mm RMS. Measure more configurations (rpim-opt design --augment)."
+    )
+
+
 def acceptance(result: Calibration) -> Acceptance | None:
     """Return the verdict on the requirement of a result's record; None without a requirement."""
     if result.record.requirement is None:
@@ -162,6 +174,11 @@ def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
     return name, result.nominal_errors(data), result.errors(data)
 
 
+def _of_positions(result: Calibration) -> bool:
+    kinds = {block.measurement.name for data in sets(result).values() for block in data.blocks}
+    return kinds <= {"position", "pose"}
+
+
 def headline(result: Calibration) -> str:
     """Return by how much the errors fall, on data that were not used for identification where there are some."""
     name, nominal, identified = headline_errors(result)
@@ -174,8 +191,7 @@ def headline(result: Calibration) -> str:
         "held out": f"On {n} measurements that were held out",
         "identification": f"On the {n} identification measurements themselves (there are no validation data)",
     }[name]
-    kinds = {block.measurement.name for data in sets(result).values() for block in data.blocks}
-    what = "position error" if kinds <= {"position", "pose"} else "error"
+    what = "position error" if _of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     falls = f"falls from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
     times = f", by a factor of {ratio:.1f}" if ratio < 10 else f", by a factor of {ratio:.0f}"
@@ -254,6 +270,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     accepted = acceptance(result)
     uncertainty = workspace(result) if accepted is None else None  # an acceptance test states it, too
     remarks = [
+        *filter(None, [inconclusive(result, uncertainty)]),
         *([] if uncertainty is None else [workspace_sentence(uncertainty)]),
         *words.weight_lines(result),
         identifiability(result),

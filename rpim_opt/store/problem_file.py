@@ -67,7 +67,7 @@ def find_problem(name: str | Path) -> Path:
     if path.is_dir():
         return path
     known = sorted(p.name for p in problems_folder().iterdir() if (p / "problem.toml").is_file())
-    if str(name) in known:
+    if name in known:  # a path is a folder's alone
         return problems_folder() / str(name)
     accepted = "a folder with problem.toml, or " + choices(str(name), known)
     raise InputError("the problem", f"no folder '{name}'", accepted)

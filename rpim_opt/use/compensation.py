@@ -49,6 +49,7 @@ REACHED = 1e-7
 """A target counts as reached when no more than this is left [m, rad]."""
 KNOWN_TOOL = 0.01
 """Largest scale [m, rad] of a reflector that is known: a wider one states no TCP."""
+UNREACHABLE, ABOVE = "unreachable", "above the limit"
 BANK = 2000
 TRIALS = 12
 """Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
@@ -73,7 +74,8 @@ class Compensation:
     status
         For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
         prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
-        ``"near singular"`` (the correction would be too large, and was damped).
+        ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where any of the
+        latter leaves more than that.
     outside
         Corrected commands beyond the joint ranges that the calibration measured.
     note
@@ -117,12 +119,19 @@ class Compensation:
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(largest)}.",
         ]
-        for status in ("limited", "near singular", "unreachable"):
+        for status in ("limited", "near singular", UNREACHABLE, ABOVE):
             at = [i for i, each in enumerate(self.status) if each == status]
             if at:
                 named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in at])
                 lines.append(f"{status.capitalize()}: {named}.")
+        if self.missed:
+            lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target: do not run these rows.")
         return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])
+
+    @property
+    def missed(self) -> list[str]:
+        """The labels of rows whose commands miss the target: unreachable, or above the limit."""
+        return [label for label, each in zip(self.label, self.status, strict=True) if each in (UNREACHABLE, ABOVE)]
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -148,6 +157,7 @@ class Compensation:
             "nominal": errors[0],
             "corrected": errors[1],
             "largest_corrections": self._largest_corrections(),
+            "missed": self.missed,
             "outside": [self.label[i] for i in self.outside.rows],
             "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
             "note": self.note,
@@ -178,6 +188,7 @@ def compensate(
     payload: float | Array | None = None,
     payload_centre: Sequence[float] | Array | None = None,
     largest: float = 0.2,
+    limit: float = np.inf,
     label: Sequence[str] = (),
     robot: str = "",
     despite_verdict: bool = False,
@@ -231,6 +242,8 @@ def compensate(
         (3,) where that mass is in the flange frame [m]; by default where the problem states it.
     largest
         Largest correction of a joint [rad or m].
+    limit
+        Position error left by the model above which a command counts as one that misses its target [m].
     label
         N row labels; numbers from 1 by default.
     robot
@@ -283,7 +296,8 @@ def compensate(
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         parts = list(pool.map(compensated, range(0, N, BLOCK)))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    whole["status"] = tuple(whole["status"].tolist())
+    above = (whole["position_error"] > limit) & (whole["status"] != UNREACHABLE)
+    whole["status"] = tuple(np.where(above, ABOVE, whole["status"]).tolist())
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
     outside = result.outside(commands)
     return Compensation(arm, targets.label, **whole, outside=outside, note=note, point=cell.point)
@@ -500,7 +514,7 @@ class _Cell(NamedTuple):
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
         corrected, left, active = nearest(self.identified, load, target, commands, limits, unit, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        cases = {"ok": self._reached(left, W), "limited": at_limit, "unreachable": ~reached}
+        cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
         position_before, orientation_before = self._norms(before)
         position_error, orientation_error = self._norms(left)
         return {

@@ -54,6 +54,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
         squared_loss=squared_loss,
         linear_penalty=False,
         problem=RESULT.problem,
+        x=np.zeros(len(FREE)),
         formulation=ro.tikhonov,
         message="Done.",
     )
@@ -80,7 +81,13 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
 
 def test_what_a_file_could_not_hold_is_said() -> None:
     stand_in: Any = SimpleNamespace(
-        flagged=(), held=(), prices=(), formulation=replace(ro.tikhonov, solvable=False), message="Done."
+        flagged=(),
+        held=(),
+        prices=(),
+        problem=RESULT.problem,
+        x=np.zeros(len(FREE)),
+        formulation=replace(ro.tikhonov, solvable=False),
+        message="Done.",
     )
     assert "cannot be solved again" in words.remarks(stand_in)[0]
 
@@ -127,3 +134,14 @@ def test_turns_of_frames_are_no_differences() -> None:
         missed = abs(row["identified"] - row["nominal"] - row["deviation"])
         assert (name in told) == (missed > 1e-4)
     assert "base_rx" in told
+
+
+def test_deviations_beyond_a_tolerance_that_nothing_bounds_are_named() -> None:
+    instance = ro.load("paper_arm")
+    tight = instance.problem.with_parameters(instance.problem.parameters.toleranced({"length_mm": 0.01}))
+    free = ro.calibrate(tight, ro.tikhonov, 1e-3)
+    (line,) = [line for line in words.remarks(free) if "tolerance" in line]
+    assert line.endswith("It bounds the formulation 'bounded' alone.")
+    assert "d4" in line
+    bounded = ro.calibrate(tight, ro.bounded, 1e-3)
+    assert not [line for line in words.remarks(bounded) if line.startswith("Beyond")]

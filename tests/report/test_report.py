@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.report import report
+from rpim_opt.report import report, summary
 from rpim_opt.report.report import page
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
@@ -300,3 +300,15 @@ def test_only_tolerances_that_were_kept_are_shown() -> None:
     loose = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
     assert "tolerance" in Reader(page(kept)).words
     assert "tolerance" not in Reader(page(loose)).words
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_robot_less_certain_than_the_nominal_one_errs_is_not_called_delivered() -> None:
+    problem = ro.load("position").problem
+    first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
+    found = ro.use.update(first, problem.data.take(np.arange(32, 40)), reset=["*"])  # 8 readings, 33 parameters
+    text = Reader(page(found.result)).words
+    assert "Inconclusive" in text
+    assert "is above the nominal robot" in text
+    assert "Delivered" not in text
+    assert summary.inconclusive(first, summary.workspace(first)) == ""

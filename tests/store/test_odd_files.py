@@ -151,3 +151,11 @@ def test_a_result_of_two_robots_comes_back(tmp_path: Path) -> None:
         again = ro.load_result(path, **({} if model is None else {"model": model}))
         assert list(again.problem.arms) == ["left", "right"]
         assert np.array_equal(again.x, result.x)
+
+
+def test_a_path_that_is_not_there_is_no_shipped_problem(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert ro.store.find_problem("position").is_dir()
+    for name in (Path("position"), "./position", "x/position"):
+        with pytest.raises(ro.InputError, match="no folder"):
+            ro.load(name)
