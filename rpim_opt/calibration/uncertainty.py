@@ -12,8 +12,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.covariance import NoiseTest, coverage_factor
+from rpim_opt.calibration.covariance import NoiseTest, coverage_factor, position_noise, scattered
 from rpim_opt.calibration.outcome import Outcome, Prediction
+from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.terms import transmission
 
 
@@ -165,6 +166,22 @@ def known_covariance(result: Outcome) -> Array | None:
         return result.covariance
     except InputError:
         return None
+
+
+def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dict[str, Array]:
+    """Return what contributes to u^2 (N,) [m^2] of the positions reached at q (N, dof), over all axes; they add up."""
+    spread = result.spread
+    there = result.problem.sample().measuring(q, position, marker, covariance=position_noise(result.problem))
+    J = there.jacobian(result.x).reshape(len(q), 3, -1)
+    prior = np.einsum("nij,jk,nik->n", J, spread.prior, J)
+    drift = np.zeros(len(q)) if spread.drift is None else np.sum((J @ spread.drift) ** 2, axis=(1, 2))
+    robot = np.trace(scattered(there, result.variance_factor).robot[0], axis1=1, axis2=2)
+    return {
+        "measurement noise in the parameters": np.einsum("nij,jk,nik->n", J, spread.noise, J),
+        "prior, in combinations that the data hardly identify": prior - drift,
+        "estimated prior scales and variance components": drift,
+        "repeatability of the robot": np.broadcast_to(robot, len(q)),
+    }
 
 
 class TransmissionError(NamedTuple):

@@ -22,7 +22,7 @@ from rpim_opt.calibration.acceptance import Acceptance, Workspace
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import Uncertainty, transmission_errors
+from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
 from rpim_opt.calibration.words import (
     HEADER,
     curve_columns,
@@ -234,6 +234,21 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         title = f"Largest expanded uncertainty of the position reached, {view}"
         drawn.append(figure(draw, title, f"{view.capitalize()}.{frame}", height))
     yield "figures", drawn
+    yield "table", _budget(map_, result)
+
+
+def _budget(map_: Workspace, result: Calibration) -> Table:
+    """Return the uncertainty budget of the position reached, by contributor, at the maximum U and over the region."""
+    variances = position_budget(result, map_.q, map_.region.marker)
+    whole = np.sum(list(variances.values()), axis=0)
+    rows = []
+    for name, each in {**variances, "combined": whole}.items():
+        cells = [name]
+        for own, total in ((each[-1], whole[-1]), (each[:-1].mean(), whole[:-1].mean())):
+            cells += [f"{1e3 * np.sqrt(max(own, 0.0)):.4f}", f"{100 * max(own, 0.0) / total:.1f} %"]
+        rows.append(cells)
+    head = ["contributor", "u [mm], maximum U", "share of u²", "u [mm], region (RMS)", "share of u²"]
+    return Table("Uncertainty budget of the position reached (GUM, u over all three axes)", head, rows)
 
 
 # --- parameters --------------------------------------------------------------------------------------------
@@ -244,18 +259,13 @@ def _parameters(content: Content) -> Iterator[Block]:
     free = result.problem.parameters.free
     half = np.full(len(result.x), np.nan)
     note = "No intervals: the formulation has no covariance."
-    head = ["parameter", "nominal", "identified", "deviation", "U", "u, noise", "u, prior", "tolerance"]
-    by_cause = np.full((len(result.x), 2), np.nan)
+    head = ["parameter", "nominal", "identified", "deviation", "U", "tolerance"]
     with contextlib.suppress(InputError):
         uncertainty = Uncertainty(result)
         half = uncertainty.coverage_factor * np.sqrt(np.diag(result.covariance))
-        by_cause = np.sqrt(np.column_stack([np.diag(C) for C in (result.spread.noise, result.spread.prior)]))
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
-        note = (
-            f"Uncertainty budget: standard uncertainties u from measurement noise and prior; U = k u, of both, is the "
-            f"expanded uncertainty ({k}, 95 %)."
-        )
+        note = f"U = k u is the expanded uncertainty ({k}, 95 %), from measurement noise and prior."
     tolerance = plot.active_tolerance(result)
     held = {each.name for each in result.held}
     rows = []
@@ -266,12 +276,10 @@ def _parameters(content: Content) -> Iterator[Block]:
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in held:
             name += ", at its bound"
-        budget = ["", "", ""]
-        if np.isfinite(half[i]):
-            budget = [f"±{half[i] / si:.4f}", *(f"{u / si:.4f}" for u in by_cause[i])]
+        expanded = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
-        rows.append([name, *figures, *budget, bound])
+        rows.append([name, *figures, expanded, bound])
     if not np.isfinite(tolerance).any():
         head = head[:-1]
         rows = [row[:-1] for row in rows]

@@ -153,7 +153,9 @@ def compare(
 def _cases(grid: Iterable[Any], seeds: Sequence[int], methods: Iterable[Method]) -> Iterator[Row]:
     """Yield the cases of a grid of source, split, count and noise factor; what no seed changes is there once."""
     for source, split, count, factor in grid:
-        random = source.drawn or split.label != FOLDER or count is not None or factor > 1
+        random = source.drawn or split.label != FOLDER or factor > 1
+        if count is not None and not random:
+            random = count < len(np.unique(source.instance(0).problem.data.configuration))
         for seed, fold, method in product(seeds if random else seeds[:1], range(1, split.folds + 1), methods):
             yield {
                 "problem": source.label,

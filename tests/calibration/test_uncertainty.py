@@ -96,3 +96,17 @@ def test_rules_serve_an_own_variable_in_the_penalty_beside_any_loss() -> None:
         "slack", cp.norm1, lambda z: cp.norm1(z) + 10 * slack, (lambda z, p: cp.abs(p.x["a2"]) <= 3e-4 + 1e-3 * slack,)
     )
     assert ro.calibrate(problem, own, weight=ro.l_curve).converged
+
+
+def test_contributors_to_the_uncertainty_of_a_position_add_up() -> None:
+    from rpim_opt.calibration.uncertainty import position_budget
+
+    problem = ro.load("position").problem
+    q = problem.data.q[:7] * 0.9
+    for weight in (None, 1.0):  # estimated scales, which add uncertainty; and stated ones
+        result = ro.calibrate(problem, ro.tikhonov, weight)
+        found = position_budget(result, q)
+        assert all((each >= -1e-20).all() for each in found.values())
+        assert (found["estimated prior scales and variance components"] > 0).any() == (weight is None)
+        total = np.trace(result.predict(q, of="reached").covariance, axis1=1, axis2=2)
+        np.testing.assert_allclose(sum(found.values()), total, rtol=1e-9)

@@ -281,6 +281,8 @@ def test_a_robot_is_delivered_where_nothing_is_demanded(arm_page) -> None:
     read = Reader(arm_page)
     assert "Delivered: the fit gives no reason" in " ".join(read.words.split()).replace(" :", ":")
     assert "Expanded uncertainty in the workspace" in read.words
+    assert "Uncertainty budget of the position reached" in read.words
+    assert "repeatability of the robot" in read.words
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -140,8 +140,8 @@ def test_seeds_repeat_only_what_they_change() -> None:
 
     found = ro.compare([arms, "position"], selectors=["reml", 1.0], seeds=[3, 5], progress=False)
     assert [(row["problem"], row["seed"]) for row in found.rows[::2]] == [("arms", 3), ("arms", 5), ("position", 3)]
-    counted = ro.compare("position", selectors=1.0, counts=[15, 30, 500], seeds=2, progress=False)
-    assert [row["configurations"] for row in counted.rows] == [15, 15, 30, 30, None, None]
+    counted = ro.compare("position", selectors=1.0, counts=[15, 30, 40, 500], seeds=2, progress=False)
+    assert [row["configurations"] for row in counted.rows] == [15, 15, 30, 30, 40, None]  # no seed changes all rows
     assert counted.rows[-1]["reason"] == "count: found 500, accepted: 1 to 40 configurations."
 
 
