@@ -30,8 +30,8 @@ GAIN = 12.0
 MOMENTS_GAIN = 20.0
 """By how much it must fall for first moments of links beside curves: admitted at a gain of 15 they made errors outside
 the measured range 1.44 times as large; with all data of that arm they gain 70, and are needed."""
-COLUMNS, FINEST = 400, 128
-"""Harmonics of all joints together at most, sines and cosines; cycles a turn of the finest one."""
+COLUMNS, FINEST = 68, 128
+"""Harmonics a joint in the mean at most, sines and cosines, of six joints at least; cycles a turn of the finest one."""
 SHORTEST = 0.05
 """Travel of a joint [rad] from which its curve is looked for."""
 BEYOND, LENGTHS = 0.3, 2.5
@@ -58,7 +58,7 @@ def curves_over(q: Array, joint_types: Sequence[str], margin: float) -> tuple[Cu
     travel = high - low
     joints = [j for j, kind in enumerate(joint_types) if kind == "revolute" and travel[j] > SHORTEST]
     turns = np.minimum(travel + 2 * margin, 2 * np.pi) / (2 * np.pi)
-    cycles = min(FINEST, COLUMNS / 2 / max(np.sum(turns[joints]), 1e-9))
+    cycles = min(FINEST, COLUMNS * max(len(joints), 6) / 2 / max(np.sum(turns[joints]), 1e-9))
     centre = (low + high) / 2
     return tuple(
         Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), max(int(cycles * turns[j]), 1)) for j in joints

@@ -301,7 +301,7 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     if not curves:
         return
     yield "heading", "Transmission errors of the joints"
-    yield "text", ["A joint turns further than its value by this error: beyond the measured range its size is known."]
+    yield "text", ["A joint turns further than its value by this error. Beyond the measured range it is not known."]
     yield "table", Table("Within the measured range", *curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
