@@ -274,6 +274,8 @@ class Evidence:
 
     def at(self, logs: Array, near: Point | None = None, accuracy: float = SETTLED) -> Point:
         """Return the marginal likelihood at (s,); local variances are looked for from those of a point on."""
+        if near is not None and not len(self._heavy) and np.array_equal(logs, near.logs):
+            return near
         prior = self.prior
         s = len(prior.hyperparameters)
         parts = whitened(self.data, self.scatter(logs), dict(zip(self.noise, logs[s:], strict=True)))
@@ -341,22 +343,22 @@ class Evidence:
             noise=S,
         )
 
-    def optima(self, starts: Sequence[Array], accuracy: float = 1e-3) -> list[Point]:
+    def optima(self, starts: Sequence[Array], accuracy: float = 1e-3, near: Point | None = None) -> list[Point]:
         """Return the optima that are reached from some starts (s,), the best first.
 
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
-        accuracy. A way that leads into an optimum that is known ends there.
+        accuracy. A way that leads into an optimum that is known ends there. ``near`` is a known point near the starts.
         """
         found: list[Point] = []
         for start in starts:
-            point = self._optimum(start, accuracy, found)
+            point = self._optimum(start, accuracy, found, near)
             if point is not None:
                 found.append(point)
         return sorted(found, key=lambda point: point.value)
 
-    def _optimum(self, start: Array, accuracy: float, known: Sequence[Point]) -> Point | None:
+    def _optimum(self, start: Array, accuracy: float, known: Sequence[Point], near: Point | None) -> Point | None:
         """Return the optimum that is reached from a start (s,); None where the way leads into one that is known."""
-        last = self.at(start, None, ROUGHLY)
+        last = self.at(start, near, ROUGHLY)
         if not len(start):
             return self.at(start, last)
 

@@ -94,8 +94,8 @@ def admitted(
         given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
         start = np.log([max(getattr(fit.laid.scatter, kind), LEAST) for kind in models.columns.noise])
         plain = given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
-        found = _most_likely(given, models, plain.logs)
-        if found is None or plain.value - found[0].value <= GAIN:
+        found = _most_likely(given, models, plain)
+        if found is None:
             return None
         point, curves, columns = found
         geometry = _integrated(models.columns, columns, point)
@@ -138,9 +138,9 @@ def _given(evidence: Evidence, keep: np.ndarray, v: Array, columns: Array, curve
 
 
 def _most_likely(
-    given: Callable[[Array, Sequence[Curve]], Evidence], models: Models, noise: Array
+    given: Callable[[Array, Sequence[Curve]], Evidence], models: Models, plain: Point
 ) -> tuple[Point, tuple[Curve, ...], Array] | None:
-    """Return the optimum of curves and noise, those curves and their columns (m, c); None where no joint turned."""
+    """Return the optimum of curves and noise, the curves and columns (m, c); None where they gain too little."""
     problem, data = models.whole, models.columns.data
     slopes = np.zeros((len(data.y), len(problem.robot.joint_types)))
     by_joints = "joint" in models.columns.noise
@@ -148,7 +148,7 @@ def _most_likely(
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]
     size = np.log(CURVES["transmission size"][0])
-    starts = [np.array([size, np.log(length), *noise]) for length in STARTS]
+    starts = [np.array([size, np.log(length), *plain.logs]) for length in STARTS]
     margin = BEYOND
     while True:
         curves = curves_over(q, problem.robot.joint_types, margin)
@@ -156,8 +156,10 @@ def _most_likely(
             return None
         columns = series(curves, q, slopes)
         beside = given(columns, curves)
-        start = min(starts, key=lambda logs: beside.at(logs).value)
-        point = beside.optima([start], ACCURACY)[0]
+        start = min((beside.at(logs) for logs in starts), key=lambda point: point.value)
+        point = beside.optima([start.logs], ACCURACY, start)[0]
+        if plain.value - point.value <= GAIN:
+            return None
         length = float(np.exp(point.logs[1]))
         if margin > BEYOND or LENGTHS * length <= 1.2 * margin:
             return point, curves, columns
