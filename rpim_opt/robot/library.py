@@ -67,10 +67,9 @@ def read_arm(
 
 
 class RobotSource(NamedTuple):
-    """The robot of a new problem: its file, its key in the problem file, and where it comes from."""
+    """The robot of a new problem, which gets a copy as robot.toml: its file, and where it comes from."""
 
     file: Path
-    stated: str
     origin: str
 
 
@@ -78,9 +77,9 @@ def find_source(robot: str) -> RobotSource:
     """Return the source of a robot that a command or a script names: a ready one by name, or a file, also a xacro."""
     endings = (*ROBOT_FILES, XACRO)
     if not robot.endswith(endings):
-        return RobotSource(find_robot(robot), robot, "a ready robot")
+        return RobotSource(find_robot(robot), f"a copy of the ready robot {robot}")
     file = Path(robot)
     if not file.exists():
         raise InputError("the robot", "no such file", f"a file {', '.join(endings)}, or a ready robot", file)
     require_file(file)
-    return RobotSource(file, "robot.toml", f"modified DH table, from {file.name}")
+    return RobotSource(file, f"modified DH table, from {file.name}")

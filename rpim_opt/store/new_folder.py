@@ -140,7 +140,6 @@ def new_problem(
         tables[TARGET] = board.table
     context = {
         "target": board.stated,
-        "robot": toml(source.stated),
         "drawing": source.origin,
         "columns": how,
         "data": Path(found.file).name,
@@ -180,9 +179,9 @@ def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: Robot
         write_text(made / "problem.toml", text)
         for name, each in tables.items():
             write_text(made / name, csv_text(each, zip(*each.values(), strict=True)))
-        if source.file.suffix == ".toml" and source.stated == "robot.toml":
+        if source.file.suffix == ".toml":
             write_text(made / "robot.toml", read_text(source.file))  # with its comments
-        elif source.stated == "robot.toml":
+        else:
             write_robot(arm.robot, made / "robot.toml")
         made.rename(folder)
 

@@ -23,6 +23,7 @@ from tests.calibration.mistakes import (
     ROBOTS,
     SEEDS,
     calibrated,
+    coupled,
     exchanged,
     flipped,
     good,
@@ -179,6 +180,18 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
         assert "mm instead of" in said
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_advice_that_is_followed_in_the_folder_ends_well(monkeypatch, capsys, tmp_path) -> None:
+    """What is to be written into robot.toml has a file there, of a ready robot too."""
+    made(monkeypatch, tmp_path, coupled(2, 1, 1.0)(simulated_arm("ur5e", count=25)))
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
+    said = " ".join(capsys.readouterr().out.split())
+    advice = said.partition("write coupling = ")[2].partition(" in robot.toml")[0]
+    robot = tmp_path / "cell" / "robot.toml"
+    robot.write_text(f"coupling = {advice}\n" + robot.read_text())
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 0
 
 
 def test_a_zero_that_is_off_by_degrees_is_calibrated(monkeypatch, tmp_path) -> None:
