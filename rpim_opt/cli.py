@@ -236,23 +236,28 @@ def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False,
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
         from rpim_opt.calibration.lack_of_fit import foreseen
-        from rpim_opt.problem.diagnosis import inspect
+        from rpim_opt.problem.design import observe
+        from rpim_opt.problem.diagnosis import identifiable_sentences, inspect
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
         say("inspecting")
-        found = inspect(instance.problem, instance.validation)
+        whole = instance.problem
+        apart = instance.validation
+        validation = {} if apart is None else {name: apart.of_robot(name) for name in {*apart.robot}}
+        parts = {name: inspect(whole.alone(name), validation.get(name)) for name in whole.arms}
+        together = observe(whole) if len(parts) > 1 else None
         say("analysing the residuals of a quick fit")
-        lacking = foreseen(instance.problem)
-    document = {
-        "title": instance.record.title,
-        "source": instance.record.source,
-        **found.content(),
-        "lack_of_fit": None,
-    }
-    head = "\n".join(filter(None, [instance.record.title, instance.record.source]))
-    text = f"{head}\n\n{found}"
+        lacking = foreseen(whole)
+    document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
+    text = "\n".join(filter(None, [instance.record.title, instance.record.source]))
+    for name, part in parts.items():
+        document |= {name: part.content()} if name else part.content()
+        text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
+    if together is not None:
+        text += f"\n\nAll together: {identifiable_sentences(together)}"
+    document["lack_of_fit"] = None
     if lacking is not None:
         document["lack_of_fit"] = lacking.content()
         text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"

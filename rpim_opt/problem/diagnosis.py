@@ -164,7 +164,7 @@ class Inspection(Tabled):
             table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
             table(["measured", "unit", "from", "to", "typical sigma"], measured),
             self._rows(),
-            self._identifiable(),
+            identifiable_sentences(self.observability),
             "\n".join(self.contact),
             "\n".join(notes[: len(self.warnings)]),
             "\n".join(notes[len(self.warnings) :]),
@@ -228,20 +228,21 @@ class Inspection(Tabled):
             lines.append(f"Nominal error stands out: {named}.")
         return "\n".join(lines)
 
-    def _identifiable(self) -> str:
-        o = self.observability
-        indices = ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
-        lines = [
-            f"{o.rank} of {len(o.names)} parameter combinations are identifiable, {o.weak} of them less precisely "
-            "than by the prior.",
-            f"Condition {o.condition:.3g} scaled and whitened, {o.raw_condition:.3g} in mm and rad; {indices}.",
-        ]
-        if o.unidentifiable:
-            lines.append(f"Unidentifiable: {', '.join(o.unidentifiable)}.")
-        if o.redundant:
-            named = "; ".join(map(combination, o.redundant))
-            lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")
-        return "\n".join(lines)
+
+def identifiable_sentences(o: Observability) -> str:
+    """Return what configurations can show, in lines."""
+    indices = ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
+    lines = [
+        f"{o.rank} of {len(o.names)} parameter combinations are identifiable, {o.weak} of them less precisely "
+        "than by the prior.",
+        f"Condition {o.condition:.3g} scaled and whitened, {o.raw_condition:.3g} in mm and rad; {indices}.",
+    ]
+    if o.unidentifiable:
+        lines.append(f"Unidentifiable: {', '.join(o.unidentifiable)}.")
+    if o.redundant:
+        named = "; ".join(map(combination, o.redundant))
+        lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")
+    return "\n".join(lines)
 
 
 def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> Inspection:

@@ -36,7 +36,7 @@ from rpim_opt.problem.row_functions import (
 )
 from rpim_opt.robot.evaluation import evaluate_rows
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.origins import ORIGIN
+from rpim_opt.robot.origins import ORIGIN, carried_by
 from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
 from rpim_opt.robot.parameters import Parameters, with_terms
 from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
@@ -258,11 +258,15 @@ class CalibrationProblem(RobotModel):
             raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
         if not robot:
             return self
+        arm = self.arms[robot]
+        p = self.parameters.of_robot(robot)
+        others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared among other robots
+        kept = np.flatnonzero([name not in others for name in p.names])
+        p = replace(p.take(kept), terms=tuple(name for name in p.terms if name not in others))
         scatter = self.scatter
         if scatter is not None and scatter.at is not None:
-            scatter = replace(scatter, at=scatter.at[self.parameters.places_of(robot)])
-        data = self.data.of_robot(robot)
-        return CalibrationProblem(self.arms[robot], self.parameters.of_robot(robot), data, scatter=scatter)
+            scatter = replace(scatter, at=scatter.at[self.parameters.places_of(robot)[kept]])
+        return CalibrationProblem(arm, p, self.data.of_robot(robot), scatter=scatter)
 
     @property
     def joint_values(self) -> Array:
@@ -731,8 +735,10 @@ def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
 
     Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
     tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far
-    from parallel an axis pair still counts.
+    from parallel an axis pair still counts. None where the origins of a URDF's joints are identified.
     """
+    if carried_by(robot.model.terms):
+        return ()
     return tuple(
         f"beta{i}"
         for i in range(1, len(robot.mdh))
@@ -749,11 +755,10 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
         kept.append(BASE)
     kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
-    if any(name.startswith(ORIGIN) for name in parameters.terms):  # in the place of the table's
+    if carried_by(robot.model.terms):  # in the place of the table's
         kept[0] = re.compile(f"{ORIGIN}.*")
     geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
     others = [block for block in data.blocks if block.measurement not in READY.values()]
     own = {of_fixture(name, block.fixture) for block in others for name in block.measurement.parameters}
     places.append([name for name in parameters.names if name in own and not PLACES.fullmatch(name)])
-    parallel = near_parallel(robot) if kept[0] is GEOMETRY else ()
-    return [*geometry, *parallel, *(name for names in places for name in names)]
+    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]

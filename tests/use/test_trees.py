@@ -11,6 +11,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame
 from tests.robot.test_exchange import between_links, text
+from tests.test_cli import run
 
 SIGMA = 1e-4
 NEW = 2000
@@ -130,3 +131,62 @@ def test_a_tree_is_calibrated_as_a_whole_and_written_into_one_file(
         )
         floor = np.sqrt(np.mean((measured - modelled) ** 2)) / SIGMA
         assert floor < 1.2
+
+
+def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, more: str = "") -> None:
+    """Write the problem of a tracker that measures two tips and of a third tip that measures the first, no errors."""
+    monkeypatch.chdir(tmp_path)
+    seed = 1
+    content, tips = random_tree(seed)
+    Path("robot.urdf").write_text(content)
+    lines = ['title = "tree"', 'robot = "robot.urdf"', more, "[noise]", "position_mm = 0.1"]
+    rng = np.random.default_rng(seed)
+    for name, (base, tip) in chains(seed, tips).items():
+        arm = ro.read_urdf("robot.urdf", base, tip, origins=True)
+        q = drawn(arm, 60, rng)
+        rows = np.hstack([q, between_links(Path("robot.urdf"), arm.names, base, tip, q)[:, :3, 3]])
+        columns = [f"q{i}_{'rad' if d == 'angle' else 'm'}" for i, d in enumerate(arm.robot.joint_dimensions, 1)]
+        text_of = [",".join(map(repr, row)) for row in rows.tolist()]
+        Path(f"{name}.csv").write_text("\n".join([",".join([*columns, "x_m", "y_m", "z_m"]), *text_of]) + "\n")
+        lines += [f"[chain.{name}]", f'urdf_base = "{base}"', f'urdf_tip = "{tip}"', f'identification = "{name}.csv"']
+        lines += [f'validation = "{name}.csv"'] if name == "left" else []
+    Path("problem.toml").write_text("\n".join(lines) + "\n")
+
+
+def test_chains_share_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The tracker's place is that of two chains; joints of two chains of three are no parameters of the third."""
+    arms = 'identify = ["origin_*", "base_*"]\nshared = { left = ["base_*"], right = ["base_*"] }'
+    folder(monkeypatch, tmp_path, arms)
+    whole = ro.load(".")
+    names = whole.problem.parameters.free.names
+    assert {"base_x", "head.base_x", "origin_j_1_x"} <= set(names)
+    assert not {"left.base_x", "right.base_x", "left.origin_j_1_x"} & set(names)
+    assert set(whole.validation.robot) == {"left"}
+    part = ro.load(".", chain="head").problem
+    alone = whole.problem.alone("head")
+    assert set(alone.parameters.names) == set(part.parameters.names)
+    assert "origin_j_1_x" not in alone.parameters.names  # of the trunk, above both links
+    x = np.random.default_rng(0).normal(size=len(names)) * whole.problem.parameters.free.scale
+    values = dict(zip(names, x, strict=True))
+    called = [whole.problem.parameters.called("head", name) for name in part.parameters.free.names]
+    own = part.residual(np.array([values[name] for name in called]))
+    assert np.array_equal(whole.problem.residual(x)[-len(own) :], own)
+    assert run(monkeypatch, "inspect", ".") == 0
+
+
+def test_auto_takes_origins_in_the_place_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder(monkeypatch, tmp_path, 'identify = "auto"')
+    names = ro.load(".", chain="left").problem.parameters.free.names
+    assert {name.split("_")[0] for name in names} == {"origin", "base", "tool"}
+    mounts = ro.load(".", chain="left").problem.parameters.identify(["mount_*"]).free
+    assert mounts.scale.tolist() == [0.01] * 6
+    Path("problem.toml").write_text(Path("problem.toml").read_text().replace('"robot.urdf"', '"ur5e"'))
+    with pytest.raises(ro.InputError, match=r"key chain.*'ur5e'.*a file \.urdf"):
+        ro.load(".")
+
+
+def test_origins_of_another_robot_are_not_written(tmp_path: Path) -> None:
+    path = tmp_path / "robot.urdf"
+    path.write_text(random_tree(0)[0])
+    with pytest.raises(ro.InputError, match=r"parameters origin_torso_\*: found no such joint"):
+        ro.robot.write_origins(path, {"origin_torso_": np.zeros(6)}, tmp_path / "new.urdf")
