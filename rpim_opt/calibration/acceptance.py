@@ -422,7 +422,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     against += _against(requirement, least, seen)
     lacking += _wide(requirement.limit, mapped.largest, scatter)
     if np.isfinite(mapped.largest) and max(requirement.limit, scatter) < mapped.largest:
-        lacking += _decisive(result, mapped)
+        lacking += decisive(result, mapped)
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "undecided"
@@ -507,7 +507,7 @@ def _wide(limit: float, bound: float, scatter: float) -> list[str]:
     ]
 
 
-def _decisive(result: Calibration, found: Workspace) -> list[str]:
+def decisive(result: Calibration, found: Workspace) -> list[str]:
     """Say which part of the robot decides the largest bound: by C given that part, C - C_k C_kk^-1 C_k'."""
     free = result.problem.parameters.free
     names = [own_name(name) for name in free.names]

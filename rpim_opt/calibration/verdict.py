@@ -241,7 +241,7 @@ def _deviations(result: Outcome) -> Iterator[str]:
         said = f"{said}: no robot is machined worse than {1e3 * largest:g} {unit}."
         worst = max(worst, (float(abs(x)) / largest, said))
     if worst[1]:
-        yield worst[1]
+        yield f"{worst[1]} Check the order (exchanged names), signs and units of the joint columns, and the DH table."
 
 
 def _worse(result: Outcome) -> Iterator[str]:

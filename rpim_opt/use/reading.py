@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -186,9 +187,10 @@ def read_measurements(
     data = rows_of(found, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, _noise(result, stated, kind))
     name = time_column(found.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in found.raw[name]))
-    lost = tuple(column for column in found.left_out if column != name)
-    notes = [f"{each.file}: {note}" for each in found.tables for note in each.notes if "left out" in note]
-    return Measured(data, lost, (*notes, *found.notes), clock)
+    left_out = tuple(column for column in found.left_out if column != name)
+    lost = re.compile(r"rows without|line \d|\d+ more lines")
+    notes = [f"{each.file}: {note}" for each in found.tables for note in each.notes if lost.match(note)]
+    return Measured(data, left_out, (*notes, *found.notes), clock)
 
 
 def _understood(

@@ -18,6 +18,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.understanding import Understood, understand
+from rpim_opt.store.raw import understand_of
 
 ARM = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
 ROWS = "P1,1,2,401,5,6\nP2,3,4,402,6,7\n"
@@ -280,3 +281,15 @@ def test_a_table_without_columns_and_one_whose_names_are_no_texts() -> None:
     for table, said in (({}, "an empty table"), ({1: [2]}, "column 1, accepted: texts as names")):
         with pytest.raises(ro.InputError, match=said):
             ro.read_data(table, ARM, {"position_mm": 0.1})
+
+
+def test_a_german_controllers_and_a_trackers_export_need_no_renaming(tmp_path: Path) -> None:
+    robot = ro.load("position").problem.robot
+    head = ";".join(["Nr.", *(f"Achse {letter} [°]" for letter in "SLURBT"), "X-Wert", "Y-Wert", "Z-Wert"])
+    text = f"Messprotokoll\nEinheit: mm\n\n{head};Unsicherheit U95\n"
+    text += "".join(f"{i};1,5;2,5;3,5;4,5;5,5;6,5;100,125;200,25;{i}00,5;0,01\n" for i in (1, 2, 3))
+    (tmp_path / "raw.csv").write_text(text, encoding="utf-8")
+    arm = ro.robot.Described(robot, np.zeros(6), np.zeros(6))
+    found = understand_of(arm, [tmp_path / "raw.csv"], options=ro.data.TableOptions(units="deg,mm"))
+    assert found.kind is position
+    assert set(found.columns) == {"label", *(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", "u95_mm"}

@@ -78,6 +78,7 @@ def test_a_table_that_does_not_say_its_convention_is_asked_for(tmp_path, monkeyp
     [
         ("i,alpha(i-1) [deg],a(i-1) [mm],d [mm],theta [deg]", "modified"),
         ("i,alpha_i-1 [°],a_i-1 [mm],d_i [mm],theta offset [°]", "modified"),
+        ("Gelenk,alpha(i-1) [°],a(i-1) [mm],d(i) [mm],theta(i) Offset [°]", "modified"),
         ("i,alpha_i-1 [deg],a_i-1 [mm],d_i [mm],theta_i [deg]", "modified"),
         ("i,alpha [deg],a [mm],d [mm],theta [deg]", ""),
     ],

@@ -37,7 +37,8 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"(?:field_)?position_?(\d+)", r"q\1", "ROS: JointState.position"),
     (r"(\d+)_?(?:軸|轴|축)", r"q\1"),
     (r"(to_)?(?:field_)?(?:tau|torque|effort)_?(\d+)", r"\1tau\2"),
-    (rf"{_WHERE}([xyz])(?:_?1|坐标)?", r"\1"),
+    (rf"{_WHERE}([xyz])(?:_?1|坐标|_?(?:wert|value|coord(?:inate)?|koordinate|achse))?", r"\1"),
+    (rf"(?:{_JOINT})_([slurbt])", r"\1"),
     (r"az(?:imuth|imut)?", "azimuth", "azimuth, counterclockwise from x about z"),
     (r"hz|horizontal_?(?:angle|winkel)|hz_?(?:angle|winkel)", "hz", "horizontal angle, clockwise from x"),
     (r"el(?:ev(?:ation)?)?(?:_angle)?", "elevation", "elevation above the horizontal plane"),
@@ -48,7 +49,7 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"pitch", "ry"),
     (r"yaw", "rz"),
     (r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
-    (r"u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
+    (r"(?:unsicherheit_|uncertainty_)?u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
     (rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
     (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
     (r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"

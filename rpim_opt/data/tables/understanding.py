@@ -360,12 +360,15 @@ def _under_our_names(
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
     unitless: dict[str, str] = {}
+    turned = {each.stem for each in read.values()} & {"qw", "rx", "r11"}
     for name, cells in table.items():
         found = read[name]
         if found.stem not in known and found.stem not in text_columns(kind):
             meant.append(Meant(name, "left out", "", "", found.why or "no column of these measurements"))
             continue
         dimensions = [dimension for dimension in known.get(found.stem, []) if dimension]
+        if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
+            dimensions = ["length"]
         unit, why = _unit(name, found, dimensions, units)
         if unit and dimension_of(unit) not in dimensions:
             accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"

@@ -33,6 +33,8 @@ CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modifie
 """What people call the conventions of Denavit-Hartenberg tables."""
 INDEX_BEFORE = re.compile(r"[_\s(\[{]*i\s*[-\u2212]\s*1[)\]}]*", re.IGNORECASE)
 """Of alpha and a of the link before: the table is modified."""
+INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
+"""Of the joint itself, ``d(i)``, ``theta_i``: that tells no convention."""
 SHEET = {
     "\u03b1": "alpha",
     "θ": "theta",
@@ -214,7 +216,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         stem = INDEX_BEFORE.sub("", stem).strip().lower()
         if stem in JOINT_NAMES:
             continue
-        stem = stem.removesuffix("_i")
+        stem = INDEX.sub("", stem)
         key = SHEET.get(stem, stem) + (f"_{unit}" if unit else "")
         if key in columns:
             raise InputError("the header", ", ".join(raw.columns), "every column once", path)
