@@ -123,7 +123,8 @@ class Compensation:
             at = [i for i, each in enumerate(self.status) if each == status]
             if at:
                 named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in at])
-                lines.append(f"{status.capitalize()}: {named}.")
+                where = " in the robot's base frame" if status == UNREACHABLE else ""
+                lines.append(f"{status.capitalize()}{where}: {named}.")
         if self.missed:
             lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target: do not run these rows.")
         return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])

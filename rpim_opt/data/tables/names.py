@@ -49,7 +49,8 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"pitch", "ry"),
     (r"yaw", "rz"),
     (r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
-    (r"(?:unsicherheit_|uncertainty_)?u_?95(?:_total|_mag|_magnitude)?", "u95", "expanded uncertainty, coverage factor 2"),
+    (r"(?:unsicherheit_|uncertainty_)?u_?95(?:_total|_mag|_magnitude)?", "u95",
+         "expanded uncertainty, coverage factor 2"),
     (rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
     (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
     (r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|messpunkt"
