@@ -76,3 +76,16 @@ def test_no_folder_for_temporary_files_or_caches_is_used(tmp_path: Path) -> None
     places = {"TMPDIR": str(tmp_path), "HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
     assert run(tmp_path, "calibrate", "paper_arm", **places).returncode == 0
     assert not list(tmp_path.iterdir())
+
+
+def test_a_reader_that_leaves_is_no_error_of_the_folder_that_is_made(tmp_path: Path) -> None:
+    arm = ROOT / "problems" / "paper_arm"
+    made = ["new", "made", "--robot", str(arm / "robot.toml"), "--data", str(arm / "identification.csv")]
+    read, write = os.pipe()
+    os.close(read)
+    command = [sys.executable, "-m", "rpim_opt", *made]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, cwd=tmp_path, env=environment, stdout=write, stderr=subprocess.PIPE, check=False)
+    os.close(write)
+    assert (done.returncode, done.stderr) == (1, b"")
+    assert run(tmp_path, *made).returncode == 0

@@ -149,6 +149,8 @@ def refused(path: object) -> Iterator[None]:
     """Turn what the system refuses while ``path`` is written into a sentence."""
     try:
         yield
+    except BrokenPipeError:  # of what is printed meanwhile, not of the file
+        raise
     except OSError as error:
         raise RpimError(f"{path}: cannot be written: {error}.") from None
 

@@ -17,7 +17,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
-from rpim_opt.calibration.held_out import CONFIDENCE, judged
+from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
@@ -25,7 +25,7 @@ from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
-from rpim_opt.data.record import Requirement
+from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.linear import Machine, identified_of, require_robot
 from rpim_opt.problem.workspace import in_base, markers

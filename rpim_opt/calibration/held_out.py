@@ -16,12 +16,10 @@ from rpim_opt.calibration.covariance import coverage_factor, row_freedom, scatte
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import HeldOut
+from rpim_opt.data.record import CONFIDENCE, HeldOut
 
 RARE = 0.01
 """Probability that data like those of the calibration have any row that is named."""
-CONFIDENCE = 0.95
-"""Of the intervals whose coverage is counted."""
 
 
 class Judged(NamedTuple):

@@ -15,6 +15,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.trust import Squares
+from rpim_opt.data.record import CONFIDENCE
 from rpim_opt.problem.blocks import in_parts
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
@@ -242,8 +243,6 @@ def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, 
 
 WORTH = 0.9
 """A calibration whose predicted error is above this share of the nominal robot's improves nothing."""
-CONFIDENCE = 0.95
-"""Of the intervals."""
 
 
 @dataclass(frozen=True)

@@ -773,8 +773,6 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     data = problem.data
     parts, fixtures = _movable(problem)
     of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
-    if len(of["base"]) < len(FRAME):
-        of["base"] = []
     if not any(of[what] for what in ("base", *fixtures)) or len(data) < 2 * FEWEST:
         return
     tried = [(k, what) for k in _places(len(data)) for what, some in of.items() if some]

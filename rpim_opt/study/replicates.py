@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import json
+import signal
 import sqlite3
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError
-from contextlib import ExitStack, closing, contextmanager
+from contextlib import ExitStack, closing, contextmanager, suppress
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
@@ -157,7 +158,14 @@ def _computed(key: str, work: Work) -> tuple[str, Row]:
 def _in_processes(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:
     from joblib import Parallel, delayed
 
-    finished: Any = Parallel(n_jobs=workers, return_as="generator_unordered")(delayed(_computed)(*t) for t in tasks)
+    answer = None
+    with suppress(ValueError):  # of a thread that is not the main one
+        answer = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as processes inherit: Ctrl-C is this one's to answer
+    try:
+        finished: Any = Parallel(n_jobs=workers, return_as="generator_unordered")(delayed(_computed)(*t) for t in tasks)
+    finally:
+        if answer is not None:
+            signal.signal(signal.SIGINT, answer)
     try:
         yield from finished
     except BrokenExecutor as error:

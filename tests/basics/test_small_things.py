@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.files import read_bytes
 from rpim_opt.basics.text import LONGEST, shortened
+from rpim_opt.basics.units import UNITS, split_unit
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 
@@ -21,6 +23,16 @@ def test_a_table_has_no_column_without_a_value_and_blanks_where_one_lacks() -> N
     some = parameters.toleranced({"length_mm": 0.5})._repr_html_()
     assert "tolerance" in some
     assert "None" not in some + html
+
+
+def test_a_unit_is_what_its_name_says() -> None:
+    sizes = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180,
+             "Nm": 1.0, "N": 1.0, "kg": 1.0, "K": 1.0, "degC": 1.0, "ppm": 1e-6, "px": 1.0}  # fmt: skip
+    for name, unit in UNITS.items():
+        above, _, below = name.partition("_per_")
+        size = math.prod(sizes[part.removesuffix("2")] ** (1 + part.endswith("2")) for part in above.split("_"))
+        assert unit.si == pytest.approx(size / sizes[below or "m"], rel=1e-14)
+        assert (split_unit(f"x_{name}"), split_unit(f"x__{name}")) == (("x", unit), ("x_", unit))
 
 
 def test_a_long_title_is_cut() -> None:

@@ -6,9 +6,11 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration import words
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.report import report
+from rpim_opt.robot.terms import Curve
 from tests.simulate import ARM
 
 ROBOT = dataclasses.replace(
@@ -74,6 +76,15 @@ def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
     assert outside > 3 * inside
     curve = next(term.curve for term in result.problem.robot.model.terms if term.curve.joint == 2)
     assert curve.period > 2.5  # 2 rad were measured
+
+
+def test_a_curve_stays_at_its_ends_beyond_its_period() -> None:
+    curve = Curve(1, 0.3, 2.0, 3)
+    q = 0.3 + np.array([-5.0, -1.0, -0.9, 0.9, 1.0, 5.0])[:, None]
+    below, low, inside, within, high, above = series([curve], q, np.ones((6, 1)))
+    np.testing.assert_allclose([below, above], [low, high])
+    assert np.abs(inside - low).max() > 0.1
+    assert np.abs(within - high).max() > 0.1
 
 
 def test_a_file_holds_the_curves(rippled, tmp_path):

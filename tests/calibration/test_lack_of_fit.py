@@ -57,6 +57,8 @@ def test_clean_arm_is_left_alone_and_its_noise_named():
     fine = LackOfFit(60, 180, 150.0, "length", left=1e-4, instrument=1e-4, position=2e-5)
     assert "only a more accurate one" in str(fine)
     assert "only a more accurate one" not in str(replace(fine, position=4e-5))
+    assert "mm, repeatability 0.04 mm" in str(replace(fine, position=4e-5))
+    assert "mm, repeatability" not in str(replace(fine, position=4e-6))
 
 
 @pytest.mark.parametrize("weight", [None, "reml", 1.0])

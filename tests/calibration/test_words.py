@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.calibration import words
 from rpim_opt.calibration.at_weight import ending
 from rpim_opt.calibration.certificate import Certificate
-from rpim_opt.calibration.diagnosis import Flag, Held
+from rpim_opt.calibration.diagnosis import Flag, Held, Price
 from rpim_opt.calibration.loop import Ended, State
 from tests.calibration.test_loop import state
 
@@ -50,7 +50,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
         flagged=flags,
         kept_together=(),
         held=held,
-        prices=(),
+        prices=(Price("a2 by 0.5 mm", "mm", 0.0, 2.0, 0.1, 0.2, 9.0),) * count,
         squared_loss=squared_loss,
         linear_penalty=False,
         problem=RESULT.problem,
@@ -75,8 +75,16 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     assert bounds[0] == (
         "Active bound: a2 at +0.5 mm. Loosening its tolerance by 0.05 mm would lower the whitened RMS by 0.05."
     )
+    loosened = "'a2 by 0.5 mm' is active: loosening it by 0.1 mm would lower the objective by 0.2 of 9."
+    assert eleven.count(loosened) == 11
     assert not any("A squared loss lets" in line for line in eleven)
     assert any("A squared loss lets" in line for line in flagged(1, True))
+
+
+def test_points_beyond_a_table_are_counted_with_the_largest_of_their_errors() -> None:
+    found = [words.Scatter(f"p{k}", 2, 1e-3, 1e-4, 1e-6 * k) for k in range(23)]
+    assert words.scatter_rows(found)[20:] == [["3 others", "6", "", "", "0.022"]]
+    assert len(words.scatter_rows(found[:20])) == 20
 
 
 def test_what_a_file_could_not_hold_is_said() -> None:

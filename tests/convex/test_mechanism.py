@@ -122,6 +122,21 @@ def test_every_minimum_is_that_of_plain_cvxpy(loss: str, penalty: str, constrain
         pytest.skip("plain CVXPY does not solve it in any of five ways")
 
 
+@pytest.mark.parametrize("loss", ["absolute", "quantile", "insensitive", "sum of norms"])
+def test_kinks_of_many_rows_are_those_of_all_rows_in_one_program(monkeypatch: pytest.MonkeyPatch, loss: str) -> None:
+    """From 400 entries on the loss is smoothed, and only rows near a kink are taken as they are."""
+    problem, _ = simulated(configurations=500, noise=1e-4, seed=3)
+    model = problem.linearize(np.zeros(34))
+    mine = ro.Formulation("mine", penalty=cp.norm1, **LOSSES[loss])
+    many = ro.convex.pose(mine, model)
+    found = [many.solve(weight).z for weight in (1.0, 100.0, 10.0)]  # the later ones start warm
+    monkeypatch.setattr("rpim_opt.convex.solvers.solve.FEW", 10_000)
+    one = ro.convex.pose(mine, model)
+    for z, weight in zip(found, (1.0, 100.0, 10.0), strict=True):
+        least = one.objective(one.solve(weight).z, weight)
+        assert one.objective(z, weight) == pytest.approx(least, rel=EQUAL)
+
+
 def test_a_quantile_of_redundant_parameters_is_not_wrong_in_silence() -> None:
     """Rounding in directions that the data do not see once left it 5e-3 above the minimum."""
     for weight in (1e-4, 1.0):

@@ -80,6 +80,14 @@ def test_rounded_values_are_named_where_that_explains_the_fit() -> None:
     )
 
 
+def test_values_of_three_digits_are_rounded_to_the_last_of_the_largest() -> None:
+    problem, _ = simulated(("theta2",), 30)
+    y = np.array([[float(f"{value:.3g}") for value in row] for row in 1e3 * problem.data.blocks[0].y])
+    assert np.abs(y).max() >= 1000
+    (text,) = rounded(problem.on(ro.Dataset.of(problem.data.q, 1e-3 * y, 5e-5)), 2e-3)
+    assert text.startswith("measured values are rounded to 10 mm")
+
+
 def test_rows_that_do_not_belong_together_are_named() -> None:
     problem, _ = simulated(("theta2",), 30)
     assert list(unrelated_rows(problem, 0.05)) == []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import inspect
+from rpim_opt.problem.diagnosis import inspect, odd_columns
 from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
@@ -32,6 +32,11 @@ MISTAKES = {
     "degrees as radians": ("position", {"q": np.degrees}, "degrees, not radians"),
     "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
     "millimetres as inches": ("position", {"y": lambda y: 25.4 * y}, "in mm, not inches"),
+    "a column a row too high": (
+        "position",
+        {"q": lambda q: np.concatenate([np.roll(q[..., :1], -1, axis=0), q[..., 1:]], axis=-1)},
+        "move column q1 one row down",
+    ),
     "a frame flipped": ("markers", {"y": lambda y: y * [1, -1, 1]}, "mirrored"),
 }
 
@@ -85,6 +90,20 @@ def test_copied_values_limits_and_coverage() -> None:
     assert any("rows c4 and c5 have the same measured values" in text for text in warnings)
     assert any("joint 2 leaves its limits" in text for text in warnings)
     assert any("joint 5 moves only 0.00 deg" in text for text in warnings)
+
+
+def test_columns_without_a_negative_value_are_named() -> None:
+    assert list(odd_columns(changed("position"))) == []
+    assert list(odd_columns(changed("position", y=np.abs))) == [
+        "no value of column x, y and z is negative: were signs lost?"
+    ]
+
+
+def test_deviations_of_pixels_are_in_pixels() -> None:
+    problem = ro.load("camera").problem
+    (block,) = problem.data.blocks
+    rows = inspect(problem).content()["measured"]
+    assert {row["sigma_px"] for row in rows} == {np.sqrt(np.median(block.covariance[:, 0, 0]))}
 
 
 def test_parallel_axes_are_proposed() -> None:

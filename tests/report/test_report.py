@@ -95,6 +95,7 @@ def test_the_report_says_the_figures_of_the_result(arm, arm_page) -> None:
     assert "No measurement depends on theta6." in text
     assert "T8-6" in text  # left out, with its reason
     assert "0.03 mm (x, y, z)" in text
+    assert re.search(r" \d+ % of the held-out coordinates lie in", text)
     for digest in arm.record.files.values():
         assert digest in text
     for row in arm.parameter_rows():

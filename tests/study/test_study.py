@@ -76,6 +76,16 @@ def values(folder: Path) -> list[float]:
     return parquet.read_table(folder / "replicates.parquet").column("value").to_pylist()
 
 
+def _answers() -> dict[str, bool]:
+    return {"ignored": signal.getsignal(signal.SIGINT) == signal.SIG_IGN}
+
+
+def test_an_interrupt_is_for_the_process_that_waits_for_the_others() -> None:
+    before = signal.getsignal(signal.SIGINT)
+    assert list(compute([("a", _answers)], 2, None)) == [("a", {"ignored": True})]
+    assert signal.getsignal(signal.SIGINT) == before
+
+
 def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
     toy()
     counts = []

@@ -156,6 +156,7 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     last = second.record.earlier[-1]
     assert last.digest == json.loads((tmp_path / "first.json").read_text(encoding="utf-8"))["digest"]
     assert last.let_go == ("theta4",)
+    assert f"(digest {last.digest[:12]})" in second.weight_sentence()
     assert "without theta4" in second.weight_sentence()
     again = second.asked(second.problem)  # a file holds the prior: it can be solved again
     np.testing.assert_allclose(again.x, second.x, atol=1e-8)

@@ -315,7 +315,8 @@ class Newton:
     def _exact(self, z: Array, near: np.ndarray, h: float) -> Array | None:
         """Return the minimum with rows near a kink as they are, the others by their model, until no other row bends."""
         at, T, weight = self.penalty.at, self.rows.whitened[1], self.weight
-        value = self._value(z, self.x)
+        x, best = self.x, self.point
+        value = self._value(z, x)
         for _ in range(8):
             if len(near) > 2 * max(NEAR * self.rows.A.shape[1], 200):
                 return None
@@ -336,14 +337,15 @@ class Newton:
             r_ahead = self._residual(ahead)
             v, v_ahead = self.rows.entries(r), self.rows.entries(r_ahead)
             old, new = self.loss.values(v)[near].sum(), self.loss.values(v_ahead)[near].sum()
-            chord = weight * (self.penalty.value(point.x) - self.penalty.value(self.x))
+            chord = weight * (self.penalty.value(point.x) - self.penalty.value(x))
             damping = self._damping(ahead) - self._damping(z)
             u = T @ d
             promised = -(gradient @ u + 0.5 * u @ H @ u + chord + damping + new - old)
             there = self._total(r_ahead) + weight * self.penalty.value(point.x) + self._damping(ahead)
             if there <= value:
-                z, value, self.x, self.point = ahead, there, point.x, point
+                z, value, x, best = ahead, there, point.x, point
             if promised <= 1e-9 * max(abs(value), 1e-9):
+                self.x, self.point = x, best
                 return z
             bent = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.kink
             beside = self._near(self.rows.entries(self._residual(z)), h)
