@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+import re
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,7 +18,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.basics.text import joined, listed
+from rpim_opt.basics.text import counted, joined, listed
+from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.identify import calibrate
@@ -83,6 +85,7 @@ def export_files(
     urdf: Path | None = None,
     ur_kinematics: Path | None = None,
     ur_calibration: Path | None = None,
+    camera_info: Path | None = None,
     mdh: Path | None = None,
     robodk: Path | None = None,
     corrections: Path | None = None,
@@ -100,9 +103,9 @@ def export_files(
         The calibration.
     out
         Where to write what corrects a file; of several the folder.
-    urdf, ur_kinematics, ur_calibration
+    urdf, ur_kinematics, ur_calibration, camera_info
         Files of the nominal robot to correct: a URDF, ``kinematics.yaml`` of ROS and ``calibration.conf`` of a
-        Universal Robot.
+        Universal Robot, a camera's YAML of ROS (``camera_info_url``).
     mdh, robodk
         Files to write: MDH parameters (.csv, .json, .toml), RoboDK's four numbers a joint (.csv).
     corrections
@@ -135,6 +138,7 @@ def export_files(
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
         (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, marker).robot, target)),
         (ur_calibration, lambda source, target: export_ur_calibration(result, source, target)),
+        (camera_info, partial(export_camera, result)),
     ]
     sources = [(source, write) for source, write in corrected if source]
     if sources and out is None:
@@ -154,7 +158,9 @@ def export_files(
     ]
     writers += [(target, write) for target, write in plain if target]
     if not writers:
-        accepted = "--urdf, --ur-kinematics, --ur-calibration, --mdh, --robodk, --corrections, one or several"
+        accepted = (
+            "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections, one or several"
+        )
         raise InputError("export", "nothing to write", accepted)
     said = write_all(writers, note)
     requirement = whole.record.requirement
@@ -331,6 +337,49 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     if not np.array_equal(mdh, robot.mdh):
         notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
     return notes
+
+
+def export_camera(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
+    """Write a camera's YAML of ROS with the calibrated intrinsics, everything else as in ``source``.
+
+    The projection matrix keeps its rectification: focal lengths are multiplied, and the centre moved, as those of the
+    camera matrix. Refused are calibrations of no camera, or of several, and files without one of the three lists.
+    """
+    path = Path(source)
+    p = result.problem.parameters
+    values = p.nominal.copy()
+    values[p.identified] = p.free.values(result.x)
+    cameras = {name.rpartition("_")[0] for name in p.names if own_name(name).startswith("camera_")}
+    if len(cameras) != 1:
+        raise InputError("the calibration", counted(len(cameras), "camera"), "one camera")
+    camera = cameras.pop() + "_"
+    of = {name[len(camera) :]: value for name, value in zip(p.names, values, strict=True) if name.startswith(camera)}
+    text = read_bytes(path).decode()
+    old = [float(number) for number in _yaml_list(text, "camera_matrix", 9, path)[0]]
+    projection = [float(number) for number in _yaml_list(text, "projection_matrix", 12, path)[0]]
+    for at, in_matrix, name in ((0, 0, "fx"), (5, 4, "fy")):
+        projection[at] *= of[name] / old[in_matrix]
+    for at, in_matrix, name in ((2, 2, "cx"), (6, 5, "cy")):
+        projection[at] += of[name] - old[in_matrix]
+    lists = {
+        "camera_matrix": [of["fx"], 0.0, of["cx"], 0.0, of["fy"], of["cy"], 0.0, 0.0, 1.0],
+        "distortion_coefficients": [of[name] for name in ("k1", "k2", "p1", "p2", "k3")],
+        "projection_matrix": projection,
+    }
+    for key, numbers in lists.items():
+        _, start, end = _yaml_list(text, key, len(numbers), path)
+        text = text[:start] + ", ".join(repr(float(number)) for number in numbers) + text[end:]
+    write_text(Path(target), text)
+    return []
+
+
+def _yaml_list(text: str, key: str, count: int, path: Path) -> tuple[list[str], int, int]:
+    """Return the numbers of a list ``key: data: [...]``, and where they stand."""
+    found = re.search(rf"^{key}:[^\n]*\n(?:[ \t]+[^\n]*\n)*?[ \t]+data:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    numbers = found[1].replace(",", " ").split() if found else []
+    if found is None or len(numbers) != count or not np.isfinite([numeral(each) for each in numbers]).all():
+        raise InputError(f"key {key}", f"{len(numbers)} numbers", f"data: [...] of {count} finite numbers", path)
+    return numbers, found.start(1), found.end(1)
 
 
 def noted(text: str, ending: str, note: str) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tomllib
 from dataclasses import replace
 from functools import cache
@@ -256,3 +257,49 @@ def test_two_cameras_on_the_flange_are_told_apart(tmp_path: Path) -> None:
         assert values[f"camera_{name}_fx"] == pytest.approx(f, abs=0.1)
         assert values[f"tool_{name}_x"] == pytest.approx(x, abs=1e-4)
     assert result.errors(dimension="pixel").max() < 0.01
+
+
+CAMERA_INFO = """image_width: 640   # pixels
+image_height: 480
+camera_name: head
+camera_matrix:
+  rows: 3
+  cols: 3
+  data: [500.0, 0., 320., 0., 510., 240., 0., 0., 1.]
+distortion_model: plumb_bob
+distortion_coefficients:
+  rows: 1
+  cols: 5
+  data: [0, 0, 0, 0, 0]
+projection_matrix:
+  rows: 3
+  cols: 4
+  data: [400., 0., 310., 0.,
+         0., 408., 236., 0., 0., 0., 1., 0.]
+"""
+
+
+def test_a_camera_goes_into_the_file_that_ros_reads(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = ro.load("camera").calibrate(weight=1.0)
+    Path("camera.yaml").write_text(CAMERA_INFO)
+    ro.use.export_files(result, Path("better.yaml"), camera_info=Path("camera.yaml"), despite_verdict=True)
+    rows = [
+        re.findall(r"[-\d.e]+", data) for data in re.findall(r"data: \[([^\]]*)\]", Path("better.yaml").read_text())
+    ]
+    matrix, distortion, projection = (np.array(numbers, dtype=float) for numbers in rows)
+    p = result.problem.parameters
+    values = dict(zip(p.names, p.nominal, strict=True))
+    for name, x in zip(p.free.names, result.x, strict=True):
+        values[name] += x
+    fx, fy, cx, cy, *of = (values[f"camera_{name}"] for name in ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3"))
+    assert matrix.tolist() == pytest.approx([fx, 0, cx, 0, fy, cy, 0, 0, 1])
+    assert distortion.tolist() == pytest.approx(of)
+    assert projection[[0, 2, 5, 6]].tolist() == pytest.approx([0.8 * fx, cx - 10, 0.8 * fy, cy - 4])
+    assert Path("better.yaml").read_text().startswith("image_width: 640   # pixels\nimage_height: 480\n")
+    Path("camera.yaml").write_text(CAMERA_INFO.replace("data: [0, 0, 0, 0, 0]", "data: [0, 0, 0, 0]"))
+    with pytest.raises(ro.InputError, match="key distortion_coefficients: found 4 numbers"):
+        ro.use.export_files(result, Path("b.yaml"), camera_info=Path("camera.yaml"), despite_verdict=True)
+    plain = ro.calibrate("position", weight=1.0)
+    with pytest.raises(ro.InputError, match="the calibration: found 0 cameras"):
+        ro.use.export_files(plain, Path("b.yaml"), camera_info=Path("camera.yaml"))
