@@ -532,7 +532,8 @@ def decisive(result: Calibration, found: Workspace) -> list[str]:
         return []
     text = f"The bound rests on {part}: known exactly, it would be {1e3 * left[part]:.3f} mm."
     if "reflector" in part:
-        text += " State what is known of it ([prior] known), or measure with the wrist turned further."
+        text += ' State what is known of it ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]), or measure with the wrist'
+        text += " turned further."
     return [text]
 
 

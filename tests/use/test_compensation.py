@@ -276,7 +276,7 @@ def test_what_cannot_be_reached_is_named_with_what_is_left() -> None:
             np.sqrt(2 * nearest), abs=3e-4
         )  # the outstretched arm: a flat valley
         assert np.linalg.norm(error(found.q[i])) == pytest.approx(found.position_error[i], abs=1e-10)
-    assert f"Unreachable: 1 ({1e3 * found.position_error[0]:.3f} mm left)" in str(found)
+    assert f"Unreachable in the robot's base frame: 1 ({1e3 * found.position_error[0]:.3f} mm left)" in str(found)
 
 
 def base_position(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
