@@ -9,12 +9,15 @@ from itertools import count
 from logging import getLogger
 from typing import Any
 
+import numpy as np
+
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
+from rpim_opt.bayes.prior_terms import Statement
 from rpim_opt.calibration.at_weight import calibrated
 from rpim_opt.calibration.loop import Iteration, Options, nearby, require_finite, require_start
 from rpim_opt.calibration.result import Calibration
@@ -34,6 +37,8 @@ NOISE = {
 }
 """Parts of the noise that are estimated, by the option's name."""
 MODELS = ("geometry", "auto")
+ZERO = 0.1
+"""Standard deviation [rad] of a joint's zero that was found from the data."""
 ELSEWHERE = "The stated frames are far from their registration; deviations count from the registered frames."
 
 
@@ -125,15 +130,6 @@ def calibrate(
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
     kinds = _noise(noise, model)
     require_affordable(problem)
-    asked: Callable[[Source], Calibration] = partial(
-        calibrate,
-        formulation=formulation,
-        weight=weight,
-        prior=prior,
-        model=model,
-        noise=noise,
-        **(vars(options) | {"progress": None}),
-    )
     require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None
     mapping: JointMapping | None = None
@@ -143,8 +139,18 @@ def calibrate(
         found = find_mapping(problem)
         if found is not None:
             mapping, problem = found
+            prior = (prior or Prior()) & _zeros(mapping)
         elsewhere = relocated(problem)
     problem = elsewhere or problem
+    asked: Callable[[Source], Calibration] = partial(
+        calibrate,
+        formulation=formulation,
+        weight=weight,
+        prior=prior,
+        model=model,
+        noise=noise,
+        **(vars(options) | {"progress": None}),
+    )
     if weight is None and formulation.penalty is None:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
@@ -164,6 +170,13 @@ def calibrate(
     )
     LOGGER.info(message)
     return replace(result, message=message, asked=mapped_as(mapping, asked), mapping=mapping)
+
+
+def _zeros(mapping: JointMapping) -> Prior:
+    """Return what is expected of zeros that were found from the data: quarter turns are conventions, others chance."""
+    found = np.flatnonzero((mapping.zero % (np.pi / 2) != 0) & (np.array(mapping.joint_types) == "revolute"))
+    wide = ((1 / ZERO,),)
+    return Prior(statements=tuple(Statement((f"theta{i + 1}",), ("angle",), wide, (0.0,), whole=True) for i in found))
 
 
 def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:

@@ -99,8 +99,14 @@ def test_many_random_signs_and_zeros_are_found(name: str, seed: int) -> None:
     problem, unseen, truth = simulated(name, seed)
     result = ro.calibrate(problem)
     assert result.mapping is not None
-    # zeros are found to some mrad from 20 points, and the prior is centred there and not at the truth: 1.203 at most
-    assert error(result, unseen) < 1.25 * error(ro.calibrate(truth), unseen) or result.mapping.alternatives
+    # what is lost is what the nominal robot says of the zeros
+    assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen) or result.mapping.alternatives
+
+
+def test_zeros_that_were_found_are_not_held_there() -> None:
+    """20 points tell zeros to some mrad: with the nominal robot's prior about them the error was 1.18 times as large."""
+    problem, unseen, truth = simulated("panda", 101)
+    assert error(ro.calibrate(problem), unseen) < 1.12 * error(ro.calibrate(truth), unseen)
 
 
 def test_poses_show_signs_and_zeros() -> None:
