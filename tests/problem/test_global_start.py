@@ -104,7 +104,7 @@ def test_many_random_signs_and_zeros_are_found(name: str, seed: int) -> None:
 
 
 def test_zeros_that_were_found_are_not_held_there() -> None:
-    """20 points tell zeros to some mrad: with the nominal robot's prior about them the error was 1.18 times as large."""
+    """20 points tell zeros to some mrad: held there the error was 1.18 times as large."""
     problem, unseen, truth = simulated("panda", 101)
     assert error(ro.calibrate(problem), unseen) < 1.12 * error(ro.calibrate(truth), unseen)
 
