@@ -35,7 +35,7 @@ def test_a_grid_has_one_row_a_replicate() -> None:
     for row in found.rows:
         if (row["formulation"], row["selector"]) == ("lasso", "reml"):
             assert row["status"] == "impossible"
-            assert row["reason"].startswith("Selector reml: found formulation 'lasso', accepted: a quadratic penalty")
+            assert row["reason"].startswith("selector reml: found formulation 'lasso', accepted: a quadratic penalty")
             assert row["rms_mm"] is None
         else:
             assert row["status"] == "ok"
@@ -430,7 +430,7 @@ def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
     page = found.report(tmp_path / "out").read_text()
     assert nasty not in page
     assert "default-src 'none'" in unescape(page)
-    for part in ("How it was made", "SHA-256", "Selector reml: found formulation", "data:image/svg+xml;base64,"):
+    for part in ("How it was made", "SHA-256", "Selector reml: found formulation", "<svg"):
         assert part in page
     lines = (tmp_path / "out" / "replicates.csv").read_text().splitlines()
     assert len(lines) == 1 + 20
