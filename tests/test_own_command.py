@@ -89,3 +89,28 @@ def test_a_reader_that_leaves_is_no_error_of_the_folder_that_is_made(tmp_path: P
     os.close(write)
     assert (done.returncode, done.stderr) == (1, b"")
     assert run(tmp_path, *made).returncode == 0
+
+
+NO_NETWORK = """
+import sys
+
+def refuse(event, arguments):
+    if event in ("socket.connect", "socket.bind", "socket.getaddrinfo", "subprocess.Popen", "os.system", "os.exec"):
+        raise SystemExit(f"{event} {arguments}")
+
+sys.addaudithook(refuse)
+from rpim_opt.__main__ import main
+main()
+"""
+
+
+@pytest.mark.parametrize(
+    "arguments", [["calibrate", "paper_arm", "--out", "out"], ["inspect", "paper_arm"], ["robots"], ["report", "out"]]
+)
+def test_a_command_opens_no_connection_and_starts_no_program(tmp_path: Path, arguments: list[str]) -> None:
+    if arguments[0] == "report":
+        assert run(tmp_path, "calibrate", "paper_arm", "--out", "out").returncode == 0
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    command = [sys.executable, "-c", NO_NETWORK, *arguments]
+    done = subprocess.run(command, cwd=tmp_path, env=environment, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr

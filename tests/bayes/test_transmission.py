@@ -83,8 +83,9 @@ def test_a_curve_stays_at_its_ends_beyond_its_period() -> None:
     q = 0.3 + np.array([-5.0, -1.0, -0.9, 0.9, 1.0, 5.0])[:, None]
     below, low, inside, within, high, above = series([curve], q, np.ones((6, 1)))
     np.testing.assert_allclose([below, above], [low, high])
-    assert np.abs(inside - low).max() > 0.1
-    assert np.abs(within - high).max() > 0.1
+    angles = np.pi * 0.9 * np.arange(1, 4)
+    np.testing.assert_allclose(within, [*np.cos(angles), *np.sin(angles)])
+    np.testing.assert_allclose(inside, [*np.cos(angles), *-np.sin(angles)])
 
 
 def test_a_file_holds_the_curves(rippled, tmp_path):
