@@ -12,7 +12,7 @@ from string import ascii_uppercase
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
@@ -109,9 +109,12 @@ def _common(
     parts: Mapping[str, CalibrationProblem], shared: Sequence[str] | Mapping[str, Sequence[str]]
 ) -> dict[str, set[str]]:
     """Return what every problem shares: parameters that match a pattern and that several have, stated alike."""
-    if isinstance(shared, str):
-        raise InputError("together, shared", f"'{shared}'", f"patterns in a list: ['{shared}']")
     patterns = shared if isinstance(shared, Mapping) else dict.fromkeys(parts, shared)
+    for key, each in patterns.items():
+        if key not in parts:
+            raise InputError("together, shared", f"'{key}'", choices(key, parts))
+        if isinstance(each, str):
+            raise InputError("together, shared", f"'{each}'", f"patterns in a list: ['{each}']")
     count = Counter(name for part in parts.values() for name in part.parameters.names)
     several = [name for name in count if count[name] > 1]
     for pattern in chain.from_iterable(patterns.values()):
@@ -138,7 +141,7 @@ def _common(
             if apart > FAR * one.scale[i]:
                 found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} scales"
                 raise InputError(f"together, shared '{name}'", found, "one nominal value in all")
-    return {key: {name for name, keys in having.items() if key in keys} for key in parts}
+    return {key: {name for name, keys in having.items() if key in keys and len(keys) > 1} for key in parts}
 
 
 def _concatenated(tables: Sequence[Parameters]) -> Parameters:

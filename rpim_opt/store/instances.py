@@ -226,7 +226,9 @@ def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
         f"{prefix}*" for prefix in (ORIGIN, MOUNT) if any(count[name] > 1 for name in count if name.startswith(prefix))
     ]
     more = stated.table.shared
-    by_chain = {name: [*shared, *(more.get(name, ()) if isinstance(more, dict) else more)] for name in parts}
+    if isinstance(more, list):
+        more = dict.fromkeys(parts, more)
+    by_chain = {name: [*shared, *more.get(name, ())] for name in {**parts, **more}}
     try:
         problem = together(**{name: part.problem for name, part in parts.items()}, shared=by_chain)
     except InputError as error:

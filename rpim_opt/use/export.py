@@ -20,12 +20,14 @@ from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, w
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import counted, joined, listed
 from rpim_opt.basics.units import numeral
+from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
+from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
@@ -63,9 +65,7 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     (array([ 1.8 , -0.7 ,  0.35,  0.02, -0.04,  1.9 ]), array([18.8, -3.7, 61. ]))
     """
     p = result.problem.parameters
-    values = p.nominal.copy()
-    values[p.identified] = p.free.values(result.x)
-    of = dict(zip(p.names, values, strict=True))
+    of = dict(zip(p.names, parameter_values(result.problem, result.x), strict=True))
     extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
     if extras:
         accepted = "MDH parameters, base and tool: files hold nothing else; `compensate` corrects commands for them"
@@ -347,39 +347,33 @@ def export_camera(result: Calibration, source: str | Path, target: str | Path) -
     """
     path = Path(source)
     p = result.problem.parameters
-    values = p.nominal.copy()
-    values[p.identified] = p.free.values(result.x)
     cameras = {name.rpartition("_")[0] for name in p.names if own_name(name).startswith("camera_")}
     if len(cameras) != 1:
         raise InputError("the calibration", counted(len(cameras), "camera"), "one camera")
-    camera = cameras.pop() + "_"
-    of = {name[len(camera) :]: value for name, value in zip(p.names, values, strict=True) if name.startswith(camera)}
+    values = dict(zip(p.names, parameter_values(result.problem, result.x).tolist(), strict=True))
+    fx, fy, cx, cy, *distortion = (values[f"{min(cameras)}_{name}"] for name in INTRINSICS)
     text = read_bytes(path).decode()
-    old = [float(number) for number in _yaml_list(text, "camera_matrix", 9, path)[0]]
-    projection = [float(number) for number in _yaml_list(text, "projection_matrix", 12, path)[0]]
-    for at, in_matrix, name in ((0, 0, "fx"), (5, 4, "fy")):
-        projection[at] *= of[name] / old[in_matrix]
-    for at, in_matrix, name in ((2, 2, "cx"), (6, 5, "cy")):
-        projection[at] += of[name] - old[in_matrix]
-    lists = {
-        "camera_matrix": [of["fx"], 0.0, of["cx"], 0.0, of["fy"], of["cy"], 0.0, 0.0, 1.0],
-        "distortion_coefficients": [of[name] for name in ("k1", "k2", "p1", "p2", "k3")],
-        "projection_matrix": projection,
-    }
+    before = _yaml_list(text, "camera_matrix", (3, 3), path)[0]
+    K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    P = _yaml_list(text, "projection_matrix", (3, 4), path)[0]
+    P[[0, 1], [0, 1]] *= np.diag(K)[:2] / np.diag(before)[:2]
+    P[:2, 2] += K[:2, 2] - before[:2, 2]
+    lists = {"camera_matrix": K, "distortion_coefficients": np.array([distortion]), "projection_matrix": P}
     for key, numbers in lists.items():
-        _, start, end = _yaml_list(text, key, len(numbers), path)
-        text = text[:start] + ", ".join(repr(float(number)) for number in numbers) + text[end:]
+        _, start, end = _yaml_list(text, key, numbers.shape, path)
+        text = text[:start] + ", ".join(map(repr, numbers.ravel().tolist())) + text[end:]
     write_text(Path(target), text)
     return []
 
 
-def _yaml_list(text: str, key: str, count: int, path: Path) -> tuple[list[str], int, int]:
+def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple[Array, int, int]:
     """Return the numbers of a list ``key: data: [...]``, and where they stand."""
     found = re.search(rf"^{key}:[^\n]*\n(?:[ \t]+[^\n]*\n)*?[ \t]+data:\s*\[([^\]]*)\]", text, re.MULTILINE)
-    numbers = found[1].replace(",", " ").split() if found else []
-    if found is None or len(numbers) != count or not np.isfinite([numeral(each) for each in numbers]).all():
-        raise InputError(f"key {key}", f"{len(numbers)} numbers", f"data: [...] of {count} finite numbers", path)
-    return numbers, found.start(1), found.end(1)
+    numbers = np.array([numeral(each) for each in found[1].replace(",", " ").split()]) if found else np.empty(0)
+    if found is None or numbers.size != np.prod(shape) or not np.isfinite(numbers).all():
+        accepted = f"data: [...] of {np.prod(shape)} finite numbers"
+        raise InputError(f"key {key}", f"{numbers.size} numbers", accepted, path)
+    return numbers.reshape(shape), found.start(1), found.end(1)
 
 
 def noted(text: str, ending: str, note: str) -> str:

@@ -172,6 +172,11 @@ def test_chains_share_what_they_say(tmp_path: Path, monkeypatch: pytest.MonkeyPa
     own = part.residual(np.array([values[name] for name in called]))
     assert np.array_equal(whole.problem.residual(x)[-len(own) :], own)
     assert run(monkeypatch, "inspect", ".") == 0
+    Path("problem.toml").write_text(Path("problem.toml").read_text().replace("right = [", "rigt = ["))
+    with pytest.raises(ro.InputError, match=r"together, shared: found 'rigt', accepted: left, right, head.*mean right"):
+        ro.load(".")
+    with pytest.raises(ro.InputError, match=r"found 'base_\*', accepted: patterns in a list"):
+        ro.together(left=part, right=part, shared={"left": "base_*"})
 
 
 def test_auto_takes_origins_in_the_place_of_the_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
