@@ -59,8 +59,7 @@ def test_configurations_left_out_of_a_lasso_are_near_those_that_are_solved_witho
     chosen, solved = ro.leave_one_out(program), ro.leave_one_out(program, exact=True)
     assert "approximately (" in chosen.note
     assert "approximately" not in solved.note
-    assert chosen.weight == pytest.approx(solved.weight, rel=0.5)
-    assert min(chosen.score) == pytest.approx(min(solved.score), rel=0.05)
+    assert min(chosen.score) == pytest.approx(min(solved.score), rel=0.02)  # of two minima that are as good
 
 
 def test_gcv_is_its_formula_and_close_to_leaving_out() -> None:
