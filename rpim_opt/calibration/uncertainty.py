@@ -221,6 +221,9 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
     for stack in part.stacks(joints=False):
         length[stack.index] = stack.length
     rows = max(len(np.unique(part.owners[length])), 1)
+    at = part.joint_values
+    if result.record.earlier:  # what was measured before them counts, at the corners of its ranges
+        at = np.vstack([at, *(ends @ part.robot.joint_map.T for ends in result.ranges.values())])
     found = []
     for curve in part.robot.model.curves:
         place = [free.names.index(name) for name in transmission(curve).names(curve.joint)]
@@ -229,9 +232,8 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         variance = np.full(len(q), np.nan)
         if C is not None:
             variance = np.sum((columns @ C[np.ix_(place, place)]) * columns, axis=1)
-        at = part.joint_values[:, curve.joint - 1]
         effect = np.linalg.norm(J[np.ix_(length, place)] @ result.x[place]) / np.sqrt(rows)
-        ends = float(at.min()), float(at.max())
+        ends = float(at[:, curve.joint - 1].min()), float(at[:, curve.joint - 1].max())
         found.append(
             TransmissionError(curve.joint, q, columns @ result.x[place], np.sqrt(variance), ends, float(effect))
         )

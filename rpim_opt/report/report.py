@@ -447,12 +447,18 @@ def _robot(name: str, robot: Robot) -> str:
     return " - ".join(filter(None, [named, f"{robot.dof} joints", robot.source]))
 
 
+FEW_NUMBERS = 8
+"""Arguments of a penalty or constraint that are longer are said by their length: an earlier result is a matrix."""
+
+
 def _formulation(result: Calibration) -> str:
     """Return what is minimized, in the terms of the result's file."""
 
     def term(part: Any) -> str:
         if isinstance(part, list):
-            return f"{part[0]}({', '.join(map(str, part[1:]))})"
+            long = [isinstance(each, list | tuple) and len(each) > FEW_NUMBERS for each in part]
+            texts = [f"{len(each)} rows" if cut else str(each) for each, cut in zip(part, long, strict=True)]
+            return f"{texts[0]}({', '.join(texts[1:])})"
         return part or "a function of a script, not in the file"
 
     parts = definition(result.formulation)

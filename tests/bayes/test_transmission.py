@@ -140,6 +140,9 @@ def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
     """The prior of the update knows the curves' coefficients, which no file of a robot holds."""
     result, others = rippled
     updated = ro.use.update(result, others).result
+    assert len(report.page(updated)) < 1e6  # its prior is a matrix of all coefficients
+    before, after = (transmission_errors(each)[0].measured for each in (result, updated))
+    assert after[0] <= before[0] < before[1] <= after[1]
     alone, notes = ro.use.geometry_alone(updated)
     assert notes
     assert len(alone.x) == len(result.stated.parameters.free)
