@@ -195,3 +195,51 @@ def test_origins_of_another_robot_are_not_written(tmp_path: Path) -> None:
     path.write_text(random_tree(0)[0])
     with pytest.raises(ro.InputError, match=r"parameters origin_torso_\*: found no such joint"):
         ro.robot.write_origins(path, {"origin_torso_": np.zeros(6)}, tmp_path / "new.urdf")
+
+
+def test_two_hands_on_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Touches of one plane by two tips of a tree: those of other places lie in one plane, too, after and not before."""
+    monkeypatch.chdir(tmp_path)
+    seed, count = 4, 60
+    content, tips = random_tree(seed)
+    Path("robot.urdf").write_text(content)
+    with_errors(Path("robot.urdf"), Path("true.urdf"), seed)
+    rng = np.random.default_rng(seed)
+    lines = ['title = "table"', 'robot = "robot.urdf"', 'measurement = "revisit"', 'identify = ["origin_*"]']
+    lines += ["[noise]", "position_mm = 0.1"]
+    others = {}
+    for name, tip in (("left", tips[0]), ("right", tips[1])):
+        arm = ro.read_urdf("robot.urdf", "root", tip, origins=True)
+        q = drawn(arm, 400, rng)
+
+        def heights(q: np.ndarray, names: tuple[str, ...] = arm.names, tip: str = tip) -> np.ndarray:
+            return between_links(Path("true.urdf"), names, "root", tip, q)[:, 2, 3]
+
+        for _ in range(15):  # Newton steps of least length onto the table
+            z = heights(q)
+            slopes = np.stack([(heights(q + 1e-6 * e) - z) / 1e-6 for e in np.eye(len(q[0]))], axis=1)
+            q = q - ((z - 0.2) / (1e-3 + np.sum(slopes**2, axis=1)))[:, None] * slopes
+        q = q[(np.abs(heights(q) - 0.2) < 1e-6) & (np.abs(q).max(axis=1) < 3)]
+        others[name] = q[count:]
+        columns = [f"q{i}_{'rad' if d == 'angle' else 'm'}" for i, d in enumerate(arm.robot.joint_dimensions, 1)]
+        rows = [",".join([*map(repr, row), "table"]) for row in q[:count].tolist()]
+        Path(f"{name}.csv").write_text("\n".join([",".join([*columns, "plane"]), *rows]) + "\n")
+        lines += [f"[chain.{name}]", 'urdf_base = "root"', f'urdf_tip = "{tip}"', f'identification = "{name}.csv"']
+    Path("problem.toml").write_text("\n".join(lines) + "\n")
+    problem = ro.load(".").problem
+    assert len(problem.touches.rows) == 1
+    result = ro.calibrate(problem)
+
+    def off(x: np.ndarray) -> float:
+        """Return how far other touches are from the plane that fits them best [m, RMS]."""
+        read = [
+            result.problem.on(ro.Dataset.of_robots({name: ro.Dataset.of(q, np.zeros((len(q), 3)), 1e-4)})).modelled(x)[
+                0
+            ]
+            for name, q in others.items()
+        ]
+        p = np.concatenate(read)
+        return float(np.linalg.svd(p - p.mean(axis=0), compute_uv=False)[-1] / np.sqrt(len(p)))
+
+    assert min(map(len, others.values())) > 50
+    assert off(result.x) < 1e-4 < 1e-3 < off(0 * result.x)
