@@ -306,11 +306,13 @@ def _orders(robot: Robot) -> Iterator[Reading]:
     """Yield all orders of up to six turning joints."""
     if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
         return
-    for order in permutations(range(robot.dof)):
-        what = f"joints in the order {', '.join(f'q{i + 1}' for i in order)}"
-        yield Reading(
-            what, "name the columns in that order", lambda points, order=order: replace(points, q=points.q[:, order])
-        )
+    for columns in permutations(range(robot.dof)):  # the columns that hold joints 1, 2, ...
+        names = ", ".join(f"q{columns.index(i) + 1}" for i in range(robot.dof))
+
+        def change(points: Points, columns: tuple[int, ...] = columns) -> Points:
+            return replace(points, q=points.q[:, columns])
+
+        yield Reading(f"joints in the order {names}", f"name the columns {names}", change)
 
 
 def _other_robots(robot: Robot) -> Iterator[Reading]:

@@ -194,6 +194,14 @@ def test_advice_that_is_followed_in_the_folder_ends_well(monkeypatch, capsys, tm
     assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 0
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_columns_of_joints_in_another_order_get_the_names_that_help(monkeypatch, capsys, tmp_path) -> None:
+    """Where column q1 holds joint 6 and q2 joint 1, the names are q6, q1, ..., and not q2, q3, ..."""
+    made(monkeypatch, tmp_path, joints(lambda q: np.roll(q, 1, axis=-1))(simulated_arm("ur5e", count=25)))
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
+    assert "name the columns q6, q1, q2, q3, q4, q5." in " ".join(capsys.readouterr().out.split())
+
+
 def test_a_zero_that_is_off_by_degrees_is_calibrated(monkeypatch, tmp_path) -> None:
     """Other readings with zeros fitted are compared with the stated one with zeros fitted."""
     made(monkeypatch, tmp_path, shifted(2, 5)(simulated_arm("ur5e")))
