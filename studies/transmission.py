@@ -137,7 +137,7 @@ def _recovered(rows: Rows, wrist: bool) -> tuple[float, float, float]:
     """Return correlation and ratio of the RMS of all curves with the truth, and the share that intervals cover."""
     curves = [curve for row in rows for curve in row["curves"] if (curve["joint"] > LARGE) == wrist]
     if not curves:
-        return (float("nan"),) * 3
+        return float("nan"), float("nan"), float("nan")
     truth, found, both = (sum(curve[key] for curve in curves) for key in ("truth", "found", "both"))
     return both / np.sqrt(truth * found), float(np.sqrt(found / truth)), float(np.mean([c["covered"] for c in curves]))
 

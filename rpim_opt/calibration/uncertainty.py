@@ -228,7 +228,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
     for curve in part.robot.model.curves:
         place = [free.names.index(name) for name in transmission(curve).names(curve.joint)]
         q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
-        columns = series([curve._replace(joint=1)], q[:, None], np.ones((len(q), 1)))
+        columns: Array = series([curve._replace(joint=1)], q[:, None], np.ones((len(q), 1)))
         variance = np.full(len(q), np.nan)
         if C is not None:
             variance = np.sum((columns @ C[np.ix_(place, place)]) * columns, axis=1)

@@ -190,7 +190,8 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
         yield of(f"joint {i + 1} read {unit}", remedy, eye + (factor - 1) * np.outer(eye[i], eye[i]))
     for i in np.flatnonzero(turning):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
-        yield of(f"joint {i + 1} reversed", f"write sign = -1 for joint {i + 1} in robot.toml", flipped)
+        sign = 1 if robot.joint_map[i, i] < 0 else -1
+        yield of(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
     for i, j in combinations(range(robot.dof), 2):
         exchanged = eye.copy()
         exchanged[[i, j]] = eye[[j, i]]
@@ -202,11 +203,18 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
         for factor in COUPLINGS[bool(abs(i - j) == 1)]:
             M = eye.copy()
             M[i, j] = factor
-            rows = ", ".join("[" + ", ".join(f"{v:g}" for v in row) + "]" for row in M)
             size = "" if abs(factor) == 1 else f"{abs(factor):g} "
             sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
             what = f"joint {i + 1} coupled to joint {j + 1} ({sum_of})"
-            yield of(what, f"write coupling = [{rows}] in robot.toml", M)
+            yield of(what, coupling(robot.joint_map @ M), M)
+
+
+def coupling(joint_map: Array) -> str:
+    """Return what makes a joint map (m, dof), by signs that are those of its diagonal."""
+    signs = np.ones(len(joint_map))
+    signs[np.diag(joint_map) < 0] = -1
+    rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in signs[:, None] * joint_map + 0.0)
+    return f"write coupling = [{rows}] in robot.toml"
 
 
 def _of_positions() -> Iterator[Reading]:

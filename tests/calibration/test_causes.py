@@ -154,7 +154,7 @@ def test_the_change_point_is_where_the_instrument_moved() -> None:
         assert "1.1" in text  # 1 mm along x and half of it along y
 
 
-def made(monkeypatch, folder, problem, *options: str) -> None:
+def made(monkeypatch, folder, problem, *options: str, robot: str = "ur5e") -> None:
     """Make the folder ``cell`` from a raw table of what was measured."""
     (block,) = problem.data.blocks
     header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"])
@@ -164,7 +164,7 @@ def made(monkeypatch, folder, problem, *options: str) -> None:
     ]
     (folder / "raw.csv").write_text("\n".join([header, *rows]))
     table = str(folder / "raw.csv")
-    assert run(monkeypatch, "new", str(folder / "cell"), "--robot", "ur5e", "--data", table, *options) == 0
+    assert run(monkeypatch, "new", str(folder / "cell"), "--robot", robot, "--data", table, *options) == 0
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -183,15 +183,25 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_advice_that_is_followed_in_the_folder_ends_well(monkeypatch, capsys, tmp_path) -> None:
-    """What is to be written into robot.toml has a file there, of a ready robot too."""
-    made(monkeypatch, tmp_path, coupled(2, 1, 1.0)(simulated_arm("ur5e", count=25)))
-    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
-    said = " ".join(capsys.readouterr().out.split())
-    advice = said.partition("write coupling = ")[2].partition(" in robot.toml")[0]
-    robot = tmp_path / "cell" / "robot.toml"
-    robot.write_text(f"coupling = {advice}\n" + robot.read_text())
-    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 0
+@pytest.mark.parametrize(
+    ("robot", "change"),
+    [
+        ("ur5e", coupled(2, 1, 1.0)),
+        pytest.param("kr6_r900", coupled(4, 3, 0.02), id="a fiftieth of a joint that counts the other way"),
+    ],
+)
+def test_advice_that_is_followed_in_the_folder_ends_well(monkeypatch, capsys, tmp_path, robot, change) -> None:
+    """What is to be written into robot.toml has a file there, of a ready robot too, and the sign that helps."""
+    made(monkeypatch, tmp_path, change(simulated_arm(robot)), robot=robot)
+    file = tmp_path / "cell" / "robot.toml"
+    ready = file.read_text()
+    for _ in range(3):  # a coupling beside deviations that it spoiled is known to a tenth
+        code = run(monkeypatch, "calibrate", str(tmp_path / "cell"))
+        said = " ".join(capsys.readouterr().out.split())
+        if code == 0:
+            break
+        file.write_text(f"coupling = {said.partition('write coupling = ')[2].partition(' in robot.toml')[0]}\n{ready}")
+    assert code == 0
 
 
 @pytest.mark.usefixtures("undrawn")
