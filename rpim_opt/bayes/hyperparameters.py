@@ -322,7 +322,7 @@ def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
     return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
 
 
-def parameter_values(problem: CalibrationProblem, x: Array) -> Array:
+def parameter_values(problem: Source, x: Array) -> Array:
     """Return the values (P,) of all parameters at deviations x (n,)."""
     p = problem.parameters
     values = p.nominal.copy()
