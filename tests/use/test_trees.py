@@ -243,3 +243,14 @@ def test_two_hands_on_one_table(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
 
     assert min(map(len, others.values())) > 50
     assert off(result.x) < 1e-4 < 1e-3 < off(0 * result.x)
+
+
+def test_joints_whose_parameters_would_have_one_name_are_refused(tmp_path: Path) -> None:
+    links = "".join(f'<link name="l{i}"/>' for i in range(3))
+    joints = "".join(
+        f'<joint name="{name}" type="revolute"><parent link="l{i}"/><child link="l{i + 1}"/><axis xyz="0 0 1"/></joint>'
+        for i, name in enumerate(["arm-1", "arm_1"])
+    )
+    (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
+    with pytest.raises(ro.InputError, match="the parameters origin_arm_1_. of joint 'arm-1', too"):
+        ro.read_urdf(tmp_path / "arm.urdf", origins=True)

@@ -88,6 +88,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     if origins:
         steps = [_still(steps[0].start, urdf.path), *steps]
         chain = _chain(urdf, steps)
+        urdf.prefixes()
     joints = [step.joint for step in steps if step.joint.kind]
     table, T_base, T_tool, G = describe(chain)
     names, joint_map, offsets = _followed(urdf, joints)
@@ -236,7 +237,7 @@ def write_origins(source: str | Path, deviations: Mapping[str, Array], target: s
     """
     urdf = _read(Path(source))
     edits: dict[tuple[int, int], str] = {}
-    known = {origin_prefix(joint.name, bool(joint.kind)): joint for joint in urdf.joints.values()}
+    known = urdf.prefixes()
     for prefix, six in deviations.items():
         if prefix not in known:
             raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known), urdf.path)
@@ -443,6 +444,17 @@ class _Urdf:
     name: str
     links: Mapping[str, _Element]
     above: Mapping[str, _Joint]
+
+    def prefixes(self) -> dict[str, _Joint]:
+        """Return the joints by the prefix of their origins' parameters; InputError where two have the same."""
+        known: dict[str, _Joint] = {}
+        for joint in self.joints.values():
+            prefix = origin_prefix(joint.name, bool(joint.kind))
+            if prefix in known:
+                found = f"the parameters {prefix}* of joint '{known[prefix].name}', too"
+                raise joint.error("name", found, "names that differ in letters or digits")
+            known[prefix] = joint
+        return known
 
     def path_between(self, base: str | None, tip: str | None) -> list[_Step]:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
