@@ -226,7 +226,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         at = np.vstack([at, *(ends @ part.robot.joint_map.T for ends in result.ranges.values())])
     found = []
     for curve in part.robot.model.curves:
-        place = [free.names.index(name) for name in transmission(curve).names(curve.joint)]
+        place = np.array([free.names.index(name) for name in transmission(curve).names(curve.joint)])
         q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
         columns: Array = series([curve._replace(joint=1)], q[:, None], np.ones((len(q), 1)))
         variance = np.full(len(q), np.nan)

@@ -18,7 +18,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, combination, observe
-from rpim_opt.problem.misreadings import better_reading, coupling, misfit, placed
+from rpim_opt.problem.misreadings import better_reading, coupling, misfit, placed, signs
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
@@ -756,7 +756,8 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         to_model[i] += factor * problem.robot.joint_map[j]
         what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
         if i != j:
-            part = to_model[i, j] / to_model[i, i]
+            sign = signs(problem.robot.joint_map)
+            part = sign[i] * factor * sign[j]
             what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
         yield f"{what}: {left}; {coupling(to_model)}."
     elif found.number == len(pairs):

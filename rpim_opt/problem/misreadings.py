@@ -190,7 +190,7 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
         yield of(f"joint {i + 1} read {unit}", remedy, eye + (factor - 1) * np.outer(eye[i], eye[i]))
     for i in np.flatnonzero(turning):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
-        sign = 1 if robot.joint_map[i, i] < 0 else -1
+        sign = -int(signs(robot.joint_map)[i])
         yield of(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
     for i, j in combinations(range(robot.dof), 2):
         exchanged = eye.copy()
@@ -209,11 +209,17 @@ def _of_joints(robot: Robot) -> Iterator[Reading]:
             yield of(what, coupling(robot.joint_map @ M), M)
 
 
+def signs(joint_map: Array) -> Array:
+    """Return the signs (m,) of joints that a joint map (m, dof) has on its diagonal."""
+    found = np.ones(len(joint_map))
+    found[np.flatnonzero(np.diag(joint_map) < 0)] = -1
+    return found
+
+
 def coupling(joint_map: Array) -> str:
-    """Return what makes a joint map (m, dof), by signs that are those of its diagonal."""
-    signs = np.ones(len(joint_map))
-    signs[np.diag(joint_map) < 0] = -1
-    rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in signs[:, None] * joint_map + 0.0)
+    """Return what makes a joint map (m, dof)."""
+    stated = signs(joint_map)[:, None] * joint_map + 0.0
+    rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in stated)
     return f"write coupling = [{rows}] in robot.toml"
 
 
