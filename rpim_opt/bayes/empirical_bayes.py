@@ -55,9 +55,24 @@ def estimate(problem: Source, estimator: Estimator, model: str, start: Array | N
 
 def _found(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
     every = sampled(problem)
-    estimator, whole, notes = _first(every, estimator, _begin(every, start))
+    p = every.parameters
+    if start is None:  # frames registered to the data, the robot nominal
+        start = np.zeros(len(p.free))
+        frames = p.placed & p.identified
+        if frames.any():
+            start[p.placed[p.identified]] = settled(every.identifying(frames))
+    whole = estimator.fit(every, start, None, ROUNDS)
+    notes: tuple[str, ...] = ()
+    if estimator.prior.doubted:  # left out where the marginal likelihood is against it
+        plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, doubted=False))
+        without = plain.fit(every, start, None, ROUNDS)
+        fall = without.point.value - whole.point.value
+        if fall < ASKED:
+            estimator, whole = plain, without
+            reason = f"-2 ln L falls by {fall:.1f} with it, where {ASKED:g} are required."
+            notes = (f"The population prior was left out: {reason}",)
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
-    stated = every.parameters.free.names
+    stated = p.free.names
     curved = None
     gain = 0.0
     if model == "auto" and possible(fit.problem):
@@ -78,32 +93,6 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
         added=tuple(name for name in fit.problem.parameters.free.names if name not in stated),
     )
     return Found(laid, replace(found, notes=(*notes, *found.notes)), fit.inside, fit.x)
-
-
-def _begin(problem: CalibrationProblem, start: Array | None) -> Array:
-    """Return where to linearize first: frames registered to the data, the robot nominal."""
-    if start is not None:
-        return start
-    p = problem.parameters
-    x = np.zeros(len(p.free))
-    frames = p.placed & p.identified
-    if frames.any():
-        x[p.placed[p.identified]] = settled(problem.identifying(frames))
-    return x
-
-
-def _first(every: CalibrationProblem, estimator: Estimator, x: Array) -> tuple[Estimator, Fit, tuple[str, ...]]:
-    """Return the first fit; a doubted prior is left out where the marginal likelihood is against it."""
-    whole = estimator.fit(every, x, None, ROUNDS)
-    if not estimator.prior.doubted:
-        return estimator, whole, ()
-    plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, doubted=False))
-    without = plain.fit(every, x, None, ROUNDS)
-    fall = without.point.value - whole.point.value
-    if fall >= ASKED:
-        return estimator, whole, ()
-    note = f"The population prior was left out: -2 ln L falls by {fall:.1f} with it, where {ASKED:g} are required."
-    return plain, without, (note,)
 
 
 def _without_outliers(

@@ -57,12 +57,6 @@ class Spectrum(NamedTuple):
     w2: Array
     measure: Array
 
-    def logarithms(self, length: float) -> tuple[Array, Array, Array]:
-        """Return the logarithms (c,) at size 1, with first and second derivatives by ln length."""
-        r2 = 3 / length**2
-        logs = np.log(8 * r2**1.5 / self.measure) - 2 * np.log(r2 + self.w2)
-        return logs, 4 * r2 / (r2 + self.w2) - 3, -8 * r2 * self.w2 / (r2 + self.w2) ** 2
-
 
 @dataclass(frozen=True, eq=False)
 class Hierarchy:
@@ -104,11 +98,13 @@ class Hierarchy:
         slopes[:, :g] = 2.0 * (self.group[:, None] == np.arange(g))
         curvature = np.zeros(len(variances))
         if self.spectrum is not None:
-            own = slice(len(variances) - len(self.spectrum.w2), None)
-            shares, slope, curvature[own] = self.spectrum.logarithms(float(np.exp(logs[g + 1])))
-            variances[own] = np.exp(2 * logs[g] + shares)
+            w2, measure = self.spectrum
+            own = slice(len(variances) - len(w2), None)
+            r2 = 3 / float(np.exp(logs[g + 1])) ** 2
+            variances[own] = np.exp(2 * logs[g] + np.log(8 * r2**1.5 / measure) - 2 * np.log(r2 + w2))
             slopes[own, g] = 2.0
-            slopes[own, g + 1] = slope
+            slopes[own, g + 1] = 4 * r2 / (r2 + w2) - 3
+            curvature[own] = -8 * r2 * w2 / (r2 + w2) ** 2
         slopes[self.replaced] = 0.0
         return variances, slopes, curvature
 
@@ -162,24 +158,22 @@ def whitened(data: Linearized, scatter: Scatter, noise: Mapping[str, float]) -> 
         N, k = stack.index.shape
         L = np.linalg.cholesky(stack.covariance(scatter))
         inverse = np.linalg.inv(L)
-        slopes = [2 * np.exp(2 * log) * noise_share(stack, kind) for kind, log in noise.items()]
+        slopes = []
+        for kind, log in noise.items():  # what a unit of a noise adds to the covariances
+            mask = stack.angle if kind == "orientation" else stack.length
+            share = mask[:, :, None] * np.eye(k)
+            if kind == "joint":
+                share = stack.joint @ stack.joint.transpose(0, 2, 1)
+            elif kind == "instrument":
+                share = stack.instrument
+            elif kind == "position" and stack.unit is not None:
+                share = stack.unit
+            slopes.append(2 * np.exp(2 * log) * share)
         by_noise = inverse @ np.reshape(slopes, (-1, N, k, k)) @ inverse.transpose(0, 2, 1)
         y = (inverse @ data.y[stack.index][:, :, None])[:, :, 0]
         logdet = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
         found.append(Whitened(inverse @ data.X[stack.index], y, by_noise, logdet))
     return found
-
-
-def noise_share(stack: Stack, kind: str) -> Array:
-    """Return what a unit of a noise adds to the covariances (N, k, k)."""
-    if kind == "joint":
-        return stack.joint @ stack.joint.transpose(0, 2, 1)
-    if kind == "instrument":
-        return stack.instrument
-    if kind == "position" and stack.unit is not None:
-        return stack.unit
-    mask = stack.angle if kind == "orientation" else stack.length
-    return mask[:, :, None] * np.eye(mask.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -299,13 +293,11 @@ class Evidence:
         value = logdet + sum(part.logdet for part in parts) + float(np.sum((prior.rows @ z - prior.values) ** 2))
         value += sum(float(np.sum(residual**2)) for residual in residuals)
         value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[normal])))
-        nu = prior.tails
-        t2, of_tails = size2[self._heavy], (e2 / v)[self._heavy]
-        value += float(
-            np.sum((nu + 1) * np.log((nu * t2 + e2[self._heavy]) / (nu + 1)) - nu * np.log(t2) + 1 - of_tails)
-        )
+        nu, t2, t = prior.tails, size2[self._heavy], e2[self._heavy]
+        of_tails = (nu + 1) * np.log((nu * t2 + t) / (nu + 1)) - nu * np.log(t2) + 1 - t / v[self._heavy]
+        value += float(np.sum(of_tails))
         slope = 2 * (1 - e2 / v)
-        slope[self._heavy] = (2 * prior.tails * (size2 / v - 1))[self._heavy]
+        slope[self._heavy] = (2 * nu * (size2 / v - 1))[self._heavy]
         gradient = slope @ of_size / 2
         by_noise, f, among = _by_noise(parts, residuals, z, C, S)
         gradient[s:] = by_noise
@@ -319,7 +311,7 @@ class Evidence:
         follows = C * (C + 2 * np.outer(z, z)) * information
         log_v = self._log_variances(of_size, direct, follows, size2, v)
         slopes = 2 * (e2[:, None] * of_size - direct - follows @ log_v) / v[:, None]
-        slopes[self._heavy] = (2 * prior.tails * (size2 / v)[:, None] * (of_size - log_v))[self._heavy]
+        slopes[self._heavy] = (2 * nu * (size2 / v)[:, None] * (of_size - log_v))[self._heavy]
         curvature = np.zeros((len(logs), len(logs)))
         curvature[:s] = of_size[:, :s].T @ slopes / 2
         curvature[s:, :s] = curvature[:s, s:].T
@@ -349,18 +341,7 @@ class Evidence:
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
         accuracy. A way that leads into an optimum that is known ends there. ``near`` is a known point near the starts.
         """
-        found: list[Point] = []
-        for start in starts:
-            point = self._optimum(start, accuracy, found, near)
-            if point is not None:
-                found.append(point)
-        return sorted(found, key=lambda point: point.value)
-
-    def _optimum(self, start: Array, accuracy: float, known: Sequence[Point], near: Point | None) -> Point | None:
-        """Return the optimum that is reached from a start (s,); None where the way leads into one that is known."""
-        last = self.at(start, near, ROUGHLY)
-        if not len(start):
-            return self.at(start, last)
+        known: list[Point] = []
 
         def ask(logs: Array) -> Point:
             nonlocal last
@@ -368,23 +349,30 @@ class Evidence:
                 last = self.at(logs.copy(), last, ROUGHLY)
             return last
 
-        def is_known(logs: Array, value: float) -> bool:
-            return any(value >= point.value and np.abs(logs - point.logs).max() <= BASIN for point in known)
+        def is_known(at: Any) -> bool:
+            return any(at.fun >= point.value and np.abs(at.x - point.logs).max() <= BASIN for point in known)
 
         def explored(intermediate_result: Any) -> None:
-            if is_known(intermediate_result.x, intermediate_result.fun):
+            if is_known(intermediate_result):
                 raise StopIteration
 
-        found = scipy.optimize.minimize(
-            lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
-            start,
-            method="trust-exact",
-            jac=lambda logs: ask(logs).gradient,
-            hess=lambda logs: ask(logs).curvature,
-            callback=explored,
-            options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
-        )
-        return None if is_known(found.x, found.fun) else self.at(found.x, last)
+        for start in starts:
+            last = self.at(start, near, ROUGHLY)
+            if not len(start):
+                known.append(self.at(start, last))
+                continue
+            found = scipy.optimize.minimize(
+                lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
+                start,
+                method="trust-exact",
+                jac=lambda logs: ask(logs).gradient,
+                hess=lambda logs: ask(logs).curvature,
+                callback=explored,
+                options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
+            )
+            if not is_known(found):
+                known.append(self.at(found.x, last))
+        return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
         """Return where optima are looked for: all of it noise, prior medians, and large deviations.
@@ -392,14 +380,9 @@ class Evidence:
         The first one leads to the best optimum most often, where only one is used.
         """
         noisy = 3.0 * np.isin(self.names, self.noise)
-        geometry = np.zeros(len(self.centre))
-        geometry[self.prior.geometry] = 2.0
-        found = [self.centre]
-        if noisy.any():
-            found.insert(0, self.centre + noisy)
-        if geometry.any():
-            found.append(self.centre + geometry)
-        return found
+        geometry = 2.0 * np.isin(np.arange(len(self.centre)), self.prior.geometry)
+        found = [self.centre + noisy, self.centre, self.centre + geometry]
+        return found[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
 
     def restricted(self, keep: np.ndarray) -> Evidence:
         """Return the marginal likelihood of a model with some of the columns (p,)."""
@@ -561,21 +544,18 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
     c = C.diagonal()[heavy]
     local = v[heavy]
     known = np.maximum(1 / c - 1 / local, 0.0)
-    precision = 1 / _mixture_variance(known * size**2, z[heavy] / c * size, tails) / size**2 - known
+    # t_nu in units of tau is a mixture of normals; the nearer to a normal, the closer their logarithms are to zero
+    logs = PRECISIONS * np.sqrt(3 / max(tails, 3.0))
+    both = (known * size**2)[:, None] + np.exp(logs)
+    moved = (z[heavy] / c * size)[:, None]
+    mean = moved / both
+    log = (tails * (logs - np.exp(logs)) + logs - np.log(both) + moved * mean) / 2
+    share = np.exp(log - log.max(axis=1, keepdims=True))
+    share /= share.sum(axis=1, keepdims=True)
+    middle = np.sum(share * mean, axis=1, keepdims=True)
+    variance = np.sum(share * (1 / both + (mean - middle) ** 2), axis=1)
+    precision = 1 / variance / size**2 - known
     B = np.sqrt(1 / local - np.clip(precision, 1 / (MOST_WIDENED * local), 1 / local))
     own = C[np.ix_(heavy, heavy)]
     L = np.linalg.cholesky(np.eye(len(B)) - own * np.outer(B, B))
     return np.asarray(np.linalg.solve(L, (C[:, heavy] * B).T).T, dtype=float)
-
-
-def _mixture_variance(precision: Array, moved: Array, tails: float) -> Array:
-    """Return the variances (h,) of t_nu times normals exp(moved t - precision t^2 / 2), as mixtures of normals."""
-    logs = PRECISIONS * np.sqrt(3 / max(tails, 3.0))  # the nearer to a normal, the closer they are to zero
-    own = np.exp(logs)
-    both = precision[:, None] + own
-    mean = moved[:, None] / both
-    log = (tails * (logs - own) + logs - np.log(both) + moved[:, None] * mean) / 2
-    share = np.exp(log - log.max(axis=1, keepdims=True))
-    share /= share.sum(axis=1, keepdims=True)
-    middle = np.sum(share * mean, axis=1, keepdims=True)
-    return np.asarray(np.sum(share * (1 / both + (mean - middle) ** 2), axis=1), dtype=float)

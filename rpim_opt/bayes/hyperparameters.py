@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ from rpim_opt.bayes.prior_terms import FIXED, Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.noise import Scatter, Stack
+from rpim_opt.problem.noise import Scatter
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
@@ -177,11 +177,6 @@ class Fit:
     x: Array
 
     @property
-    def several(self) -> bool:
-        """Whether the marginal likelihood has other optima."""
-        return any(np.abs(other.logs - self.point.logs).max() > DISTINCT for other in self.others)
-
-    @property
     def spare(self) -> float:
         """Part of the equations that remains for the noise."""
         used = float(np.sum(1 - np.diag(self.point.C) / self.point.v))
@@ -259,8 +254,9 @@ class Estimator:
         From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known.
         """
         fit = self._once(problem, x, before, before is None, ITERATIONS)
+        several = any(np.abs(other.logs - fit.point.logs).max() > DISTINCT for other in fit.others)
         for k in range(1, rounds):
-            again = self._once(problem, fit.x, fit.point.logs, k == 1 and fit.several, ITERATIONS * 2**k)
+            again = self._once(problem, fit.x, fit.point.logs, k == 1 and several, ITERATIONS * 2**k)
             moved = _distance(again.x, fit.x, again.laid)
             resized = np.abs(again.point.logs - fit.point.logs).max(initial=0.0)
             fit = replace(again, others=again.others or fit.others)
@@ -345,7 +341,20 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     root = U * np.sqrt(2 / np.maximum(curvature, FLATTEST))
     covariance = root @ root.T
     spread = np.sqrt(np.diag(covariance))
-    growth = _growth(evidence, point)
+    # slopes (s,) of ln V by the logarithms of hyperparameters, V = tr(X C X' + R) of all lengths (else angles, pixels)
+    stacks = evidence.data.stacks
+    reads = [next(kind for kind in map(stack.of, ("length", "angle", "pixel")) if kind.any()) for stack in stacks]
+    X = np.vstack([evidence.data.X[stack.index[read]] for stack, read in zip(stacks, reads, strict=True)])
+    scatter = evidence.scatter(point.logs)
+
+    def variance(scatter: Scatter) -> float:
+        parts = [np.einsum("nkk->nk", stack.covariance(scatter)) for stack in stacks]
+        return sum(float(np.sum(part[read])) for part, read in zip(parts, reads, strict=True))
+
+    growth = point.falls(point.C @ (X.T @ X) @ point.C)
+    for i, kind in enumerate(evidence.noise, len(growth) - len(evidence.noise)):  # R is a sum of squares of the noises
+        growth[i] += 2 * (variance(scatter) - variance(replace(scatter, **{kind: 0.0})))
+    growth = growth / (float(np.sum((X @ point.C) * X)) + variance(scatter))
     values = [Size(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
     sizes, noise = len(prior.names), len(prior.hyperparameters)
     plain = np.delete(np.arange(len(values)), slice(sizes, noise))  # without the curves'
@@ -353,6 +362,18 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     local = np.sqrt(point.v) / size
     heavy = np.flatnonzero(prior.heavy & ~prior.replaced)
     scales = np.sqrt(prior.variances(point.logs)[0][heavy])
+    notes = []
+    if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
+        notes.append("A hyperparameter is implausibly far from its prior median: check units, scales and stated noise.")
+    vague = [i for i in prior.geometry if spread[i] > VAGUE]
+    if vague:
+        names = joined([prior.names[i] for i in vague])
+        factor = f"a factor of {np.exp(max(spread[vague])):.1f} either way, 1 sigma"
+        notes.append(f"The data hardly identify the prior scale of {names} ({factor}).")
+    m, n = evidence.data.X.shape
+    if m < n:
+        rest = f"at least {n - m} parameter combinations rest on the prior alone."
+        notes.append(f"{m} equations for {n} parameters: {rest}")
     widening = tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)
     return Learned(
         sizes=dict(zip(prior.names, values[:sizes], strict=True)),
@@ -363,44 +384,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         covariance=covariance[np.ix_(plain, plain)],
         stated=fit.problem.parameters.free.scale,
         drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, widening]),
-        notes=tuple(_doubts(fit, spread)),
+        notes=tuple(notes),
         curves=None if prior.spectrum is None else Transmitted(values[sizes], values[sizes + 1], gain),
         **more,
     )
-
-
-def _growth(evidence: Evidence, point: Point) -> Array:
-    """Return the slopes (s,) of ln V by the logarithms of hyperparameters, V = tr(X C X' + R) of all lengths read."""
-    X = np.vstack([evidence.data.X[stack.index[_read(stack)]] for stack in evidence.data.stacks])
-    scatter = evidence.scatter(point.logs)
-
-    def read(scatter: Scatter) -> float:
-        variances = [np.einsum("nkk->nk", stack.covariance(scatter)) for stack in evidence.data.stacks]
-        return sum(float(np.sum(v[_read(stack)])) for v, stack in zip(variances, evidence.data.stacks, strict=True))
-
-    noise = read(scatter)
-    rises = point.falls(point.C @ (X.T @ X) @ point.C)
-    for i, kind in enumerate(evidence.noise, len(rises) - len(evidence.noise)):  # R is a sum of squares of the noises
-        rises[i] += 2 * (noise - read(replace(scatter, **{kind: 0.0})))
-    return np.asarray(rises / (float(np.sum((X @ point.C) * X)) + noise), dtype=float)
-
-
-def _read(stack: Stack) -> np.ndarray:
-    """Return which equations (N, k) are of lengths (else angles, else pixels)."""
-    kinds = (stack.of(dimension) for dimension in ("length", "angle", "pixel"))
-    return next(kind for kind in kinds if kind.any())
-
-
-def _doubts(fit: Fit, spread: Array) -> Iterator[str]:
-    """Yield sentences on how far the marginal likelihood decides; ``spread`` (s,) of the logarithms."""
-    evidence, point = fit.evidence, fit.point
-    if (np.abs(point.logs - evidence.centre) > FARTHEST - 0.01).any():
-        yield "A hyperparameter is implausibly far from its prior median: check units, scales and stated noise."
-    vague = [i for i in evidence.prior.geometry if spread[i] > VAGUE]
-    if vague:
-        names = joined([evidence.prior.names[i] for i in vague])
-        factor = np.exp(max(spread[vague]))
-        yield f"The data hardly identify the prior scale of {names} (a factor of {factor:.1f} either way, 1 sigma)."
-    m, n = evidence.data.X.shape
-    if m < n:
-        yield f"{m} equations for {n} parameters: at least {n - m} parameter combinations rest on the prior alone."

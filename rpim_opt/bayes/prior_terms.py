@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, Protocol
 
 import numpy as np
@@ -128,98 +128,66 @@ class Stated:
         return replace(formulation, penalty=prior_penalty(formulation.penalty, *parts), penalty_over=None)
 
 
-Vector = tuple[float, ...]
-Matrix = tuple[Vector, ...]
-
-
-@dataclass(frozen=True)
-class _Penalty:
-    """penalty(keep (z - centre)) + |rows z - values|^2; of norms |D_k keep (z - centre)| where groups D_k are given.
+def prior_penalty(
+    penalty: Callable[[Any], Any] | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
+) -> Callable[[Any], Any]:
+    """Return penalty(keep (z - centre)) + |rows z - values|^2; of norms |D_k keep (z - centre)| with groups D_k.
 
     ``keep`` is 1 / scale, and zero for what the statements replace.
     """
+    penalty = named(penalty)
+    if groups is not None:
+        groups = tuple(tuple(map(tuple, D)) for D in groups)
+    arguments = (penalty, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), groups)
+    if penalty is None or penalty in NAMED or isinstance(penalty, Ready):
+        return _Penalty("prior_penalty", _penalized, arguments)
+    return partial(_penalized, **dict(zip(ARGUMENTS, arguments, strict=True)))
 
-    penalty: Callable[[Any], Any] | None
-    keep: Vector
-    centre: Vector
-    rows: Matrix
-    values: Vector
-    groups: tuple[Matrix, ...] | None = None
 
-    def __call__(self, z: Any) -> Any:
-        terms = []
-        if self.penalty is not None:
-            terms.append(self._own(cp.multiply(np.array(self.keep), z - np.array(self.centre))))
-        if self.rows:
-            terms.append(cp.sum_squares(np.array(self.rows) @ z - np.array(self.values)))
-        return sum(terms[1:], terms[0])
+ARGUMENTS = ("penalty", "keep", "centre", "rows", "values", "groups")
 
-    def __reduce__(self) -> Any:
-        return prior_penalty, tuple(getattr(self, each.name) for each in fields(self))
 
-    def _own(self, y: Any) -> Any:
-        penalty: Any = self.penalty
-        if self.groups is None:
-            return penalty(y)
-        differences = [np.array(D) for D in self.groups]
-        if penalty == SQUARES:  # of norms: the sum of all squares, and no cone
-            return cp.sum_squares(np.vstack(differences) @ y)
-        return penalty(cp.hstack([cp.norm(D @ y) for D in differences]))
+def _penalized(
+    z: Any, penalty: Callable[[Any], Any] | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
+) -> Any:
+    terms = []
+    if penalty is not None:
+        y = cp.multiply(np.array(keep), z - np.array(centre))
+        if groups is None:
+            terms.append(penalty(y))
+        elif penalty == SQUARES:  # of norms: the sum of all squares, and no cone
+            terms.append(cp.sum_squares(np.vstack([np.array(D) for D in groups]) @ y))
+        else:
+            terms.append(penalty(cp.hstack([cp.norm(np.array(D) @ y) for D in groups])))
+    if rows:
+        terms.append(cp.sum_squares(np.array(rows) @ z - np.array(values)))
+    return sum(terms[1:], terms[0])
 
 
 @dataclass(frozen=True)
-class _ReadyPenalty(_Penalty, Ready):
-    """The same of a ready penalty: equal in content is equal in meaning, and a file holds it."""
-
-    maker = "prior_penalty"
-
-    @property
-    def stated(self) -> list[Any]:
-        """The maker's name and its arguments, the penalty by its own name."""
-        return [self.maker, self.penalty, self.keep, self.centre, self.rows, self.values, self.groups]
+class _Penalty(Ready):
+    """The penalty of a prior over a ready one: equal in content is equal in meaning, and a file holds it."""
 
     @cached_property
     def quadratic(self) -> Quadratic | None:  # type: ignore[override]
         """The quadratic that it declares to be, without squared numbers in between; None where it is something else."""
-        if self.penalty not in (None, SQUARES) or (self.penalty is None and not self.rows):
+        penalty, keep, centre, rows, values, groups = self.arguments
+        if penalty not in (None, SQUARES) or (penalty is None and not rows):
             return None
-        n = len(self.centre)
-        L = [np.zeros((0, n))]
-        c = [np.zeros(0)]
-        if self.penalty is not None:
-            own = np.diag(self.keep)
-            if self.groups is not None:
-                own = np.vstack([np.array(D) for D in self.groups]) @ own
-            L.append(own)
-            c.append(own @ np.array(self.centre))
-        if self.rows:
-            L.append(np.array(self.rows))
-            c.append(np.array(self.values))
-        return _reduced(np.vstack(L), np.concatenate(c))
-
-
-def _reduced(L: Array, c: Array) -> Quadratic:
-    """Return |L z - c|^2 with no more rows than unknowns, diagonal where L is."""
-    n = L.shape[1]
-    if len(L) == n and not np.any(L - np.diag(np.diag(L))):
-        return Quadratic(np.diag(L).copy(), c)
-    if len(L) <= n:
-        return Quadratic(L, c)
-    R: Any = np.linalg.qr(np.column_stack([L, c]), mode="r")
-    return Quadratic(R[:n, :n], R[:n, n], float(R[n, n] ** 2))
-
-
-def prior_penalty(
-    penalty: Callable[[Any], Any] | None, keep: Any, centre: Any, rows: Any, values: Any, groups: Any
-) -> Callable[[Any], Any]:
-    """Return the penalty of a prior."""
-    penalty = named(penalty)
-    if groups is not None:
-        groups = tuple(tuple(map(tuple, D)) for D in groups)
-    kept: Any = penalty
-    ready = penalty is None or penalty in NAMED or isinstance(penalty, Ready)
-    kind = _ReadyPenalty if ready else _Penalty
-    return kind(kept, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), groups)
+        n = len(centre)
+        L, c = np.zeros((0, n)), np.zeros(0)
+        if penalty is not None:
+            L = np.diag(keep)
+            if groups is not None:
+                L = np.vstack([np.array(D) for D in groups]) @ L
+            c = L @ np.array(centre)
+        L, c = np.vstack([L, np.reshape(rows, (-1, n))]), np.concatenate([c, values])
+        if len(L) == n and not np.any(L - np.diag(np.diag(L))):
+            return Quadratic(np.diag(L).copy(), c)
+        if len(L) <= n:
+            return Quadratic(L, c)
+        R: Any = np.linalg.qr(np.column_stack([L, c]), mode="r")
+        return Quadratic(R[:n, :n], R[:n, n], float(R[n, n] ** 2))
 
 
 # --- statements -----------------------------------------------------------------------------------------------
@@ -263,7 +231,17 @@ class Statement:
         And (n,) for which of them they stand in the place of their own scales. InputError for a name that the table has
         not, another dimension, a value far from nominal.
         """
-        here = self._here(parameters)
+        here = {name: i for i, name in enumerate(parameters.names)}
+        missing = [name for name in self.names if name not in here]
+        if missing and (not self.whole or len(missing) == len(self.names)):
+            raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
+        of = {name: parameters.dimensions[here[name]] for name in self.names if name in here}
+        for name, dimension in zip(self.names, self.dimensions, strict=True):
+            if name in of and dimension not in (of[name], ""):
+                raise InputError(self.where, f"a unit of {dimension} for '{name}'", f"one of {of[name]}")
+        if len(set(of.values())) > 1 and "" in self.dimensions:
+            found = f"a sum of {' and '.join(sorted(set(of.values())))}"
+            raise InputError(self.where, found, "parameters of one dimension")
         known = [name for name in self.names if name in here]
         place = np.array([here[name] for name in known], dtype=int)
         own = np.array([self.names.index(name) for name in known], dtype=int)
@@ -284,24 +262,6 @@ class Statement:
         replaced[column] = self.whole
         says = full.any(axis=1)
         return full[says], values[says], replaced
-
-    def _here(self, parameters: Parameters) -> dict[str, int]:
-        """Return the places of a table, names and dimensions checked."""
-        here = {name: i for i, name in enumerate(parameters.names)}
-        missing = [name for name in self.names if name not in here]
-        if missing and (not self.whole or len(missing) == len(self.names)):
-            raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
-        dimensions = set()
-        for name, said in zip(self.names, self.dimensions, strict=True):
-            if name in here:
-                dimensions.add(parameters.dimensions[here[name]])
-                if said not in (parameters.dimensions[here[name]], ""):
-                    accepted = f"one of {parameters.dimensions[here[name]]}"
-                    raise InputError(self.where, f"a unit of {said} for '{name}'", accepted)
-        if len(dimensions) > 1 and "" in self.dimensions:
-            found = f"a sum of {' and '.join(sorted(dimensions))}"
-            raise InputError(self.where, found, "parameters of one dimension")
-        return here
 
     def _offset(self, parameters: Parameters, place: np.ndarray, own: np.ndarray) -> Array:
         """Return by how much nominal values (p,) [SI] differ from the reference; zero where that is nominal."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import astuple, dataclass, replace
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display, fits
 from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
-from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.workspace import within_box, within_ranges
 from rpim_opt.robot.parameters import Parameters
 
@@ -46,23 +46,27 @@ Limits = Callable[[Parameters], tuple[Array, Array]]
 """From the identified parameters to lower and upper bounds (n,) of z."""
 
 
+@dataclass(frozen=True)
 class Ready:
-    """A function that the package makes: equal in content is equal in meaning, in a cache or in a file."""
+    """A function that the package makes: equal in content is equal in meaning, in a cache or in a file.
 
-    maker = ""
+    ``function`` gets what it is called with, and the ``arguments`` of its ``maker``.
+    """
+
+    maker: str
+    function: Callable[..., Any]
+    arguments: tuple[Any, ...]
+    quadratic: ClassVar[Any] = None
+    """The quadratic of its argument that a penalty declares to be, where it knows that exactly."""
+
+    def __call__(self, *given: Any) -> Any:
+        """Return what the function does."""
+        return self.function(*given, *self.arguments)
 
     @property
     def stated(self) -> list[Any]:
         """The maker's name and its arguments, as a file holds them."""
-        arguments: list[Any] = []
-        for value in astuple(self):  # type: ignore[call-overload]
-            arguments += list(value) if isinstance(value, tuple) else [value]
-        return [self.maker, *arguments]
-
-    @property
-    def quadratic(self) -> Quadratic | None:
-        """The quadratic of its argument that a penalty declares to be, where it knows that exactly."""
-        return None
+        return [self.maker, *self.arguments]
 
 
 def spoken(deviation: float, dimension: str) -> str:
@@ -122,7 +126,7 @@ class Box:
         low = np.flatnonzero(np.isfinite(lower) & (lower < upper))
         high = np.flatnonzero(np.isfinite(upper) & (lower < upper))
         made = [z[fixed] == lower[fixed], z[low] >= lower[low], z[high] <= upper[high]]
-        return [each for each, places in zip(made, (fixed, low, high), strict=True) if len(places)]
+        return [each for each in made if each.size]
 
 
 def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
@@ -143,16 +147,6 @@ within_tolerance = Box("within tolerance", _tolerances)
 """
 
 
-@dataclass(frozen=True)
-class _AtNominal(Ready):
-    patterns: tuple[str, ...]
-    maker = "at_nominal"
-
-    def __call__(self, parameters: Parameters) -> tuple[Array, Array]:
-        chosen = matching(parameters, self.patterns, self.maker)
-        return np.where(chosen, 0.0, -np.inf), np.where(chosen, 0.0, np.inf)
-
-
 def at_nominal(*patterns: str) -> Box:
     """Keep the parameters that match one of the patterns at their nominal values: z_i = 0.
 
@@ -164,20 +158,12 @@ def at_nominal(*patterns: str) -> Box:
     >>> dict(zip(result.problem.parameters.free.names, result.x.tolist()))["alpha3"]
     0.0
     """
-    return Box("at nominal", _AtNominal(patterns))
+    return Box("at nominal", Ready("at_nominal", _at_nominal, patterns))
 
 
-@dataclass(frozen=True)
-class _Signed(Ready):
-    sign: int
-    patterns: tuple[str, ...]
-    maker = "signed"
-
-    def __call__(self, parameters: Parameters) -> tuple[Array, Array]:
-        chosen = matching(parameters, self.patterns, self.maker)
-        lower = np.where(chosen & (self.sign > 0), 0.0, -np.inf)
-        upper = np.where(chosen & (self.sign < 0), 0.0, np.inf)
-        return lower, upper
+def _at_nominal(parameters: Parameters, *patterns: str) -> tuple[Array, Array]:
+    chosen = matching(parameters, patterns, "at_nominal")
+    return np.where(chosen, 0.0, -np.inf), np.where(chosen, 0.0, np.inf)
 
 
 def signed(sign: int, *patterns: str) -> Box:
@@ -193,28 +179,12 @@ def signed(sign: int, *patterns: str) -> Box:
     """
     if sign not in (1, -1):
         raise InputError("signed", f"sign {sign}", "+1 or -1")
-    return Box("signed", _Signed(sign, patterns))
+    return Box("signed", Ready("signed", _signed, (sign, *patterns)))
 
 
-@dataclass(frozen=True)
-class _Equal(Ready):
-    names: tuple[str, ...]
-    maker = "equal"
-
-    def __call__(self, z: Any, parameters: Parameters) -> Any:
-        k = [parameters.names.index(n) for n in self.names if n in parameters.names]
-        if len(k) < len(self.names) or len(k) < 2:
-            missing = next((n for n in self.names if n not in parameters.names), self.names[0] if self.names else "")
-            raise InputError(
-                "equal", f"'{missing}'", "identified parameters, two or more: " + choices(missing, parameters.names)
-            )
-        if len({parameters.dimensions[i] for i in k}) > 1:
-            found = ", ".join(f"{parameters.names[i]} ({parameters.dimensions[i]})" for i in k)
-            raise InputError("equal", found, "parameters of one dimension")
-        scale, nominal = parameters.scale[k], parameters.nominal[k]
-        unit = scale.max()
-        value = cp.multiply(scale / unit, z[k]) + nominal / unit
-        return value[1:] == value[0]
+def _signed(parameters: Parameters, sign: int, *patterns: str) -> tuple[Array, Array]:
+    chosen = matching(parameters, patterns, "signed")
+    return np.where(chosen & (sign > 0), 0.0, -np.inf), np.where(chosen & (sign < 0), 0.0, np.inf)
 
 
 def equal(*names: str) -> Constraint:
@@ -230,17 +200,22 @@ def equal(*names: str) -> Constraint:
     >>> (1e3 * result.robot.mdh[2:4, 0]).round(3)  # [mrad]
     array([-0.124, -0.124])
     """
-    return _Equal(names)
+    return Ready("equal", _equal, names)
 
 
-@dataclass(frozen=True)
-class _InBall(Ready):
-    radius: float
-    patterns: tuple[str, ...]
-    maker = "in_ball"
-
-    def __call__(self, z: Any, parameters: Parameters) -> Any:
-        return cp.norm(z[np.flatnonzero(matching(parameters, self.patterns, self.maker))]) <= self.radius
+def _equal(z: Any, parameters: Parameters, *names: str) -> Any:
+    k = [parameters.names.index(n) for n in names if n in parameters.names]
+    if len(k) < len(names) or len(k) < 2:
+        missing = next((n for n in names if n not in parameters.names), names[0] if names else "")
+        accepted = "identified parameters, two or more: " + choices(missing, parameters.names)
+        raise InputError("equal", f"'{missing}'", accepted)
+    if len({parameters.dimensions[i] for i in k}) > 1:
+        found = ", ".join(f"{parameters.names[i]} ({parameters.dimensions[i]})" for i in k)
+        raise InputError("equal", found, "parameters of one dimension")
+    scale, nominal = parameters.scale[k], parameters.nominal[k]
+    unit = scale.max()
+    value = cp.multiply(scale / unit, z[k]) + nominal / unit
+    return value[1:] == value[0]
 
 
 def in_ball(radius: float, *patterns: str) -> Constraint:
@@ -254,7 +229,11 @@ def in_ball(radius: float, *patterns: str) -> Constraint:
     """
     if not (np.isfinite(radius) and radius >= 0):
         raise InputError("in_ball", f"radius {radius}", "a finite number of scales, zero or more")
-    return _InBall(radius, patterns)
+    return Ready("in_ball", _in_ball, (radius, *patterns))
+
+
+def _in_ball(z: Any, parameters: Parameters, radius: float, *patterns: str) -> Any:
+    return cp.norm(z[np.flatnonzero(matching(parameters, patterns, "in_ball"))]) <= radius
 
 
 def matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.ndarray:
@@ -265,9 +244,8 @@ def matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.n
     for pattern in patterns:
         hits = np.array([fits(name, pattern) for name in parameters.names])
         if not hits.any():
-            raise InputError(
-                what, f"pattern '{pattern}'", "identified parameters: " + choices(pattern, parameters.names)
-            )
+            accepted = "identified parameters: " + choices(pattern, parameters.names)
+            raise InputError(what, f"pattern '{pattern}'", accepted)
         chosen |= hits
     return chosen
 
@@ -306,19 +284,6 @@ def by_kind(parameters: Parameters) -> list[Array]:
     return _grouped(parameters, lambda name: name.rstrip("0123456789") if name[-1].isdigit() else name.split("_")[0])
 
 
-@dataclass(frozen=True)
-class _Differences(Ready):
-    patterns: tuple[str, ...]
-    maker = "differences"
-
-    def __call__(self, parameters: Parameters) -> list[Array]:
-        chosen = matching(parameters, self.patterns, self.maker)
-        eye = np.eye(len(parameters))
-        k = np.flatnonzero(chosen)
-        neighbours = [eye[[i]] - eye[[j]] for i, j in zip(k[1:], k[:-1], strict=True)]
-        return neighbours + [eye[[i]] for i in np.flatnonzero(~chosen)]
-
-
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
 
@@ -333,7 +298,15 @@ def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
     [[ 0  0  0 -1  1  0  0  0]]
     [[1 0 0 0 0 0 0 0]]
     """
-    return _Differences(patterns)
+    return Ready("differences", _differences, patterns)
+
+
+def _differences(parameters: Parameters, *patterns: str) -> list[Array]:
+    chosen = matching(parameters, patterns, "differences")
+    eye = np.eye(len(parameters))
+    k = np.flatnonzero(chosen)
+    neighbours = [eye[[j]] - eye[[i]] for i, j in pairwise(k)]
+    return neighbours + [eye[[i]] for i in np.flatnonzero(~chosen)]
 
 
 # --- statements in words ---------------------------------------------------------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.text import Brief, counted
-from rpim_opt.convex.constraints import Box, Constraint, Ready, by_kind, by_link, within_tolerance
+from rpim_opt.convex.constraints import Constraint, Ready, by_kind, by_link, within_tolerance
 from rpim_opt.convex.expressions import ATOMS, LARGEST, NORM1, SQUARES, SUM, cp, named
 from rpim_opt.robot.parameters import Parameters
 
@@ -112,27 +112,18 @@ class Formulation(Brief):
     @property
     def ready(self) -> bool:
         """Whether all its functions are the package's own, which mean the same whenever they are asked."""
-        return all(_is_ready(f) for f in (self.loss, self.penalty, self.penalty_over, *self.constraints))
+        functions = [self.loss, self.penalty, self.penalty_over, *self.constraints]
+        # of a box what matters are its limits
+        functions = [getattr(f, "limits", f) for f in functions if f is not None and f != within_tolerance]
+        return all(isinstance(f, Ready) or f in NAMED for f in functions)
 
 
 def _called(function: Any) -> str:
     return str(getattr(function, "maker", "") or getattr(function, "__name__", type(function).__name__))
 
 
-def _is_ready(function: Any) -> bool:
-    if isinstance(function, Box):
-        return function == within_tolerance or isinstance(function.limits, Ready)
-    return function is None or isinstance(function, Ready) or function in NAMED
-
-
-@dataclass(frozen=True)
-class _Huber(Ready):
-    threshold: float
-    maker = "huber"
-
-    def __call__(self, v: Any) -> Any:
-        bound: Any = self.threshold  # CVXPY's annotation says int
-        return cp.sum(cp.huber(v, bound))
+def _huber(v: Any, threshold: Any) -> Any:
+    return cp.sum(cp.huber(v, threshold))
 
 
 def lost(name: str) -> Callable[..., Any]:
@@ -160,7 +151,7 @@ def huber(threshold: float = HUBER) -> Function:
     """
     if not (np.isfinite(threshold) and threshold > 0):
         raise InputError("huber", f"threshold {threshold}", "a number of sigmas above zero")
-    return _Huber(threshold)
+    return Ready("huber", _huber, (threshold,))
 
 
 least_squares = Formulation("least squares")

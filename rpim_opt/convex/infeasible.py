@@ -8,15 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import Conflict
 from rpim_opt.convex.constraints import Box, Parsed, spoken
 from rpim_opt.convex.expressions import cp, norms, substituted
 from rpim_opt.convex.structure import Structure
 from rpim_opt.problem.linear import LinearModel
 
-FAR = 1e6
-"""Bounds beyond so many scales are none."""
 LEAST = 1e-6
 """Slacks below this are the solver's accuracy."""
 
@@ -32,24 +29,28 @@ def conflict(structure: Structure, model: LinearModel) -> Conflict | None:
     """Return what contradicts what; None where the constraints can be met after all.
 
     ``constraints`` is irreducible: without any one of them the others can be met (deletion filter; Chinneck and
-    Dravnieks 1991, ORSA Journal on Computing 3:157).
+    Dravnieks 1991, ORSA Journal on Computing 3:157). By how much others would have to give way is the least sum of
+    slacks, of one kind at a time.
     """
     z = cp.Variable(structure.n)
     units = _units(structure, model, z)
-    everything = [stated for unit in units for stated in unit]
-    if _possible(everything):
+    if _possible(units):
         return None
     kept = _irreducible(units)
     single = _irreducible([[stated] for unit in kept for stated in unit])
     names = tuple(stated.name for unit in single for stated in unit)
     parameters, groups = structure.parameters, np.unique(model.group)
-    slack = _least(structure, model, "boxes")
-    bounds = {parameters.names[i]: float(slack[i] * parameters.scale[i]) for i in np.flatnonzero(slack > LEAST)}
-    slack = _least(structure, model, "configurations")
-    rows = {int(groups[i]): float(slack[i]) for i in np.flatnonzero(slack > LEAST)}
     parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
-    slack = _least(structure, model, "statements") if parsed else np.zeros(0)
-    pairs = zip(parsed, slack, strict=True)
+    slacks = []
+    for kind, count in (("boxes", structure.n), ("configurations", len(groups)), ("statements", len(parsed))):
+        slack = cp.Variable(max(count, 1), nonneg=True)
+        loosened = _units(structure, model, z, **{kind: slack})
+        _solved(cp.sum(slack), [demand for unit in loosened for stated in unit for demand in stated.demands])
+        slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
+    by_box, by_row, by_statement = slacks
+    bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
+    rows = {int(groups[i]): float(by_row[i]) for i in np.flatnonzero(by_row > LEAST)}
+    pairs = zip(parsed, by_statement, strict=True)
     statements = {each.name: float(each.scale(parameters) * by) for each, by in pairs if by > LEAST}
     return Conflict(bounds, rows, names, statements)
 
@@ -66,9 +67,9 @@ def _solved(objective: Any, demands: Sequence[Any]) -> cp.Problem | None:
     return problem
 
 
-def _possible(demands: Sequence[Stated]) -> bool:
+def _possible(units: list[list[Stated]]) -> bool:
     """Whether all can be met at once."""
-    problem = _solved(0, [constraint for stated in demands for constraint in stated.demands])
+    problem = _solved(0, [demand for unit in units for stated in unit for demand in stated.demands])
     return problem is None or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
@@ -77,31 +78,51 @@ def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
     kept = list(units)
     for unit in units:
         others = [other for other in kept if other is not unit]
-        if not _possible([stated for other in others for stated in other]):
+        if not _possible(others):
             kept = others
     return kept
 
 
-def _units(structure: Structure, model: LinearModel, z: cp.Variable) -> list[list[Stated]]:
-    """Return what every constraint function demands, bound by bound, and ``largest`` by configuration."""
+def _units(
+    structure: Structure,
+    model: LinearModel,
+    z: cp.Variable,
+    boxes: Any = 0,
+    configurations: Any = 0,
+    statements: Any = 0,
+) -> list[list[Stated]]:
+    """Return what every constraint function demands, bound by bound, and ``largest`` by configuration.
+
+    Loosened by slacks of boxes [scales], of configurations [sigma], and of statements in words [scales of each].
+    """
+    parameters, stated = structure.parameters, structure.formulation
     units: list[list[Stated]] = []
-    for k, function in enumerate(structure.formulation.constraints):
+    count = 0
+    for k, function in enumerate(stated.constraints):
+        found: list[Stated] = []
         if isinstance(function, Box):
-            units.append(_bounds(function, structure, z))
-            continue
-        demands = [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
-        if isinstance(function, Parsed):
-            units.append([Stated(function.name, tuple(demands))])
-            continue
-        name = name_of(function, k)
-        several = len(demands) > 1
-        units.append([Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)])
+            more = boxes + np.zeros(structure.n)
+            for sign, side in zip("><", function.bounds(parameters), strict=True):
+                for i in np.flatnonzero(np.isfinite(side)):
+                    bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
+                    demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
+                    found.append(Stated(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
+        elif isinstance(function, Parsed):
+            by = None if isinstance(statements, int) else function.scale(parameters) * statements[count]
+            found.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
+            count += 1
+        else:
+            demands = [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
+            name = name_of(function, k)
+            several = len(demands) > 1
+            found = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
+        units.append(found)
     if structure.limited:
         size = norms(model.A @ z - model.b, model.group)
-        largest = structure.formulation.largest
-        numbers = np.unique(model.group)
+        limit = stated.largest + configurations + np.zeros(size.size)
         name = "configuration {} within {:g} sigmas"
-        units.append([Stated(name.format(g, largest), (size[i] <= largest,)) for i, g in enumerate(numbers)])
+        numbers = np.unique(model.group)
+        units.append([Stated(name.format(g, stated.largest), (size[i] <= limit[i],)) for i, g in enumerate(numbers)])
     return units
 
 
@@ -112,49 +133,7 @@ def name_of(function: Any, k: int) -> str:
         maker, *arguments = stated
         return f"{maker}({', '.join(repr(a) for a in arguments)})"
     name = getattr(function, "__name__", "<lambda>")
-    if name == "<lambda>":
-        return f"constraint {k + 1}"
-    return name
-
-
-def _bounds(box: Box, structure: Structure, z: cp.Variable) -> list[Stated]:
-    """Return every finite bound of a box, in the parameter's unit."""
-    parameters = structure.parameters
-    found: list[Stated] = []
-    for sign, side in zip("><", box.bounds(parameters), strict=True):
-        for i in np.flatnonzero(np.isfinite(side)):
-            bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
-            name = f"{parameters.names[i]} {sign}= {bound} ({box.name})"
-            demand = z[i] >= side[i] if sign == ">" else z[i] <= side[i]
-            found.append(Stated(name, (demand,)))
-    return found
-
-
-def _least(structure: Structure, model: LinearModel, loosened: str) -> Array:
-    """Return the slacks of least sum of boxes [scales], configurations [sigma] or statements [scales of each].
-
-    The others stay as they are; zeros where that does not make the constraints possible.
-    """
-    parameters = structure.parameters
-    z = cp.Variable(structure.n)
-    parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
-    count = {"boxes": structure.n, "configurations": len(np.unique(model.group)), "statements": len(parsed)}[loosened]
-    slack = cp.Variable(count, nonneg=True)
-    demands: list[Any] = []
-    for k, function in enumerate(structure.formulation.constraints):
-        if isinstance(function, Box):
-            lower, upper = (np.clip(side, -FAR, FAR) for side in function.bounds(parameters))
-            more = slack if loosened == "boxes" else 0.0
-            demands += [z <= upper + more, z >= lower - more]
-        elif isinstance(function, Parsed) and loosened == "statements":
-            demands += function.loosened(z, parameters, function.scale(parameters) * slack[parsed.index(function)])
-        else:
-            demands += [substituted(each, {id(structure.answers.z): z}) for each in structure.constraints[k]]
-    if structure.limited:
-        more = slack if loosened == "configurations" else 0.0
-        demands.append(norms(model.A @ z - model.b, model.group) <= structure.formulation.largest + more)
-    _solved(cp.sum(slack), demands)
-    return np.zeros(slack.size) if slack.value is None else np.asarray(slack.value)
+    return f"constraint {k + 1}" if name == "<lambda>" else name
 
 
 def advice(structure: Structure, status: str, found: Conflict | None) -> str:

@@ -306,11 +306,8 @@ class Program(Brief):
         return max(self._distance(z), self.excess(z))
 
     def _distance(self, z: Array) -> float:
-        """Return the distance of z (n,) from the constraints."""
         found = self._projected(z)
-        if found is None:
-            return float("inf")
-        return float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
+        return np.inf if found is None else float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
 
     def excess(self, z: Array) -> float:
         """Return by how much at z (n,) the worst configuration exceeds ``largest``, relative to it."""
@@ -447,7 +444,13 @@ class Program(Brief):
         if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         elif self.closed_form and damping is None:
-            estimate = self._at(self._formula(weight), weight)
+            form, z = self.penalty_form, self.ridge.minima(np.array([weight]))[0]
+            if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
+                # a penalty that hardly holds some directions costs the formula digits
+                A = np.vstack([self.squared.triangle[:, :-1], np.sqrt(weight) * form.matrix])
+                b = np.concatenate([self.squared.triangle[:, -1], np.sqrt(weight) * form.c])
+                z = z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
+            estimate = self._at(z, weight)
         elif self.structure.joint:
             estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False)
         else:
@@ -501,9 +504,7 @@ class Program(Brief):
 
         Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along.
         """
-        if not self.formulation.constraints or self.structure.predicts:
-            return None
-        if self.structure.joint:
+        if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
             return None
         begun = self.apart(self.model).beginning(z)
         try:
@@ -512,7 +513,7 @@ class Program(Brief):
             return None
         p = self.structure.canonical
         limit = ACTIVE * max(np.abs(found.dual).max(initial=0.0), TOUCHING)
-        dense = p.A if isinstance(p.A, np.ndarray) else p.A.toarray()
+        dense = p.dense[0]
         linear = np.arange(p.linear)
         active = (linear < p.zero) | (np.abs(found.dual[linear]) > limit)
         normals = [dense[linear[active]]]
@@ -561,22 +562,20 @@ class Program(Brief):
             z = self.inside(z, np.zeros_like(z), weight)
         return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
 
-    def _formula(self, weight: float) -> Array:
-        """Return the unconstrained minimum (n,) of a quadratic program."""
-        form, R = self.penalty_form, self.squared.triangle
-        z = self.ridge.minima(np.array([weight]))[0]
-        if form is None or weight == 0 or (form.diagonal and bool((form.L == 1).all())):
-            return z
-        # a penalty that hardly holds some directions costs the formula digits
-        A = np.vstack([R[:, :-1], np.sqrt(weight) * form.matrix])
-        b = np.concatenate([R[:, -1], np.sqrt(weight) * form.c])
-        return z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
-
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
-        """Return the minimum by the structure of the loss, or where that fails CVXPY's own."""
+        """Return the minimum by the structure of the loss; where rounding stops that by a proximal step, or CVXPY's."""
+        of = self.structure.loss, self._rows, self._warm, weight, self._squares
         try:
             with phase("solve"):
-                found = self._minimum(weight, damping, accuracy)
+                try:
+                    found = minimum(*of, damping, accuracy)
+                except Unsolved as error:
+                    if damping is not None or str(error) in STATUS:
+                        raise
+                    n = self.structure.n
+                    centre = np.zeros(n) if self._warm.z is None else self._warm.z
+                    size = PROXIMAL * np.linalg.norm(self.rows[0]) / np.sqrt(n)
+                    found = minimum(*of, Damping(centre, np.full(n, size)))
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
@@ -586,19 +585,6 @@ class Program(Brief):
             z = z - V[s == 0].T @ (V[s == 0] @ z)
         return self._at(z, weight, self._duals(found), found.iterations)
 
-    def _minimum(self, weight: float, damping: Damping | None, accuracy: float) -> Point:
-        """Return the minimum by the structure of the loss; where rounding stops the solver, by a proximal step."""
-        of = self.structure.loss, self._rows, self._warm, weight, self._squares
-        try:
-            return minimum(*of, damping, accuracy)
-        except Unsolved as error:
-            if damping is not None or str(error) in STATUS:
-                raise
-        A = self.rows[0]
-        n = A.shape[1]
-        centre = np.zeros(n) if self._warm.z is None else self._warm.z
-        return minimum(*of, Damping(centre, np.full(n, PROXIMAL * np.linalg.norm(A) / np.sqrt(n))))
-
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""
         canonical = self.structure.canonical
@@ -607,9 +593,8 @@ class Program(Brief):
         if canonical.cones is None:
             stated = np.empty_like(found.dual)
             stated[canonical.order] = found.dual
-            sides = [_sides(low, high) for low, high in self.structure.limits]
-            parts = np.split(stated, np.cumsum([len(each) for each in sides])[:-1])
-            return tuple(self._of_box(each, part) for each, part in zip(sides, parts, strict=True))
+            counts = [len(_sides(low, high)) for low, high in self.structure.limits or []]
+            return self._by_function([[part] for part in np.split(stated, np.cumsum(counts)[:-1])])
         values = canonical.duals(found.x, found.dual)
         groups = self.structure.constraints
         return self._by_function([[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in groups])
@@ -620,15 +605,10 @@ class Program(Brief):
         for constraint, group in zip(self.formulation.constraints, groups, strict=True):
             values = np.concatenate([np.empty(0), *group])
             if isinstance(constraint, Box):
-                values = self._of_box(_sides(*constraint.bounds(self.model.parameters)), values)
+                sides = _sides(*constraint.bounds(self.structure.parameters))
+                values = np.bincount(sides, np.abs(values), self.structure.n)
             found.append(values)
         return tuple(found)
-
-    def _of_box(self, sides: np.ndarray, values: Array) -> Array:
-        """Return multipliers (n,) by component from those of the rows of a box."""
-        found = np.zeros(self.structure.n)
-        np.add.at(found, sides, np.abs(values))
-        return found
 
     def _by_cvxpy(
         self,

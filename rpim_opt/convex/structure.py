@@ -5,8 +5,8 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
-from functools import cached_property, lru_cache
+from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -45,18 +45,6 @@ FEW = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
 
-@dataclass(frozen=True)
-class Shape:
-    """Number of parameters and equations, their configurations (m,), and what functions see of the parameters."""
-
-    unknowns: int
-    equations: int
-    group: bytes
-    signature: tuple[Any, ...]
-    parameters: Parameters = field(compare=False)
-    groups: np.ndarray = field(compare=False)
-
-
 @dataclass(frozen=True, eq=False)
 class Answers:
     """Expressions that a formulation's functions returned, with private copies of the user's parameters and variables.
@@ -79,9 +67,9 @@ class Answers:
 
 def answers(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Answers:
     """Call the functions of a formulation for so many equations."""
-    where = f"formulation '{formulation.name}'"
     from rpim_opt.convex.unknown import Unknown  # imports CVXPY
 
+    where = f"formulation '{formulation.name}'"
     z = Unknown(parameters.names)
     r = cp.Variable(equations, name="r")
     seen: cp.Variable = r
@@ -115,10 +103,9 @@ def answers(formulation: Formulation, parameters: Parameters, equations: int, gr
     if seen is not r:  # norms are convex and nonnegative, as absolute values are
         _require_convex(f"{where}, loss", substituted(loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))}))
     _require_convex(f"{where}, penalty", penalty_of_z)
-    predicts = bool(known.asked)
     constraints = [[frozen(each) for each in group] for group in live]
     stated = live_loss, over_z(live_penalty), live
-    return Answers(z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, stated, predicts)
+    return Answers(z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, stated, bool(known.asked))
 
 
 def _require_convex(where: str, expression: Any) -> None:
@@ -156,9 +143,9 @@ class Structure:
     set solves, it solves without CVXPY.
     """
 
-    def __init__(self, formulation: Formulation, shape: Shape):
-        self.formulation, self.parameters = formulation, shape.parameters
-        self.n, self.equations, self.groups = shape.unknowns, shape.equations, shape.groups
+    def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
+        self.formulation, self.parameters = formulation, parameters
+        self.n, self.equations, self.groups = len(parameters), equations, groups
         self.limited = bool(np.isfinite(formulation.largest))
         self.constrained = bool(formulation.constraints) or self.limited
         self._lock = threading.RLock()
@@ -280,31 +267,27 @@ class Structure:
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
     @cached_property
-    def limits(self) -> list[tuple[Array, Array]]:
-        """Lower and upper bounds (n,) of every `Box`, in the order in which they are stated."""
+    def limits(self) -> list[tuple[Array, Array]] | None:
+        """Lower and upper bounds (n,) of every `Box`, in the order in which they are stated; None beside others."""
         boxes = [constraint for constraint in self.formulation.constraints if isinstance(constraint, Box)]
+        if len(boxes) < len(self.formulation.constraints):
+            return None
         return [box.bounds(self.parameters) for box in boxes]
-
-    @property
-    def _boxes(self) -> bool:
-        return all(isinstance(constraint, Box) for constraint in self.formulation.constraints)
 
     @cached_property
     def box(self) -> tuple[Array, Array] | None:
         """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none."""
-        if not self._boxes:
+        if self.limits is None or self.limited:
             return None
-        lower, upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
-        for low, high in self.limits:
-            lower, upper = np.maximum(lower, low), np.minimum(upper, high)
-        if self.limited or (lower > upper).any():
-            return None
-        return lower, upper
+        lower = np.max([low for low, _ in self.limits], axis=0, initial=-np.inf)
+        upper = np.min([high for _, high in self.limits], axis=0, initial=np.inf)
+        lower, upper = np.broadcast_to(lower, self.n), np.broadcast_to(upper, self.n)
+        return None if (lower > upper).any() else (lower, upper)
 
     @cached_property
     def canonical(self) -> Canonical:
         """Penalty and constraints of z in canonical form."""
-        if self._boxes and (self.formulation.penalty is None or self.penalty_form is not None):
+        if self.limits is not None and (self.formulation.penalty is None or self.penalty_form is not None):
             return Canonical.box(self.n, self.penalty_form, self.limits)
         penalty = self.answers.penalty_of_z
         with self._lock:
@@ -354,43 +337,38 @@ class Structure:
         if not self.inner:
             return self.loss_of(r), self.penalty_of(z)
         with self._lock:
-            if self.joint:
-                return self._together(z, r, weight)
-            if self._own_of(self.answers.loss.expression):
-                loss = self._loss_at_best(self.seen(r))
+            if not self.joint:
+                best_loss, best_penalty = self._at_best
+                return best_loss(r), best_penalty(z)
+            instead = {id(self.answers.z): cp.Constant(z), id(self.answers.r): cp.Constant(r)}
+            loss = substituted(self.loss_of_r, instead)
+            penalty: Any = cp.Constant(0.0)
+            if self.answers.penalty_of_z is not None:
+                penalty = substituted(self.answers.penalty_of_z, instead)
+            tied = [substituted(c, instead) for c in self.flat if self._own_of(c)]
+            problem = cp.Problem(cp.Minimize(loss + weight * penalty), tied)
+            for variable in problem.variables():
+                variable.save_value(None)
+            problem.solve(solver=cp.CLARABEL)
+            if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+                return float("inf"), 0.0
+            return float(loss.value), float(penalty.value)
+
+    @cached_property
+    def _at_best(self) -> tuple[Callable[[Array], float], Callable[[Array], float]]:
+        """Loss and penalty of r and z, each with the variables of its own, which it does not share, at their best."""
+        loss, best_loss, best_penalty = self.answers.loss, self.loss_of, self.penalty_of
+        if self._own_of(loss.expression):
+            form = self.loss
+            if form is not None and form.threshold is not None:
+                best_loss = lambda r: form.best(self.seen(r))[0]  # noqa: E731
             else:
-                loss = self.loss_of(r)
-            if self._own_of(self.answers.penalty_of_z):
-                return loss, self._penalty_at_best.at_best(z)
-            return loss, self.penalty_of(z)
-
-    @cached_property
-    def _loss_at_best(self) -> Callable[[Array], float]:
-        loss = self.loss
-        if loss is not None and loss.threshold is not None:
-            return lambda v: loss.best(v)[0]
-        return Canonical(self.answers.loss.expression, [], self.answers.loss.variable).at_best
-
-    @cached_property
-    def _penalty_at_best(self) -> Canonical:
-        tied = [c for c in self.flat if self._own_of(c)]
-        return Canonical(self.answers.penalty_of_z, tied, self.answers.z)
-
-    def _together(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
-        """Minimize loss + weight penalty over variables that both share, z and r given."""
-        instead = {id(self.answers.z): cp.Constant(z), id(self.answers.r): cp.Constant(r)}
-        loss = substituted(self.loss_of_r, instead)
-        penalty: Any = cp.Constant(0.0)
-        if self.answers.penalty_of_z is not None:
-            penalty = substituted(self.answers.penalty_of_z, instead)
-        tied = [substituted(c, instead) for c in self.flat if self._own_of(c)]
-        problem = cp.Problem(cp.Minimize(loss + weight * penalty), tied)
-        for variable in problem.variables():
-            variable.save_value(None)
-        problem.solve(solver=cp.CLARABEL)
-        if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
-            return float("inf"), 0.0
-        return float(loss.value), float(penalty.value)
+                canonical = Canonical(loss.expression, [], loss.variable)
+                best_loss = lambda r: canonical.at_best(self.seen(r))  # noqa: E731
+        if self._own_of(self.answers.penalty_of_z):
+            tied = [c for c in self.flat if self._own_of(c)]
+            best_penalty = Canonical(self.answers.penalty_of_z, tied, self.answers.z).at_best
+        return best_loss, best_penalty
 
     def loss_of(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""
@@ -442,38 +420,34 @@ def structure(formulation: Formulation, model: LinearModel) -> Structure:
         return Lost(formulation, model)
     m, n = model.A.shape
     if model.stands_for is not None:
-        formulation = _for_triangle(formulation, model.equations)
+        if not invariant(formulation, lambda: model.equations):
+            found = f"formulation '{formulation.name}'"
+            raise InputError(found, "equations in blocks, of which only the QR factor is kept", "a squared loss")
+        # a loss may depend on their number: a mean square of the equations is no mean of the factor's rows
+        form = None if formulation.loss in INVARIANT else _loss_form(formulation, model.equations)
+        if form is not None:
+            factor, constant = float(form.L[0] ** 2), form.constant
+            formulation = replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
     if formulation.loss in INVARIANT and formulation.loss_over == "equation" and not np.isfinite(formulation.largest):
         m = n + 1
     groups = model.members[0]
     p = model.parameters
-    signature: tuple[Any, ...] = ()
-    if formulation.constraints or formulation.penalty_over is not None:
-        signature = (p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
-    shape = Shape(n, m, groups.tobytes(), signature, p, groups)
-    return _cached(formulation, shape) if formulation.ready else Structure(formulation, shape)
+    if not formulation.ready:
+        return Structure(formulation, p, m, groups)
+    key: tuple[Any, ...] = (formulation, n, m, groups.tobytes())
+    if formulation.constraints or formulation.penalty_over is not None:  # which see the parameters
+        key = (*key, p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
+    made = _KEPT.get(key)
+    if made is None:
+        if len(_KEPT) >= MOST_KEPT:
+            _KEPT.clear()
+        made = _KEPT[key] = Structure(formulation, p, m, groups)
+    return made
 
 
-@lru_cache(maxsize=64)
-def _cached(formulation: Formulation, shape: Shape) -> Structure:
-    return Structure(formulation, shape)
-
-
-def _for_triangle(formulation: Formulation, equations: int) -> Formulation:
-    """Return a formulation whose loss means of a QR factor what it means of the equations that this stands for.
-
-    A loss may depend on their number: a mean square of the equations is no mean of the factor's rows.
-    """
-    if not invariant(formulation, lambda: equations):
-        found = f"formulation '{formulation.name}'"
-        raise InputError(found, "equations in blocks, of which only the QR factor is kept", "a squared loss")
-    form = None
-    if formulation.loss not in INVARIANT:
-        form = _loss_form(formulation, equations)
-    if form is None:
-        return formulation
-    factor, constant = float(form.L[0] ** 2), form.constant
-    return replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
+_KEPT: dict[Any, Structure] = {}
+MOST_KEPT = 64
+"""Structures of ready formulations that are kept for the next model of their shape."""
 
 
 def invariant(formulation: Formulation, equations: Callable[[], int]) -> bool:
@@ -509,7 +483,7 @@ class Lost(Structure):
         model: LinearModel,
         loss_form: Quadratic | None = None,
         penalty_form: Quadratic | None = None,
-    ):
+    ) -> None:
         self.formulation, self.parameters = formulation, model.parameters
         self.n, self.equations, self.groups = model.A.shape[1], len(model.b), model.members[0]
         self.limited, self.constrained = False, True

@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.convex.expressions import Frozen, Term, listed, norms, scalar, term
 from rpim_opt.convex.infeasible import conflict, name_of
 from rpim_opt.convex.quadratic import quadratic
-from rpim_opt.convex.rules.scores import Rule, linear_rule
+from rpim_opt.convex.rules.scores import linear_rule
 from rpim_opt.convex.rules.selection import EDGES
 from rpim_opt.convex.structure import invariant
 from rpim_opt.problem.linear import LinearModel
@@ -325,7 +325,7 @@ def test_a_linear_rule_says_an_edge_and_refines_between_neighbours(k: int) -> No
     def score_of(_: Any) -> Any:
         return lambda w: (np.log(w) - target) ** 2
 
-    chosen = linear_rule(program, Rule("mine", score_of, "found"))
+    chosen = linear_rule(program, "mine", score_of, "found")
     assert np.log(chosen.weight) == pytest.approx(target, abs=1e-5)
     assert chosen.interior == (0 < k < 199)
     assert chosen.note == {0: EDGES["lower"], 199: EDGES["upper"]}.get(k, "found")
@@ -341,8 +341,8 @@ def test_a_local_rule_prefers_a_valley_to_an_edge() -> None:
 
         return score
 
-    local = linear_rule(program, Rule("mine", score_of, "found", local=True))
+    local = linear_rule(program, "mine", score_of, "found", local=True)
     assert local.interior
     assert local.weight == pytest.approx(1e-3, rel=1e-3)
     assert not replace(local, interior=False).interior
-    assert not linear_rule(program, Rule("mine", lambda _: lambda w: -np.abs(np.log(w / 1e-3)), "f")).interior
+    assert not linear_rule(program, "mine", lambda _: lambda w: -np.abs(np.log(w / 1e-3)), "f").interior

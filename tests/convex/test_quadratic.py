@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
-from rpim_opt.convex.rules.scores import Squared, influence
+from rpim_opt.convex.rules.scores import influence
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 
@@ -72,7 +72,7 @@ def test_freedom_noise_and_prior_are_their_definitions(name: str) -> None:
 def test_rows_of_the_influence_matrix(name: str) -> None:
     m, p = model(condition=30.0), PENALTIES[name]
     form = ridge(m, p)
-    Q, s2, _ = influence(Squared(m, p, form))
+    Q, s2, _ = influence(m, form)
     H = (Q * (s2 / (s2 + WEIGHT))) @ Q.T
     assert pytest.approx(m.A @ np.linalg.inv(normal_matrix(m, p, WEIGHT)) @ m.A.T, abs=1e-8) == H
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
@@ -48,8 +46,10 @@ def l_curve(program: Program) -> Selection:
         weights = every[kept]
         score = menger(points[kept])
     best = int(np.argmax(score))
-    if not program.linear_penalty:
-        best = _first_corner(score)
+    if not program.linear_penalty:  # where the last parameters vanish, a path bends like at a corner, far above noise
+        peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
+        sharp = peaks[score[peaks] >= SHARP * np.max(score)]
+        best = int(sharp[0]) if len(sharp) else best
     if not score[best] > 0:
         best = 0
     if not 0 < best < len(weights) - 1:
@@ -65,16 +65,6 @@ def l_curve(program: Program) -> Selection:
         if -opposite > score[best]:  # the search sees one maximum of several
             weight = refined
     return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve" + skipped(failed))
-
-
-def _first_corner(score: Array) -> int:
-    """Return the corner at the smallest weight of those that are about as sharp as the sharpest.
-
-    Where the last parameters or groups vanish, a path bends like at a corner, far above the noise.
-    """
-    peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
-    sharp = peaks[score[peaks] >= SHARP * np.max(score)]
-    return int(sharp[0]) if len(sharp) else int(np.argmax(score))
 
 
 def _points(estimates: list[Estimate | None]) -> Array:
@@ -147,7 +137,24 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
                 seen[t] = _points(solved(program, [float(np.exp(t))]))[0]
         return float(menger(np.array([seen[t] for t in places]))[1])
 
-    best = _by_golden_sections(curvature, low, high, tolerance)
+    # of the two inner points the one with the larger curvature stays, until they meet
+    begin, end = low, high
+    left = (end + GOLDEN * begin) / (1 + GOLDEN)
+    right = begin + end - left
+    best = left
+    while end - begin > tolerance:
+        on_the_right = curvature(left, right, end)
+        while on_the_right < 0 and end - begin > tolerance:
+            # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
+            end, right = right, left
+            left = (end + GOLDEN * begin) / (1 + GOLDEN)
+            on_the_right = curvature(left, right, end)
+        if curvature(begin, left, right) > on_the_right:
+            best, end, right = left, right, left
+            left = (end + GOLDEN * begin) / (1 + GOLDEN)
+        else:
+            best, begin, left = right, left, right
+            right = begin + end - left
     order = [t for t in sorted(seen) if np.isfinite(seen[t]).all()]
     if not order:
         program.solve(float(np.exp(best)))  # raises what the solver says
@@ -158,29 +165,3 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
         note = "the search ended at an edge: the L-curve has no corner"
     note += skipped(len(seen) - len(order))
     return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
-
-
-def _by_golden_sections(curvature: Callable[..., float], low: float, high: float, tolerance: float) -> float:
-    """Return ln weight of the corner: of the two inner points the one with the larger curvature, until they meet."""
-    left = (high + GOLDEN * low) / (1 + GOLDEN)
-    right = low + high - left
-    best = left
-    while high - low > tolerance:
-        on_the_right = curvature(left, right, high)
-        while on_the_right < 0 and high - low > tolerance:
-            # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
-            high = right
-            right = left
-            left = (high + GOLDEN * low) / (1 + GOLDEN)
-            on_the_right = curvature(left, right, high)
-        if curvature(low, left, right) > on_the_right:
-            best = left
-            high = right
-            right = left
-            left = (high + GOLDEN * low) / (1 + GOLDEN)
-        else:
-            best = right
-            low = left
-            left = right
-            right = low + high - left
-    return best

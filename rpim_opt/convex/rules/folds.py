@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.rules.curve import l_curve
-from rpim_opt.convex.rules.scores import Rule, Squared, influence, linear_rule
+from rpim_opt.convex.rules.scores import influence, linear_rule
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
@@ -43,9 +43,6 @@ SAME = 1e-7
 MANY = 1_000_000
 """Residuals that are in memory together, of many weights."""
 
-Predicted = Callable[[Array], Array]
-"""From weights (K,) to the norms (K, N) of the residuals of left-out configurations."""
-
 
 @on_squares
 def leave_one_out(program: Program, exact: bool = False) -> Selection:
@@ -68,13 +65,21 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     mixed = form is not None and not form.diagonal  # a square then belongs to no configuration
     if program.closed_form and not mixed:
         note = "smallest error of configurations left out one by one"
-        return linear_rule(program, Rule("leave_one_out", _of_squares, note))
+        return linear_rule(program, "leave_one_out", _of_squares, note)
     if exact:
         return _least(program, "leave_one_out", _error_of_folds(program, None))
     chosen = _least(program, "leave_one_out", _left_out_error(program))
     if not chosen.interior or not _approximates(program):
         return chosen
-    how = f"left out one by one, {_how_exact(program, chosen.weight)}"
+    # how exact the approximation is, for some configurations from the best predicted to the worst
+    configurations, weight = np.unique(program.model.group), np.array([chosen.weight])
+    norms = _approximately(program)(weight)[0]
+    some = np.argsort(norms)[np.linspace(0, len(norms) - 1, min(SOME, len(norms))).astype(int)]
+    there = Folds(program, [configurations[[k]] for k in some]).norms(weight)[0]
+    off = float(np.linalg.norm(norms[some] - there) / max(np.linalg.norm(there), np.finfo(float).tiny))
+    how = f"left out one by one, approximately ({100 * off:.2g} % off in {len(some)} that were solved)"
+    if off > INEXACT:
+        how += "; exact=True solves all"
     return replace(chosen, note=chosen.note.replace("held out", how))
 
 
@@ -94,7 +99,11 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
     """
     groups = np.unique(with_rows(program, "k_fold").group)
     if parts is not None:
-        return _least(program, "k_fold", _error_of_folds(program, _division(groups, parts)))
+        present = [each for each in (np.intersect1d(part, groups) for part in parts) if len(each)]
+        if len(present) < 2 or not np.array_equal(np.sort(np.concatenate(present)), groups):
+            found = f"{len(present)} that have {sum(map(len, present))} of {len(groups)} configurations"
+            raise InputError("selector k_fold, parts", found, "two or more, with every configuration in one of them")
+        return _least(program, "k_fold", _error_of_folds(program, present))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
     place = np.unique(program.model.group, return_index=True)[1]
@@ -124,7 +133,15 @@ def two_step(program: Program) -> Selection:
     if not program.linear_penalty:
         last = max(last, min(start, weight_grid(program, 2)[0]))
     coarse = np.geomspace(start, last, 30)
-    level = _end_of_fall(program, coarse)
+    some = len(coarse) if program.closed_form else AHEAD
+    level, residual = float(coarse[0]), np.empty(0)
+    while len(residual) < len(coarse):
+        more = solved(program, coarse[len(residual) : len(residual) + some])
+        residual = np.append(residual, np.sqrt([each.loss if each else np.nan for each in more]))
+        flat = residual[1:] >= 0.99 * residual[:-1]
+        if flat.any():
+            level = float(coarse[np.argmax(flat)])
+            break
     fine = level * np.linspace(0.563 / 3.063, 5.063 / 3.063, 10)
     score = _left_out_error(program)(fine)
     best = int(np.nanargmin(score))
@@ -137,29 +154,6 @@ def two_step(program: Program) -> Selection:
         )
     note += skipped(int(failed.sum()))
     return Selection(float(fine[best]), "two_step", fine[~failed], score[~failed], interior, note)
-
-
-def _end_of_fall(program: Program, weights: Array) -> float:
-    """Return the first of falling weights (K,) where the residual norm falls no more; the first if it always does."""
-    some = len(weights) if program.closed_form else AHEAD
-    residual = np.empty(0)
-    while len(residual) < len(weights):
-        more = solved(program, weights[len(residual) : len(residual) + some])
-        residual = np.append(residual, np.sqrt([each.loss if each else np.nan for each in more]))
-        flat = residual[1:] >= 0.99 * residual[:-1]
-        if flat.any():
-            return float(weights[np.argmax(flat)])
-    return float(weights[0])
-
-
-def _division(groups: np.ndarray, parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return parts that have each of some configurations once, without those that the program does not have."""
-    present = [np.intersect1d(part, groups) for part in parts]
-    present = [part for part in present if len(part)]
-    if len(present) < 2 or not np.array_equal(np.sort(np.concatenate(present)), groups):
-        found = f"{len(present)} that have {sum(map(len, present))} of {len(groups)} configurations"
-        raise InputError("selector k_fold, parts", found, "two or more, with every configuration in one of them")
-    return present
 
 
 def _least(program: Program, name: str, error: Score) -> Selection:
@@ -191,7 +185,7 @@ def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray]
 def _left_out_error(program: Program) -> Score:
     """Return what gives `held_out_error` of configurations left out one by one, with little solving."""
     if program.closed_form and program.squared is program.model:
-        squares = _of_squares(Squared.of(program))
+        squares = _of_squares(program)
         return lambda weights: np.sqrt(squares(weights) / len(program.model.b))
     if _approximates(program):
         predicted = _approximately(program)
@@ -247,15 +241,15 @@ def _solved(M: Array, v: Array) -> Array:
     return v
 
 
-def _of_squares(squared: Squared) -> Score:
+def _of_squares(program: Program) -> Score:
     """Return the sums of squares (K,) of all left-out residuals of an estimator with influence Q diag(f) Q', by weight.
 
     With f = s^2 / (s^2 + weight) and residuals r of all, r_g^- = (1 - Q_g diag(f) Q_g')^-1 r_g.
     """
-    Q, s2, target = influence(squared)
+    Q, s2, target = influence(program.squared, program.ridge)
     projected = Q.T @ target
     parts = []
-    for places, _ in by_size(squared.model.group):
+    for places, _ in by_size(program.squared.group):
         each, k = Q[places], places.shape[1]
         parts.append((places, {(i, j): each[:, i] * each[:, j] for i in range(k) for j in range(i, k)}))
 
@@ -284,8 +278,8 @@ def _approximates(program: Program) -> bool:
     return program.structure.canonical.polyhedral or len(np.unique(program.model.group)) > EXACTLY
 
 
-def _approximately(program: Program) -> Predicted:
-    """Return the predictor of every configuration by the derivative of the solution."""
+def _approximately(program: Program) -> Score:
+    """Return what gives norms (K, N) of left-out configurations' residuals, by the derivative of the solution."""
     model = program.squared
     rows = by_size(model.group)
 
@@ -303,20 +297,6 @@ def _approximately(program: Program) -> Predicted:
     count = sum(len(configurations) for _, configurations in rows)
     nothing = np.full(count, np.nan)
     return lambda weights: np.array([norms(each) if each else nothing for each in solved(program, weights)])
-
-
-def _how_exact(program: Program, weight: float) -> str:
-    """Return how exact the approximation is for some configurations that are solved without."""
-    configurations = np.unique(program.model.group)
-    norms = _approximately(program)(np.array([weight]))[0]
-    order = np.argsort(norms)  # from the best predicted to the worst
-    some = order[np.linspace(0, len(order) - 1, min(SOME, len(order))).astype(int)]
-    there = Folds(program, [configurations[[k]] for k in some]).norms(np.array([weight]))[0]
-    off = float(np.linalg.norm(norms[some] - there) / max(np.linalg.norm(there), np.finfo(float).tiny))
-    text = f"approximately ({100 * off:.2g} % off in {len(some)} that were solved)"
-    if off > INEXACT:
-        text += "; exact=True solves all"
-    return text
 
 
 class Folds:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
@@ -11,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
+from rpim_opt.convex.quadratic import Ridge, identity, ridge, robot_alone
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
@@ -28,70 +29,38 @@ TOGETHER = 250_000
 """Frequencies of residuals that are in memory together, of many weights."""
 
 
-@dataclass(frozen=True, eq=False)
-class Squared:
-    """Equations, penalty, and their closed form."""
+def linear_rule(
+    program: Program, name: str, score_of: Callable[[Program], Score], note: str, local: bool = False
+) -> Selection:
+    """Minimize a score of the linear estimator over a grid, refined between its points.
 
-    model: LinearModel
-    penalty: Quadratic
-    form: Ridge
-
-    @classmethod
-    def of(cls, program: Program) -> Squared:
-        """Return those of a program, with the penalty |z|^2 where it has none."""
-        penalty = program.penalty_form or identity(program.model.A.shape[1])
-        return cls(program.squared, penalty, program.ridge)
-
-    @property
-    def spare(self) -> int:
-        """Equations besides those that the directions without penalty take."""
-        return self.model.equations - self.form.fixed
-
-
-@dataclass(frozen=True)
-class Rule:
-    """A score of the weight, least at the choice; with ``local`` an interior minimum goes before an edge."""
-
-    name: str
-    score: Callable[[Squared], Score]
-    note: str
-    local: bool = False
-
-
-def linear_rule(program: Program, rule: Rule) -> Selection:
-    """Minimize a score of the linear estimator over a grid, refined between its points."""
+    With ``local`` an interior minimum goes before an edge.
+    """
     if program.penalty_form is None:
         found = f"formulation '{program.formulation.name}'"
         accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
-        raise InputError(f"selector {rule.name}", found, accepted)
+        raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
         program.trusted(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
-    squared = Squared.of(program)
-    weights = grid_of(squared.form)
-    score_at = rule.score(squared)
+    weights = grid_of(program.ridge)
+    score_at = score_of(program)
     score = score_at(weights)
-    best = _lowest(score, rule.local)
+    best = int(np.argmin(score))
+    valleys = np.flatnonzero((score[1:-1] <= score[:-2]) & (score[1:-1] < score[2:])) + 1
+    if local and len(valleys):
+        best = int(valleys[np.argmin(score[valleys])])
     if not 0 < best < len(weights) - 1:
-        return Selection(float(weights[best]), rule.name, weights, score, False, edge(best))
+        return Selection(float(weights[best]), name, weights, score, False, edge(best))
     weight, _ = least_between(score_at, weights, best)
-    return Selection(weight, rule.name, weights, score, True, rule.note)
+    return Selection(weight, name, weights, score, True, note)
 
 
-def _lowest(score: Array, local: bool) -> int:
-    if local:
-        valleys = np.flatnonzero((score[1:-1] <= score[:-2]) & (score[1:-1] < score[2:])) + 1
-        if len(valleys):
-            return int(valleys[np.argmin(score[valleys])])
-    return int(np.argmin(score))
-
-
-def influence(squared: Squared) -> tuple[Array, Array, Array]:
+def influence(model: LinearModel, form: Ridge) -> tuple[Array, Array, Array]:
     """Return Q (m, p), s^2 (p,) and the values y (m,) with influence matrix Q diag(s^2 / (s^2 + weight)) Q'.
 
     Directions that the penalty leaves free stand beside the others with infinite s^2, and y is measured from the
     penalty's centre.
     """
-    model, form = squared.model, squared.form
     s = form.s[form.seen]
     s2 = np.concatenate([s**2, np.full(form.fixed, 1e300)])
     return model.A @ np.hstack([form.B[:, form.seen] / s, form.free]), s2, model.b - model.A @ form.offset
@@ -125,23 +94,22 @@ def reml(program: Program) -> Selection:
         weights = weight_grid(program)
         note = "points on a plane or sphere do not determine it: stated noise and scales are used"
         return Selection(1.0, "reml", weights, np.zeros(len(weights)), interior=False, note=note)
-    rule = Rule("reml", _restricted_likelihood, "largest restricted likelihood", local=True)
-    chosen = linear_rule(program, rule)
+    chosen = linear_rule(program, "reml", _restricted_likelihood, "largest restricted likelihood", local=True)
     if chosen.interior or chosen.weight < 1.0:
         return chosen
     note = "the data do not determine the scale of the deviations: stated noise and scales are used"
     return replace(chosen, weight=1.0, note=note)
 
 
-def _restricted_likelihood(squared: Squared) -> Score:
+def _restricted_likelihood(program: Program) -> Score:
     """Return the function from weights (K,) to -2 ln(restricted likelihood), up to a constant."""
     tiny = np.finfo(float).tiny
-    frames = squared.model.parameters.placed
-    form = squared.form
+    model, form = program.squared, program.ridge
+    frames = model.parameters.placed
     if frames.any() and not frames.all():
-        form = ridge(squared.model, robot_alone(squared.penalty, frames))
+        form = ridge(model, robot_alone(program.penalty_form or identity(len(frames)), frames))
     beta2, s2, perp = form.filters
-    m = squared.model.equations - form.fixed
+    m = model.equations - form.fixed
 
     def score(weights: Array) -> Array:
         g = weights[:, None] / (s2 + weights[:, None])
@@ -161,7 +129,7 @@ def gcv(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1', True)
     """
-    return linear_rule(program, _gcv_rule("gcv", 1.0, "smallest generalized cross-validation error"))
+    return linear_rule(program, "gcv", partial(_gcv, 1.0), "smallest generalized cross-validation error")
 
 
 @on_squares
@@ -184,24 +152,19 @@ def robust_gcv(program: Program, gamma: float = 1.4) -> Selection:
         found = f"{m} equations for {rank} directions"
         raise InputError("selector robust_gcv", found, "three equations a direction; gcv or reml with fewer")
     note = f"smallest cross-validation error with gamma {gamma:g}"
-    return linear_rule(program, _gcv_rule("robust_gcv", gamma, note))
+    return linear_rule(program, "robust_gcv", partial(_gcv, gamma), note)
 
 
-def _gcv_rule(name: str, gamma: float, note: str) -> Rule:
-    """Return the rule that minimizes rho(w) / (m - gamma dof(w))^2; no weight serves that leaves no equation."""
+def _gcv(gamma: float, program: Program) -> Score:
+    """Return rho(w) / (m - gamma dof(w))^2; no weight serves that leaves no equation."""
+    beta2, s2, perp = program.ridge.filters
 
-    def of(squared: Squared) -> Score:
-        beta2, s2, perp = squared.form.filters
-        free = squared.form.fixed
+    def score(weights: Array) -> Array:
+        g = weights[:, None] / (s2 + weights[:, None])
+        left = program.squared.equations - gamma * (program.ridge.fixed + np.sum(1 - g, axis=1))
+        return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
 
-        def score(weights: Array) -> Array:
-            g = weights[:, None] / (s2 + weights[:, None])
-            left = squared.model.equations - gamma * (free + np.sum(1 - g, axis=1))
-            return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
-
-        return score
-
-    return Rule(name, of, note)
+    return score
 
 
 @on_squares
@@ -216,33 +179,35 @@ def discrepancy(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.note
     ('28', 'misfit equal to the declared noise')
     """
-    chosen = linear_rule(program, Rule("discrepancy", _misfit, "misfit equal to the declared noise"))
+    note = "misfit equal to the declared noise"
+    chosen = linear_rule(program, "discrepancy", _misfit, note)
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights
     if not len(fits):
-        note = "no weight fits as well as the stated noise implies: it is too small, or the model lacks an effect"
-        return replace(chosen, weight=float(weights[0]), interior=False, note=note)
+        why = "no weight fits as well as the stated noise implies: it is too small, or the model lacks an effect"
+        return replace(chosen, weight=float(weights[0]), interior=False, note=why)
     k = int(fits[-1])
     if k == len(weights) - 1:
-        note = "every weight fits better than the stated noise: it is stated too large"
-        return replace(chosen, weight=float(weights[k]), interior=False, note=note)
+        why = "every weight fits better than the stated noise: it is stated too large"
+        return replace(chosen, weight=float(weights[k]), interior=False, note=why)
     # between the last weight that fits and the next, where the score crosses zero
     share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])
     weight = float(np.exp(np.log(weights[k]) + share * np.log(weights[k + 1] / weights[k])))
-    return replace(chosen, weight=weight, interior=True, note="misfit equal to the declared noise")
+    return replace(chosen, weight=weight, interior=True, note=note)
 
 
 ROOM = 1.1
 """Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
 
 
-def _misfit(squared: Squared) -> Score:
+def _misfit(program: Program) -> Score:
     """Return the function from weights (K,) to ln(rho / (tau^2 (m - dof)))."""
-    beta2, s2, perp = squared.form.filters
+    beta2, s2, perp = program.ridge.filters
+    spare = program.squared.equations - program.ridge.fixed
 
     def score(weights: Array) -> Array:
         g = weights[:, None] / (s2 + weights[:, None])
-        left = ROOM**2 * np.maximum(squared.spare - np.sum(1 - g, axis=1), 1e-9)
+        left = ROOM**2 * np.maximum(spare - np.sum(1 - g, axis=1), 1e-9)
         return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
 
     return score
@@ -260,11 +225,11 @@ def quasi_optimality(program: Program) -> Selection:
     ('5e-06', True)
     """
 
-    def of(squared: Squared) -> Score:
-        beta2, s2, _ = squared.form.filters
+    def score_of(program: Program) -> Score:
+        beta2, s2, _ = program.ridge.filters
         return lambda weights: np.sum((weights[:, None] ** 2 * s2 * beta2) / (s2 + weights[:, None]) ** 4, axis=1)
 
-    return linear_rule(program, Rule("quasi_optimality", of, "least change of the solution", local=True))
+    return linear_rule(program, "quasi_optimality", score_of, "least change of the solution", local=True)
 
 
 @on_squares
@@ -282,8 +247,8 @@ def ncp(program: Program) -> Selection:
     """
     with_rows(program, "ncp")
 
-    def of(squared: Squared) -> Score:
-        Q, s2, target = influence(squared)
+    def score_of(program: Program) -> Score:
+        Q, s2, target = influence(program.squared, program.ridge)
         projected = Q.T @ target
         # transforms are linear: those of the columns say those of every residual
         spectra = np.fft.rfft(np.vstack([Q.T, target]), axis=1)[:, 1:]
@@ -303,4 +268,4 @@ def ncp(program: Program) -> Selection:
 
         return score
 
-    return linear_rule(program, Rule("ncp", of, "whitest residual"))
+    return linear_rule(program, "ncp", score_of, "whitest residual")

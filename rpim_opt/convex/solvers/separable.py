@@ -47,8 +47,6 @@ POOR = 1e-3
 """Ratio of pivots of a Hessian below which it gets secants (iteratively reweighted least squares) beside it."""
 FEWER, LEAST_SECANTS = 0.1, 1e-8
 """Factor on the secants after a full step, and their least part."""
-ROUND = 32
-"""Rows that are taken as they are come in multiples of this: a program of so many is made once."""
 BLOCK = 1024
 """Rows that are multiplied together, as a processor's cache holds them."""
 DECADES, EXACT = 6, 1e-15
@@ -81,11 +79,6 @@ class Rows:
         return np.concatenate([[0], np.cumsum(self.sizes)[:-1]])
 
     @cached_property
-    def even(self) -> bool:
-        """Whether all entries have as many equations."""
-        return self.sizes is None or np.ptp(self.sizes) == 0
-
-    @cached_property
     def squares(self) -> Squares:
         """|A z - b|^2, reduced."""
         return Squares.of_factor(self.triangle)
@@ -115,19 +108,20 @@ class Rows:
         places = [np.arange(int(self.sizes[i])) + self.starts[i] for i in which]
         return np.concatenate([np.zeros(0, dtype=int), *places])
 
-    def of(self, which: np.ndarray) -> tuple[Array, Array]:
-        """Return the equations of some entries."""
+    def alone(self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int) -> tuple[Small, Array, Array]:
+        """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
+        expression, own = loss.some(which)
+        sizes = None if self.sizes is None else self.sizes[which]
         places = self.places(which)
-        return self.A[places], self.b[places]
+        return Small(penalty, squares, Canonical(expression, [], own), sizes), self.A[places], self.b[places]
 
 
 @dataclass(eq=False)
 class Newton:
     """One search for the minimum of loss(A z - b) + damping(z) + weight penalty(z) subject to constraints.
 
-    ``small`` is the program of squares, penalty and constraints, ``some`` those with some rows as they are;
-    ``kink`` the largest jump of the loss's slope, 0 where it is smooth; ``accuracy`` the part of the loss that may be
-    left.
+    ``small`` is the program of squares, penalty and constraints; ``kink`` the largest jump of the loss's slope, 0 where
+    it is smooth; ``accuracy`` the part of the loss that may be left.
     """
 
     loss: Loss
@@ -137,7 +131,6 @@ class Newton:
     weight: float
     damping: Damping | None
     kink: float
-    some: dict[tuple[int, int], Small]
     accuracy: float = 0.0
     steps: int = 0
     x: Array = field(default_factory=lambda: np.zeros(0))
@@ -161,7 +154,7 @@ class Newton:
                 slope[out] = 0.0
                 curvature[out] = 0.0
             return U.T @ slope, gram(U, curvature)
-        sizes, starts = self.rows.sizes, self.rows.starts
+        starts = self.rows.starts
         v = np.maximum(np.sqrt(np.add.reduceat(r * r, starts) + h * h), TINY)
         slope, curvature = self.loss.smooth(v, 0.0)
         inner = np.maximum(v * v - h * h, 0.0)  # |r|^2
@@ -176,11 +169,7 @@ class Newton:
         H = gram(U, wide)
         bent = np.flatnonzero(np.abs(along - across) > 1e-9 * across.max(initial=0.0))
         if len(bent):
-            if self.rows.even:
-                d = int(sizes[0])
-                turned = np.einsum("kd,kdn->kn", unit.reshape(-1, d)[bent], U.reshape(-1, d, U.shape[1])[bent])
-            else:
-                turned = np.add.reduceat(U * unit[:, None], starts)[bent]
+            turned = np.add.reduceat(U * unit[:, None], starts)[bent]
             H += (turned * (along - across)[bent, None]).T @ turned
         return U.T @ (wide * r), H
 
@@ -219,9 +208,13 @@ class Newton:
         tolerance = max(tolerance, self.accuracy)
         for _ in range(most):
             gradient, H = self._model(r, h)
-            if secants or _poor(H):
+            pivots = np.diag(np.linalg.cholesky(H + PROXIMAL * np.trace(H) * np.eye(len(H))))
+            if secants or pivots.min() < POOR * pivots.max():
+                # squares with the loss's slopes at r and -r lie nowhere below it
                 secants = max(secants, LEAST_SECANTS) if t_before == 1.0 else 1.0
-                H = H + secants * self._secants(r, h)
+                v = np.where(np.abs(r) > TINY, r, TINY)
+                secant = np.maximum((self._slope(v, h) - self._slope(-v, h)) / (2 * v), 0.0)
+                H = H + secants * gram(self.rows.whitened[0], secant)
             self.point = self._solved(z, gradient, H)
             ahead = self.point.x
             d = ahead[at] - z
@@ -246,11 +239,6 @@ class Newton:
             if (t == 1.0 and promised * left**2 <= 0.01 * tolerance * size) or t * np.abs(d).max() < 1e-15:
                 break
         return z
-
-    def _secants(self, r: Array, h: float) -> Array:
-        """Return the Hessian by u = T z of squares with the loss's slopes at r and -r: they lie nowhere below it."""
-        U, v = self.rows.whitened[0], np.where(np.abs(r) > TINY, r, TINY)
-        return gram(U, np.maximum((self._slope(v, h) - self._slope(-v, h)) / (2 * v), 0.0))
 
     def _search(self, r: Array, Ad: Array, chord: float, bend: float, h: float, before: float) -> tuple[float, float]:
         """Return t in (0, 1] where the derivative along the step is small, and how small: no value of it is needed."""
@@ -321,13 +309,11 @@ class Newton:
             if len(near) > 2 * max(NEAR * self.rows.A.shape[1], 200):
                 return None
             r = self._residual(z)
-            near = self._filled(near, r)
             gradient, H = self._model(r, 0.0, near)
             small = self.small
-            exact: tuple[Array, ...] = ()
+            exact: list[Array] = []
             if len(near):
-                small = with_some(self.loss, self.rows, self.penalty, near, small.rows, self.some)
-                exact = self.rows.of(near)
+                small, *exact = self.rows.alone(self.loss, near, self.penalty, small.rows)
             try:
                 point = self._solved(z, gradient, H, small, *exact)
             except (Unsolved, np.linalg.LinAlgError):
@@ -351,38 +337,6 @@ class Newton:
             beside = self._near(self.rows.entries(self._residual(z)), h)
             near = np.union1d(near, np.union1d(np.flatnonzero(bent), beside))
         return None
-
-    def _filled(self, near: np.ndarray, r: Array) -> np.ndarray:
-        """Return entries and the smallest others, so many that their number comes again."""
-        if not len(near) or not (self.loss.uniform and self.rows.even):
-            return near
-        count = min(-(-len(near) // ROUND) * ROUND, self.loss.variable.size)
-        order = np.argsort(np.abs(self.rows.entries(r)))
-        return np.sort(np.concatenate([near, order[~np.isin(order, near)][: count - len(near)]]))
-
-
-def with_some(
-    loss: Loss, rows: Rows, penalty: Canonical, which: np.ndarray, squares: int, kept: dict[tuple[int, int], Small]
-) -> Small:
-    """Return the small program with some entries of a loss as they are, beside so many rows of squares.
-
-    Where all entries have the same function, one program serves any entries of a number: ``kept`` has it.
-    """
-    key = len(which), squares
-    if key in kept:
-        return kept[key]
-    expression, own = loss.some(which)
-    sizes = None if rows.sizes is None else rows.sizes[which]
-    made = Small(penalty, squares, Canonical(expression, [], own), sizes)
-    if loss.uniform and rows.even:
-        kept[key] = made
-    return made
-
-
-def _poor(H: Array) -> bool:
-    """Whether some directions have hardly any curvature: Newton's steps along them would be far too long."""
-    pivots = np.diag(np.linalg.cholesky(H + PROXIMAL * np.trace(H) * np.eye(len(H))))
-    return bool(pivots.min() < POOR * pivots.max())
 
 
 def gram(A: Array, weights: Array) -> Array:
@@ -453,11 +407,6 @@ class Loss:
         return Canonical(self.expression, self.limits, self.variable)
 
     @cached_property
-    def uniform(self) -> bool:
-        """Whether all entries have the same function."""
-        return all(constant.size == 1 for constant in self.entries.constants())
-
-    @cached_property
     def _evaluated(self) -> Evaluation:
         return evaluation(self.entries, self.variable)
 
@@ -525,19 +474,15 @@ class Loss:
 
     def some(self, which: np.ndarray) -> tuple[Any, Any]:
         """Return the sum of some entries and the threshold, and the variable (k,) of their own that it is of."""
-        entries, own = self._alone(which)
-        total = cp.sum(entries)
-        return total if self.threshold is None else total + self.threshold, own
-
-    def _alone(self, which: np.ndarray) -> tuple[Any, Any]:
-        """Return some of the entries (k,) as an expression of a variable of their own, and that variable."""
         own = cp.Variable(len(which))
-        return _restricted(self.entries, self.variable, own, which), own
+        total = cp.sum(_restricted(self.entries, self.variable, own, which))
+        return total if self.threshold is None else total + self.threshold, own
 
     def jump(self, size: float) -> float:
         """Return the largest jump of the slope within 5 ``size`` of zero, 0 where f is smooth; by bisection."""
         which = np.unique(np.linspace(0, self.variable.size - 1, PROBES).astype(int))
-        evaluated = evaluation(*self._alone(which))
+        own = cp.Variable(len(which))
+        evaluated = evaluation(_restricted(self.entries, self.variable, own, which), own)
 
         def slope(v: Array) -> Array:
             return evaluated(v)[1] * np.ones(len(v))
@@ -699,8 +644,7 @@ AFFINE: dict[str, Callable[[Any, Any], tuple[Any, Any]]] = {
 
 
 def _huber(e: Any, v: Sequence[Array]) -> tuple[Array, list[Array]]:
-    bound = float(e.M.value)
-    cut = np.clip(v[0], -bound, bound)
+    cut = np.clip(v[0], -e.M.value, e.M.value)
     return cut * (2 * v[0] - cut), [2 * cut]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.solvers.conic import EQUILIBRATED, Canonical, Damping, Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows, kink_of, with_some
+from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows, kink_of
 
 GENERATIONS = 40
 """Working sets of entries before all rows are taken."""
@@ -32,7 +32,6 @@ class Warm:
     count: int = 0
     small: dict[int, Small] = field(default_factory=dict)
     direct: dict[int, Small] = field(default_factory=dict)
-    some: dict[tuple[int, int], Small] = field(default_factory=dict)
     kink: float = -1.0
     lock: Any = field(default_factory=threading.RLock)
 
@@ -106,7 +105,7 @@ def _separable(
     if z is None or x is None or not known:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.penalty.at]
-    search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, warm.some, accuracy)
+    search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
@@ -162,12 +161,12 @@ def _coupled(
         outside = np.ones(loss.variable.size, dtype=bool)
         outside[working] = False
         slope = np.where(rows.spread(outside), tangent.slope, 0.0)
-        small = with_some(loss, rows, warm.penalty, working, len(terms.y), warm.some)
+        small, *equations = rows.alone(loss, working, warm.penalty, len(terms.y))
         small.attempts = (EQUILIBRATED,)
         part: Any = small.loss
         part.price(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
         try:
-            point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *rows.of(working))
+            point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *equations)
         except Unsolved:
             if len(working) == len(outside):
                 raise
