@@ -326,7 +326,10 @@ class Program(Brief):
             return np.clip(z, *self.box)
         if not self.formulation.constraints or self.structure.met(z):
             return z
-        return nearest(self.structure.canonical, z)
+        try:
+            return nearest(self.structure.canonical, z)
+        except Unsolved:
+            return None
 
     def meets(self, z: Array) -> bool:
         """Whether z (n,) meets its constraints as well as is asked for."""

@@ -87,9 +87,8 @@ def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
     reduced = _reduced(data, variable)
     if reduced is None:
         return None
-    H, g = reduced
     variable.value = np.zeros(variable.size)
-    return _completed(H, g, float(expression.value))
+    return _completed(*reduced, float(expression.value))
 
 
 def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] | None:
@@ -120,22 +119,16 @@ def _reduced(data: dict[str, Any], variable: cp.Variable) -> tuple[Any, Array] |
 def _completed(H: Any, g: Array, at_zero: float) -> Quadratic | None:
     """Complete the square of 1/2 v'H v + g'v + at_zero; None where it has no minimum, or is too large to factor."""
     H = scipy.sparse.coo_array(H)
-    off = H.row != H.col
-    if not np.any(H.data[off]):
-        diagonal = np.bincount(H.row, H.data, minlength=len(g)) / 2
-        return _from_spectrum(diagonal, g, None, at_zero, 0.0)
-    if len(g) > DENSE:
+    diagonal = not np.any(H.data[H.row != H.col])
+    if diagonal:
+        values, slope = np.bincount(H.row, H.data, minlength=len(g)) / 2, g
+    elif len(g) > DENSE:
         return None
-    values, vectors = np.linalg.eigh(H.toarray() / 2)
-    return _from_spectrum(values, vectors.T @ g, vectors, at_zero)
-
-
-def _from_spectrum(
-    values: Array, slope: Array, vectors: Array | None, at_zero: float, rounding: float = ROUNDING
-) -> Quadratic | None:
-    """Return the quadratic sum values_i y_i^2 + slope_i y_i + at_zero in y = vectors'v."""
+    else:  # sum values_i y_i^2 + slope_i y_i + at_zero in y = vectors'v
+        values, vectors = np.linalg.eigh(H.toarray() / 2)
+        slope = vectors.T @ g
     largest = float(np.max(values, initial=0.0))
-    curved = values > rounding * largest
+    curved = values > (0.0 if diagonal else ROUNDING) * largest
     flat_slope = float(np.max(np.abs(slope[~curved]), initial=0.0))
     if largest <= 0 or np.min(values) < -ROUNDING * largest:
         return None
@@ -144,7 +137,7 @@ def _from_spectrum(
     root = np.sqrt(np.where(curved, values, 0.0))
     c = np.divide(-slope, 2 * root, out=np.zeros_like(root), where=curved)
     constant = at_zero - float(c @ c)
-    if vectors is None:
+    if diagonal:
         return Quadratic(root, c, constant)
     return Quadratic((vectors[:, curved] * root[curved]).T, c[curved], constant)
 
@@ -229,20 +222,21 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
     A, b = R[:n, :n], R[:n, n]
     T, N, start = _standard_form(penalty or identity(n), n)
     b = b - A @ start
-    Q, kept, dropped = _free_directions(A, N)
-    free = N @ kept
-    A_y, b_y = A, b
-    if T is not None:
-        A_y = A @ T
-    if free.size:
-        A_y = A_y - Q @ (Q.T @ A_y)
-        b_y = b - Q @ (Q.T @ b)
+    Q, free, null = np.zeros((n, 0)), N, N
+    if N.size:  # what the data see of the directions that L leaves free
+        U, s, Vt = np.linalg.svd(A @ N, full_matrices=True)
+        rank = int(np.count_nonzero(s > RANK_TOLERANCE * max(s[0], np.linalg.norm(A, 2))))
+        Q, free, null = U[:, :rank], N @ (Vt[:rank].T / s[:rank]), N @ Vt[rank:].T
+    b_y = b - Q @ (Q.T @ b)
     if T is None:
-        U, s, Vt = svd(A_y)
+        U, s, Vt = svd(A)
         B = Vt.T
         least = RANK_TOLERANCE * np.max(s, initial=0.0)
-    else:
-        U, s, Vt = _graded_svd(A_y)
+    else:  # whose columns may differ by many orders: with the largest first, small s keep digits
+        A_y = A @ T
+        factors: Any = qr(A_y - Q @ (Q.T @ A_y), mode="economic", pivoting=True)
+        U, s, Vt = np.linalg.svd(factors[1], full_matrices=False)
+        U, Vt = factors[0] @ U, Vt[:, np.argsort(factors[2])]
         B = T @ Vt.T
         # In z, not in y: where L hardly holds a direction y is long, and s of the others small beside its s.
         least = RANK_TOLERANCE * np.linalg.norm(A, 2) * np.linalg.norm(B, axis=0)
@@ -250,20 +244,10 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
     s = np.where((s > least) & (s > rounding), s, 0.0)
     beta = U.T @ b_y
     left = b_y - U[:, s > 0] @ beta[s > 0]
-    if free.size:
-        B = B - free @ (Q.T @ (A @ B))
-        start = start + free @ (Q.T @ b)
+    B = B - free @ (Q.T @ (A @ B))
+    start = start + free @ (Q.T @ b)
     perp = float(R[n, n] ** 2 + left @ left)
-    return Ridge(beta, s, B, start, perp, free, N @ dropped)
-
-
-def _graded_svd(A: Array) -> tuple[Array, Array, Array]:
-    """Return U, s, V' of a matrix whose columns may differ by many orders, the largest first: small s keep digits."""
-    factors: Any = qr(A, mode="economic", pivoting=True)
-    Q, R, order = factors
-    U, s, Vt = np.linalg.svd(R, full_matrices=False)
-    back = np.argsort(order)
-    return Q @ U, s, Vt[:, back]
+    return Ridge(beta, s, B, start, perp, free, null)
 
 
 def _standard_form(penalty: Quadratic, n: int) -> tuple[Array | None, Array, Array]:
@@ -280,17 +264,6 @@ def _standard_form(penalty: Quadratic, n: int) -> tuple[Array | None, Array, Arr
     rank = int(np.count_nonzero(s > RANK_TOLERANCE * np.max(s, initial=0.0)))
     T = Vt[:rank].T / s[:rank]
     return T, Vt[rank:].T, T @ (U[:, :rank].T @ penalty.c)
-
-
-def _free_directions(A: Array, N: Array) -> tuple[Array, Array, Array]:
-    """Return Q (k, f) spanning the seen part of A N, and in N's coordinates what is seen (scaled) and what is not."""
-    if not N.size:
-        return np.zeros((len(A), 0)), np.zeros((0, 0)), np.zeros((0, 0))
-    U, s, Vt = np.linalg.svd(A @ N, full_matrices=True)
-    rank = 0
-    if s.size:
-        rank = int(np.count_nonzero(s > RANK_TOLERANCE * max(s[0], np.linalg.norm(A, 2))))
-    return U[:, :rank], Vt[:rank].T / s[:rank], Vt[rank:].T
 
 
 def robot_alone(penalty: Quadratic, frames: np.ndarray) -> Quadratic:

@@ -95,19 +95,16 @@ class Canonical:
         made = cls.__new__(cls)
         made.size, made.at = n, np.arange(n)
         eye = np.eye(n)
-        rows: list[Array] = []
-        limits: list[Array] = []
-        equations: list[np.ndarray] = []
+        rows, limits, later = [np.zeros((0, n))], [np.zeros(0)], [np.zeros(0)]
         for low, high in bounds:
             fixed, below, above = box_sides(low, high)
             rows += [eye[fixed], -eye[below], eye[above]]
             limits += [low[fixed], -low[below], high[above]]
-            equations.append(np.arange(len(rows[-1]) + len(rows[-2]) + len(rows[-3])) < len(rows[-3]))
-        first = np.concatenate([np.zeros(0, dtype=bool), *equations])
-        made.order = np.argsort(~first, kind="stable")
-        made.A = np.vstack([np.zeros((0, n)), *rows])[made.order]
-        made.b = np.concatenate([np.zeros(0), *limits])[made.order]
-        made.zero, made.linear = int(first.sum()), len(made.b)
+            later += [np.zeros(fixed.sum()), np.ones(below.sum() + above.sum())]
+        made.order = np.argsort(np.concatenate(later), kind="stable")  # equations come first
+        made.A, made.b = np.vstack(rows)[made.order], np.concatenate(limits)[made.order]
+        made.linear = len(made.b)
+        made.zero = made.linear - int(np.concatenate(later).sum())
         made.row_scale, made.column_scale = np.ones(len(made.b)), np.ones(n)
         made.P, made.q, made.offset = np.zeros((n, n)), np.zeros(n), 0.0
         if penalty is not None:
@@ -170,10 +167,10 @@ class Canonical:
             P = sparse.triu(sparse.csc_array(self.P)[rest][:, rest])
             q = self.q[rest] + (sparse.csr_array(self.P) @ x)[rest]
             A = sparse.csc_array(self.A)[:, rest]
-            found = _clarabel(P, q, A, self.b - self.A @ x, self.linear_cones)
-            if found is None:
+            try:
+                x[rest] = _clarabel(P, q, A, self.b - self.A @ x, self.linear_cones).x
+            except Unsolved:
                 return float("inf")
-            x[rest] = found
         return self.value(x)
 
     def duals(self, x: Array, z: Array) -> dict[int, Array]:
@@ -208,32 +205,26 @@ def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.nd
     return fixed, np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
 
 
-def _clarabel(P: Any, q: Array, A: Any, b: Array, cones: list[Any]) -> Array | None:
-    """Return Clarabel's minimum of 1/2 x'P x + q'x subject to b - A x in cones; None where it finds none."""
+def _clarabel(P: Any, q: Array, A: Any, b: Array, cones: list[Any], attempts: Sequence[dict[str, Any]] = ()) -> Any:
+    """Return Clarabel's solution of minimize 1/2 x'P x + q'x subject to b - A x in cones; Unsolved where none is."""
     from scipy import sparse
 
-    clarabel = import_module("clarabel")
-    for attempt in ATTEMPTS:
-        settings = clarabel_settings(attempt)
-        found = clarabel.DefaultSolver(sparse.csc_matrix(P), q, sparse.csc_matrix(A), b, cones, settings).solve()
+    clarabel = import_module("clarabel")  # a compiled module, without types
+    program = sparse.csc_matrix(P), q, sparse.csc_matrix(A), b, cones
+    for attempt in attempts or ATTEMPTS:
+        settings = clarabel.DefaultSettings()
+        settings.verbose, settings.max_threads = False, 1
+        settings.presolve_enable = False
+        settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
+        settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
+        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCEPTED if attempt else SOUGHT
+        settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
+        for name, value in attempt.items():
+            setattr(settings, name, value)
+        found = clarabel.DefaultSolver(*program, settings).solve()
         if str(found.status) in SOLVED:
-            return np.array(found.x)
-    return None
-
-
-def clarabel_settings(other: dict[str, Any]) -> Any:
-    """Return Clarabel's settings, some of them other ones."""
-    settings = import_module("clarabel").DefaultSettings()
-    settings.verbose, settings.max_threads = False, 1
-    settings.presolve_enable = False
-    settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
-    settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
-    tolerance = ACCEPTED if other else SOUGHT
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
-    settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
-    for name, value in other.items():
-        setattr(settings, name, value)
-    return settings
+            return found
+    raise Unsolved(str(found.status))
 
 
 class Unsolved(RuntimeError):
@@ -366,12 +357,17 @@ class Small:
         self, squares: Squares | None, weight: float, A: Array | None, b: Array | None
     ) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
-        clarabel = import_module("clarabel")  # a compiled module, without types
-        data, p, k = self._data, self.penalty, self.rows
+        data, p, k, n = self._data, self.penalty, self.rows, len(self.penalty.at)
         if squares is None:
-            squares = Squares(np.zeros((k, len(p.at))), np.zeros(k), np.zeros(len(p.at)))
-        x0 = np.zeros(p.size)  # tolerances are relative to the size of the unknowns: those are changes of a near point
-        x0[p.at] = z0 = self._centre(squares, weight)
+            squares = Squares(np.zeros((k, n)), np.zeros(k), np.zeros(n))
+        # tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
+        # of the squares with some weight on |z|^2
+        z0 = self.near[p.at]
+        if k and not z0.any():
+            rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
+            z0 = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
+        x0 = np.zeros(p.size)
+        x0[p.at] = z0
         residual = squares.y - squares.R @ z0
         q = [weight * (p.q + p.P @ x0), np.zeros(k)]
         q[0][p.at] += squares.g
@@ -384,17 +380,7 @@ class Small:
         scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
         P, matrix = data.filled(weight, np.concatenate(dense))
         P.data *= scale  # tolerances are absolute below one
-        program = P, cost * scale, matrix, np.concatenate(bounds), data.cones
-        status = ""
-        for attempt in self.attempts:
-            found = clarabel.DefaultSolver(*program, clarabel_settings(attempt)).solve()
-            status = str(found.status)
-            if status in SOLVED:
-                break
-            if status == "DualInfeasible" and self.loss is not None:  # too few rows of the loss
-                raise Unsolved(status)
-        else:
-            raise Unsolved(status)
+        found = _clarabel(P, cost * scale, matrix, np.concatenate(bounds), data.cones, self.attempts)
         x, z, s = np.array(found.x), np.array(found.z) / scale, np.array(found.s)
         x[: p.size] += x0
         self.near = x[: p.size]
@@ -403,15 +389,6 @@ class Small:
         if self.loss is not None:
             point = replace(point, rest=x[p.size + k :], slope=data.link.T @ z[len(z) - data.link.shape[0] :])
         return point, s[own]
-
-    def _centre(self, squares: Squares, weight: float) -> Array:
-        """Return a point (n,) near the minimum: the last one, or that of the squares with some weight on |z|^2."""
-        last = self.near[self.penalty.at]
-        if not self.rows or last.any():
-            return last
-        n = len(last)
-        rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
-        return np.asarray(np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0], dtype=float)
 
 
 class _Data:
@@ -461,20 +438,18 @@ class _Data:
         self._sign = self._matrix.data[self._dense]
         self._order = np.abs(other.data[self._dense]).astype(int) - 2
         self._P = sparse.csc_matrix(sparse.block_diag(P))
-        self._curvature = (
-            self._P.data,
-            np.arange(self._P.nnz) < P[0].nnz,
-        )  # the penalty's, which comes first, is weighted
+        self._curvature = self._P.data
+        self._weighted = np.arange(self._P.nnz) < P[0].nnz  # the penalty's come first
 
     def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
         """Return P at a weight, and the matrix with the numbers of R (k, n) and A (m, n), row by row."""
         self._matrix.data[self._dense] = self._sign * numbers[self._order]
-        self._P.data = np.where(self._curvature[1], weight, 1.0) * self._curvature[0]
+        self._P.data = np.where(self._weighted, weight, 1.0) * self._curvature
         return self._P, self._matrix
 
 
-def nearest(p: Canonical, z: Array) -> Array | None:
-    """Return the point (n,) of a form's constraints that is nearest to z (n,); None where Clarabel finds none."""
+def nearest(p: Canonical, z: Array) -> Array:
+    """Return the point (n,) of a form's constraints that is nearest to z (n,); Unsolved where Clarabel finds none."""
     from scipy import sparse
 
     n, N = len(z), p.size
@@ -483,7 +458,7 @@ def nearest(p: Canonical, z: Array) -> Array | None:
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
     found = _clarabel(sparse.csc_array((N + 1, N + 1)), np.append(np.zeros(N), 1.0), A, bound, [*p.linear_cones, cone])
-    return None if found is None else found[p.at]
+    return np.array(found.x)[p.at]
 
 
 def on_face(

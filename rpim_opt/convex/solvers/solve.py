@@ -80,29 +80,22 @@ def minimum(
             point = _coupled(loss, rows, warm, weight, squares, damping)
         else:
             try:
-                point = _separable(loss, rows, warm, weight, damping, accuracy)
+                point = _by_newton(loss, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
                 point = _all_rows(loss, rows, warm, weight, None, damping)
         warm.z, warm.x = point.x[warm.penalty.at], point.x
         return point
 
 
-def _separable(
-    loss: Loss,
-    rows: Rows,
-    warm: Warm,
-    weight: float,
-    damping: Damping | None,
-    accuracy: float,
-) -> Point:
+def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
     if warm.kink < 0:
         warm.kink = kink_of(loss, rows)
     if warm.kink and loss.variable.size <= FEW:
         return _all_rows(loss, rows, warm, weight, None, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
-    known = z is not None and x is not None and len(x) == warm.penalty.size
-    if z is None or x is None or not known:
+    known = z is not None
+    if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.penalty.at]
     search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, accuracy)
