@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
@@ -320,14 +320,6 @@ class Place(NamedTuple):
     numbers: tuple[tuple[float, ...], ...]
 
 
-class _Affine(NamedTuple):
-    """E z + f (k,) [SI], and the norms of the rows of E (k, n); of `move` E is (3 k, n)."""
-
-    E: Array
-    f: Array
-    size: Array
-
-
 @dataclass(frozen=True)
 class Parsed:
     """A constraint that `parse` read from a text, at places that it names."""
@@ -371,58 +363,48 @@ class Parsed:
 
     def loosened(self, z: Any, parameters: Parameters, by: Any = None) -> list[Any]:
         """Return the CVXPY constraints with limits that are larger by a number or expression [SI]."""
-        made = self._affine(given(z, parameters))
-        size, kind = made.size, self.demanded.kind
-        by_row = np.repeat(size, 3) if kind == "move" else size
-        value = (made.E / by_row[:, None]) @ z + made.f / by_row
+        E, f, size = self._sums(given(z, parameters))
+        count, together, n = E.shape
+        E, f = E / size[:, None, None], f / size[:, None]
+        value = E.reshape(count * together, n) @ z + f.ravel()
+        kind = self.demanded.kind
         if by is None and kind == "equal":
             return [value == 0]
         limit = self.demanded.limit / size
         if by is not None:
             limit = limit + by / size
-        if kind == "move":
-            return [cp.norm(cp.reshape(value, (len(size), 3), order="C"), 2, axis=1) <= limit]
-        if kind == "norm":
-            return [cp.norm(value) <= limit]
+        if kind in ("norm", "move"):
+            return [cp.norm(cp.reshape(value, (count, together), order="C"), 2, axis=1) <= limit]
         if kind == "most":
             return [value <= limit]
         return [value <= limit, -value <= limit]
 
     def price(self, multipliers: Array, parameters: Parameters) -> float:
         """Return by how much the objective falls for every unit [1 / SI] by which all limits are loosened."""
-        size = self._affine(given(None, parameters)).size
-        share = 1 / np.tile(size, len(multipliers) // len(size))
-        return float(np.abs(multipliers) @ share)
+        size = self._sums(given(None, parameters))[2]
+        return float(np.abs(multipliers) @ (1 / np.tile(size, len(multipliers) // len(size))))
 
     def slack(self, z: Array, parameters: Parameters) -> float:
-        """Return how far z (n,) is from the limit [SI]; zero for an equality."""
-        made = self._affine(given(None, parameters))
-        value = made.E @ z + made.f
-        limit, kind = self.demanded.limit, self.demanded.kind
-        if kind == "equal":
-            return 0.0
-        if kind == "most":
+        """Return how far z (n,) is from the limit [SI]; of an equality by how much it is missed, negative."""
+        E, f, _ = self._sums(given(None, parameters))
+        value = E @ z + f
+        if self.demanded.kind == "most":
             return float(-np.max(value))
-        if kind == "within":
-            return limit - float(np.max(np.abs(value)))
-        return limit - float(np.max(np.linalg.norm(value.reshape(len(made.size), -1), axis=1)))
+        return self.demanded.limit - float(np.max(np.linalg.norm(value, axis=1)))
 
     def scale(self, parameters: Parameters) -> float:
         """Return by how much [SI] deviations of the prior scale change what is demanded."""
-        return float(np.max(self._affine(given(None, parameters)).size))
+        return float(np.max(self._sums(given(None, parameters))[2]))
 
     def names(self, parameters: Parameters) -> list[str]:
         """Return the identified parameters that it speaks of."""
-        E = self._affine(given(None, parameters)).E
-        return [name for i, name in enumerate(parameters.names) if E[:, i].any()]
+        used = self._sums(given(None, parameters))[0].any(axis=(0, 1))
+        return [name for name, own in zip(parameters.names, used, strict=True) if own]
 
     def require_near(self, parameters: Parameters) -> None:
         """Refuse a statement that the nominal robot misses by far more than the prior scales."""
-        made = self._affine(given(None, parameters))
         missed = -self.slack(np.zeros(len(parameters)), parameters)
-        if self.demanded.kind == "equal":
-            missed = float(np.max(np.abs(made.f)))
-        if missed > FAR * float(np.max(made.size)):
+        if missed > FAR * self.scale(parameters):
             unit, si = self.unit
             accepted = "one near it; 'nominal' where the nominal value is meant"
             raise self._wrong(f"a constraint that the nominal parameters violate by {missed / si:.4g} {unit}", accepted)
@@ -430,62 +412,58 @@ class Parsed:
     def _wrong(self, found: str, accepted: str) -> InputError:
         return InputError(f"constraint {self.name}", found, accepted)
 
-    def _affine(self, p: Given) -> _Affine:
-        """Return what is demanded to be small, of these parameters."""
+    def _sums(self, p: Given) -> tuple[Array, Array, Array]:
+        """Return sums E z + f [SI], (K, k, n) and (K, k), of which k together are to be small, and sizes (K,) of E."""
         if self.demanded.kind == "move":
             found = every_movement(p, self._configurations(p))
             size = np.linalg.norm(found.slope, axis=(1, 2))
-            if not size.any():
-                raise self._wrong("no identified parameter that moves the tool", "parameters of the robot")
             moving = size > 0
-            E = found.slope[moving].reshape(-1, len(p))
-            return _Affine(E, found.position[moving].ravel(), size[moving])
-        rows = [self._row(one, p) for each in self.demanded.sums for one in self._expanded(each, p)]
-        E = np.array([row for row, _ in rows])
-        size = np.linalg.norm(E, axis=1)
+            if not moving.any():
+                raise self._wrong("no identified parameter that moves the tool", "parameters of the robot")
+            return found.slope[moving], found.position[moving], size[moving]
+        rows = [row for each in self.demanded.sums for row in self._rows(each, p)]
+        E, f = np.array([[row] for row, _ in rows]), np.array([[constant] for _, constant in rows])
+        size = np.linalg.norm(E[:, 0], axis=1)
         if self.demanded.kind == "norm":
-            size = np.array([np.max(size)])
+            E, f, size = E.swapaxes(0, 1), f.T, np.array([np.max(size)])
         if not (size > 0).all():
             raise self._wrong("no identified parameter", "identified parameters: " + ", ".join(p.names[:24]))
-        return _Affine(E, np.array([constant for _, constant in rows]), size)
+        return E, f, size
 
-    def _expanded(self, found: Sum, p: Given) -> list[Sum]:
-        """Return a sum for every identified parameter that its pattern matches."""
-        names = whole(p).names
-        patterns = [name for name in found.names if name not in names]
-        if not patterns:
-            return [found]
-        matched = [names[i] for i in places(names, patterns[0], f"constraint {self.name}")]
-        if len(patterns) > 1:
-            raise self._wrong(f"patterns {' and '.join(patterns)}", "one pattern in a sum")
-        known = [name for name in matched if name in p.names]
-        if not known:
-            raise self._wrong(f"'{patterns[0]}'", "identified parameters: " + choices(patterns[0], p.names))
-        place = found.names.index(patterns[0])
-        return [replace(found, names=(*found.names[:place], name, *found.names[place + 1 :])) for name in known]
+    def _rows(self, found: Sum, p: Given) -> Iterator[tuple[Array, float]]:
+        """Yield a sum as a row (n,) and a number [SI], one for every identified parameter that its pattern matches.
 
-    def _row(self, found: Sum, p: Given) -> tuple[Array, float]:
-        """Return one sum as a row (n,) and a number [SI]; parameters that are not identified are nominal."""
-        table = whole(p)
-        index = [table.names.index(name) for name in found.names]
-        dimensions = sorted({table.dimensions[i] for i in index})
-        if len(dimensions) > 1:
-            raise self._wrong(f"a sum of {' and '.join(dimensions)}", "parameters of one dimension")
-        unit = self.demanded.unit
-        if unit and UNITS[unit].dimension != dimensions[0]:
-            raise self._wrong(f"unit {unit} for what is no {UNITS[unit].dimension}", f"a unit of {dimensions[0]}")
-        row = np.zeros(len(p))
-        constant = found.constant
-        for name, i, factor in zip(found.names, index, found.factors, strict=True):
-            if name in p.names:
-                row[p.names.index(name)] += factor * p.scale[p.names.index(name)]
-            if found.nominal:
-                continue
-            if table.of_frames[i] and table.periodic[i] and table.nominal[i] != 0:  # its deviations are rotations
-                what = f"the value of '{name}', an angle of a turned frame"
-                raise self._wrong(what, "its deviation: '= nominal +- 0.1 mrad'")
-            constant += factor * table.nominal[i]
-        return row, constant
+        Parameters that are not identified are nominal.
+        """
+        table, unit = whole(p), self.demanded.unit
+        patterns = [name for name in found.names if name not in table.names]
+        matched = [""]
+        if patterns:
+            every = [table.names[i] for i in places(table.names, patterns[0], f"constraint {self.name}")]
+            if len(patterns) > 1:
+                raise self._wrong(f"patterns {' and '.join(patterns)}", "one pattern in a sum")
+            matched = [name for name in every if name in p.names]
+            if not matched:
+                raise self._wrong(f"'{patterns[0]}'", "identified parameters: " + choices(patterns[0], p.names))
+        for instead in matched:
+            names = [instead if name in patterns else name for name in found.names]
+            index = [table.names.index(name) for name in names]
+            dimensions = sorted({table.dimensions[i] for i in index})
+            if len(dimensions) > 1:
+                raise self._wrong(f"a sum of {' and '.join(dimensions)}", "parameters of one dimension")
+            if unit and UNITS[unit].dimension != dimensions[0]:
+                raise self._wrong(f"unit {unit} for what is no {UNITS[unit].dimension}", f"a unit of {dimensions[0]}")
+            row, constant = np.zeros(len(p)), found.constant
+            for name, i, factor in zip(names, index, found.factors, strict=True):
+                if name in p.names:
+                    row[p.names.index(name)] += factor * p.scale[p.names.index(name)]
+                if found.nominal:
+                    continue
+                if table.of_frames[i] and table.periodic[i] and table.nominal[i] != 0:  # its deviations are rotations
+                    what = f"the value of '{name}', an angle of a turned frame"
+                    raise self._wrong(what, "its deviation: '= nominal +- 0.1 mrad'")
+                constant += factor * table.nominal[i]
+            yield row, constant
 
     def _configurations(self, p: Given) -> Array:
         """Return the joint values (N, dof) at which movements are bounded."""

@@ -147,28 +147,24 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
 def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
     """Return whether two expressions or constraints are the same but for paired variables, by ``id`` both ways."""
     if isinstance(one, cp.Expression | cp.Constraint):
-        return type(one) is type(other) and _same_nodes(one, other, pairs)
+        if type(one) is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
+            return False
+        if isinstance(one, cp.Variable):
+            mine, its = pairs.setdefault(id(one), id(other)), pairs.setdefault(id(other), id(one))
+            return (mine, its) == (id(other), id(one)) and alike(one.attributes, other.attributes, pairs)
+        if isinstance(one, cp.Constant):
+            return alike(_numbers(one), _numbers(other), pairs)
+        own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
+        data = [[d for d in e.get_data() or [] if not (isinstance(d, int) and d in own)] for e in (one, other)]
+        return alike(*data, pairs) and alike(one.args, other.args, pairs)
+    if isinstance(one, dict):
+        one, other = list(one.items()), list(other.items())
     if isinstance(one, list | tuple):
         same = type(one) is type(other) and len(one) == len(other)
         return same and all(alike(a, b, pairs) for a, b in zip(one, other, strict=True))
     if isinstance(one, np.ndarray):
         return np.array_equal(one, other)
     return bool(one == other)
-
-
-def _same_nodes(one: Any, other: Any, pairs: dict[int, int]) -> bool:
-    if one.shape != other.shape or len(one.args) != len(other.args):
-        return False
-    if isinstance(one, cp.Variable):
-        paired = pairs.setdefault(id(one), id(other)) == id(other) and pairs.setdefault(id(other), id(one)) == id(one)
-        return paired and alike(list(one.attributes.items()), list(other.attributes.items()), pairs)
-    if isinstance(one, cp.Constant):
-        return alike(_numbers(one), _numbers(other), pairs)
-    own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
-    data = [
-        [part for part in each.get_data() or [] if not (isinstance(part, int) and part in own)] for each in (one, other)
-    ]
-    return alike(data[0], data[1], pairs) and alike(one.args, other.args, pairs)
 
 
 def _numbers(constant: Any) -> list[Array]:
@@ -196,17 +192,15 @@ class Frozen:
                 raise InputError(self._where, f"parameter '{parameter.name()}' without a value", "one that has a value")
             self._instead.setdefault(id(parameter), cp.Constant(parameter.value))
         for variable in stated.variables():
-            if id(variable) not in self._shared | self._instead.keys():
-                self._instead[id(variable)] = self._copy(variable)
+            if id(variable) in self._shared | self._instead.keys():
+                continue
+            if variable.attributes.get("boolean") or variable.attributes.get("integer"):
+                found = f"integer variable '{variable.name()}'"
+                raise InputError(self._where, found, "continuous variables: integer programs are not convex")
+            made = cp.Variable(variable.shape, **{k: v for k, v in variable.attributes.items() if v})
+            self._instead[id(variable)] = made
+            self.own.append(made)
         return substituted(stated, self._instead)
-
-    def _copy(self, variable: cp.Variable) -> cp.Variable:
-        if variable.attributes.get("boolean") or variable.attributes.get("integer"):
-            found = f"integer variable '{variable.name()}'"
-            raise InputError(self._where, found, "continuous variables: integer programs are not convex")
-        made = cp.Variable(variable.shape, **{k: v for k, v in variable.attributes.items() if v})
-        self.own.append(made)
-        return made
 
 
 def _domain(expression: Any) -> list[Any]:
@@ -215,11 +209,6 @@ def _domain(expression: Any) -> list[Any]:
         return list(expression.args)
     own = expression.domain if not expression.args else expression._domain()
     return [*own, *(limit for arg in expression.args for limit in _domain(arg))]
-
-
-def fulfilled(limit: Any) -> bool:
-    """Whether a constraint is met exactly at the values of its variables."""
-    return not np.any(limit.violation() > 0)
 
 
 def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
@@ -251,7 +240,7 @@ class Term:
             self.variable.save_value(value)
             with np.errstate(all="ignore"):
                 found = self.expression.value
-                if not all(fulfilled(limit) for limit in self._domain):  # 1 / x is a number there, but not the atom's
+                if any(np.any(limit.violation() > 0) for limit in self._domain):  # 1 / x is a number there, no atom's
                     return float("inf")
         if found is None or not np.isfinite(found):
             return float("inf")

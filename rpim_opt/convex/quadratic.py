@@ -244,8 +244,9 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
     s = np.where((s > least) & (s > rounding), s, 0.0)
     beta = U.T @ b_y
     left = b_y - U[:, s > 0] @ beta[s > 0]
-    B = B - free @ (Q.T @ (A @ B))
-    start = start + free @ (Q.T @ b)
+    if free.size:
+        B = B - free @ (Q.T @ (A @ B))
+        start = start + free @ (Q.T @ b)
     perp = float(R[n, n] ** 2 + left @ left)
     return Ridge(beta, s, B, start, perp, free, null)
 

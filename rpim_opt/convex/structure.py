@@ -22,7 +22,6 @@ from rpim_opt.convex.expressions import (
     alike,
     called,
     cp,
-    fulfilled,
     listed,
     norms,
     reason,
@@ -411,7 +410,7 @@ class Structure:
                 return False
             own.save_value(z)
             with np.errstate(all="ignore"):
-                return all(fulfilled(limit) for limit in self.flat)
+                return not any(np.any(limit.violation() > 0) for limit in self.flat)
 
 
 def structure(formulation: Formulation, model: LinearModel) -> Structure:

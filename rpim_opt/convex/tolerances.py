@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
 
@@ -193,9 +193,8 @@ class _Reader:
         wide = self._item(self._next("+", "-")) if spread else Sum()
         self._require_end()
         for name in (*stated.names, *wide.names):
-            raise self._wrong(
-                f"'{name}' where a number should stand", f"a number with a unit: {choices(name, units())}"
-            )
+            accepted = f"a number with a unit: {choices(name, units())}"
+            raise self._wrong(f"'{name}' where a number should stand", accepted)
         if not spread:
             if equals or self.unit:
                 raise self._wrong("no standard deviation")
@@ -226,43 +225,35 @@ class _Reader:
                 raise self._wrong("no =, <= or >=")
             relations = ["="]
             sides.append(("", (Sum(nominal=1),)))  # 'd5 +- 0.1 mm'
-        made = self._related(sides, relations, tolerance)
-        for each in made.sums:
-            self._checked(each)
-        return replace(made, unit=self.unit)
-
-    def _related(
-        self, sides: list[tuple[str, tuple[Sum, ...]]], relations: list[str], tolerance: float | None
-    ) -> Sentence:
         if tolerance is not None and relations != ["="]:
             raise self._wrong("a tolerance without =", "'= 850.00 +- 0.05 mm'")
         if relations[0] == ">=":
             sides = sides[::-1]
-        if any(kind for kind, _ in sides):
-            return self._sized(sides, relations)
-        sums = [each for _, (each,) in sides]
-        if relations == ["="]:
-            difference = self._difference(*sums)
-            if not tolerance:
-                return Sentence("equal", (difference,))
-            if tolerance < 0:
+        limit = 0.0
+        kind: Kind = "most"
+        if any(opening for opening, _ in sides):  # an absolute value or norm is at most a number
+            if len(relations) > 1:
+                raise self._wrong(" and ".join(relations), "one relation after an absolute value or norm")
+            (opening, sums), (other, large) = sides
+            if relations[0] == "=" or not opening or other:
+                raise self._wrong("a constraint that is not convex", "an absolute value or norm <= a number")
+            limit = self._constant(large[0])
+            if not limit > 0:
+                raise self._wrong(f"a limit of {limit:g}", "one above zero; '=' where nothing may differ")
+            kind = "within" if opening == "|" and len(sums) == 1 else "norm"
+        else:
+            if len(set(relations)) > 1 or len(relations) > (1 if "=" in relations else 2):
+                accepted = "one relation, or a chain like '89.9 deg <= alpha2 <= 90.1 deg'"
+                raise self._wrong(" and ".join(relations), accepted)
+            sums = tuple(self._difference(*pair) for pair in pairwise(each for _, (each,) in sides))
+            if "=" in relations:
+                limit = tolerance or 0.0
+                kind = "within" if limit else "equal"
+            if limit < 0:
                 raise self._wrong("a tolerance below zero", "one above zero")
-            return Sentence("within", (difference,), tolerance)
-        if "=" in relations or len(set(relations)) > 1 or len(relations) > 2:
-            raise self._wrong(" and ".join(relations), "one relation, or a chain like '89.9 deg <= alpha2 <= 90.1 deg'")
-        return Sentence("most", tuple(self._difference(low, high) for low, high in pairwise(sums)))
-
-    def _sized(self, sides: list[tuple[str, tuple[Sum, ...]]], relations: list[str]) -> Sentence:
-        """Return the demand that an absolute value or norm is at most a number."""
-        if len(relations) > 1:
-            raise self._wrong(" and ".join(relations), "one relation after an absolute value or norm")
-        (kind, sums), (other, large) = sides
-        if relations[0] == "=" or not kind or other:
-            raise self._wrong("a constraint that is not convex", "an absolute value or norm <= a number")
-        limit = self._constant(large[0])
-        if not limit > 0:
-            raise self._wrong(f"a limit of {limit:g}", "one above zero; '=' where nothing may differ")
-        return Sentence("within" if kind == "|" and len(sums) == 1 else "norm", sums, limit)
+        for each in sums:
+            self._checked(each)
+        return Sentence(kind, sums, limit, self.unit)
 
     def _side(self) -> tuple[str, tuple[Sum, ...]]:
         """Return a sum, or with the sign of what they stand in, sums between bars or in ``norm(...)``."""
