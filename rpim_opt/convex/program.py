@@ -21,7 +21,7 @@ from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box_sides, nearest
 from rpim_opt.convex.solvers.separable import Rows
-from rpim_opt.convex.solvers.solve import INACTIVE, Warm, minimum
+from rpim_opt.convex.solvers.solve import Warm, minimum
 from rpim_opt.convex.structure import Structure, structure
 from rpim_opt.convex.trust import Trusted
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
@@ -30,8 +30,6 @@ FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
 ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
-DIFFERENCE = 1e-4
-"""Change of a solution, in scales, over which it is differentiated."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
 PROXIMAL = 1e-7
@@ -484,24 +482,6 @@ class Program(Brief):
         found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
         return [found[weight] for weight in checked.tolist()]
 
-    def derivative(self, estimate: Estimate) -> tuple[Array, Array]:
-        """Return D (n, r) and U (m, r), U'U = 1: where b moves by U e, the solution of a squared loss moves by D e."""
-        squares, n = Squares.of_factor(self.squared.triangle), self.structure.n
-        _, s, V = np.linalg.svd(squares.R)
-        seen = s > RANK_TOLERANCE * s[0]
-        s, V = s[seen], V[: len(s)][seen]
-        small, at = self._warm.program(n + 1), self.structure.canonical.at
-        here = estimate.z
-        D = np.empty((n, len(s)))
-        for j in range(len(s)):
-            y = squares.y + DIFFERENCE * (squares.R @ V[j])
-            try:
-                there = small.solve(replace(squares, y=y), estimate.weight).x[at]
-            except Unsolved:  # as if there were no constraints, and |z|^2 the penalty
-                there = here + DIFFERENCE * s[j] ** 2 / (s[j] ** 2 + estimate.weight) * V[j]
-            D[:, j] = (there - here) / (DIFFERENCE * s[j])
-        return D, self.squared.A @ (V.T / s)
-
     def tangent(self, z: Array, weight: float) -> Array | None:
         """Return orthonormal directions (n, k) along which z may move with its active constraints; None for all.
 
@@ -534,24 +514,6 @@ class Program(Brief):
         moves = V[rank:].T[p.at]
         U, values, _ = np.linalg.svd(moves, full_matrices=False)
         return U[:, values > TOUCHING]
-
-    def idle(self, weight: float) -> np.ndarray:
-        """Return the configurations (k,) whose equations do not pull at the minimum: a maximum rests on few of them.
-
-        None of a loss that is a square or a sum over rows, in which every row counts.
-        """
-        loss, rows, groups = self.structure.loss, self._rows, self.model.group
-        if loss is None or loss.separable or self.structure.joint:
-            return groups[:0]
-        try:
-            found = minimum(loss, rows, self._warm, weight, self._squares)
-        except Unsolved:
-            return groups[:0]
-        if found.slope is None or len(found.slope) < len(groups):
-            return groups[:0]
-        order, _ = self.structure.by_configuration or (np.arange(len(groups)), None)
-        pulls = np.abs(found.slope) > INACTIVE * np.abs(found.slope).max()
-        return np.setdiff1d(groups, groups[order[pulls]])
 
     def _weight(self, weight: float) -> float:
         """Return the weight, checked; zero where there is no penalty for it to multiply."""

@@ -90,11 +90,10 @@ def tail(r: Any) -> Any:
 @pytest.mark.parametrize(
     "formulation", [ro.minimax, ro.Formulation("tail", loss=tail, penalty=cp.sum_squares)], ids=lambda f: f.name
 )
-def test_what_rests_on_few_configurations_is_solved_without_these_alone(formulation: ro.Formulation) -> None:
+def test_what_rests_on_few_configurations_is_solved_without_each(formulation: ro.Formulation) -> None:
     problem = ro.load("position").problem
     model = problem.linearize(np.zeros(len(problem.parameters.free)))
     program = ro.convex.pose(formulation, model)
-    assert 0 < len(program.idle(10.0)) < 40
     expected = []
     for k in range(40):
         out = model.group == k

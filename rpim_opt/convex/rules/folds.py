@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.convex.program import Estimate, Program
+from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.curve import l_curve
 from rpim_opt.convex.rules.scores import influence, linear_rule
 from rpim_opt.convex.rules.selection import (
@@ -24,12 +23,8 @@ from rpim_opt.convex.rules.selection import (
     with_rows,
 )
 
-SOME = 6
-"""Configurations that are left out by solving, to see how exact the approximation is."""
-EXACTLY = 60
-"""Configurations up to which a program with cones is solved without each of them."""
-INEXACT = 0.05
-"""Relative error of the approximation from which a choice says how to do without it."""
+PARTS = 100
+"""Configurations up to which each is left out alone, where each takes solving; of more, so many parts are left out."""
 AHEAD = 5
 """Weights that are solved at once, where each takes solving."""
 COARSE = 12
@@ -38,8 +33,6 @@ DROPPED = 1e-13
 """Pivots below this belong to what nothing else decides."""
 MEMORY = 500_000_000
 """Bytes of equations that are kept for all folds together; of more, a fold is made when it is asked for."""
-SAME = 1e-7
-"""Relative difference of objectives that is the solver's."""
 MANY = 1_000_000
 """Residuals that are in memory together, of many weights."""
 
@@ -49,11 +42,8 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     """Choose by leaving every configuration out once and predicting it, all its equations together.
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
-    With constraints or another penalty the same with H = A dz/db, the derivative of the solution (approximate
-    leave-one-out; Wang et al. 2018); some configurations are left out by solving, too, and the note says how exact it
-    is. With cones and few configurations, and of a loss that is no sum over rows (minimax), all are solved.
-
-    ``exact``: all are solved anyway. InputError for a single configuration, or a formulation without penalty.
+    With constraints, another penalty or loss the program is solved without each; of more than 100 configurations
+    without each of 100 parts, unless ``exact``. InputError for a single configuration, or without penalty.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.leave_one_out)
@@ -66,21 +56,7 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     if program.closed_form and not mixed:
         note = "smallest error of configurations left out one by one"
         return linear_rule(program, "leave_one_out", _of_squares, note)
-    if exact:
-        return _least(program, "leave_one_out", _error_of_folds(program, None))
-    chosen = _least(program, "leave_one_out", _left_out_error(program))
-    if not chosen.interior or not _approximates(program):
-        return chosen
-    # how exact the approximation is, for some configurations from the best predicted to the worst
-    configurations, weight = np.unique(program.model.group), np.array([chosen.weight])
-    norms = _approximately(program)(weight)[0]
-    some = np.argsort(norms)[np.linspace(0, len(norms) - 1, min(SOME, len(norms))).astype(int)]
-    there = Folds(program, [configurations[[k]] for k in some]).norms(weight)[0]
-    off = float(np.linalg.norm(norms[some] - there) / max(np.linalg.norm(there), np.finfo(float).tiny))
-    how = f"left out one by one, approximately ({100 * off:.2g} % off in {len(some)} that were solved)"
-    if off > INEXACT:
-        how += "; exact=True solves all"
-    return replace(chosen, note=chosen.note.replace("held out", how))
+    return _least(program, "leave_one_out", _error_of_folds(program, None if exact else _singly(program)))
 
 
 @on_squares
@@ -106,10 +82,7 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
         return _least(program, "k_fold", _error_of_folds(program, present))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
-    place = np.unique(program.model.group, return_index=True)[1]
-    groups = groups[np.argsort(place)]  # by their rows: numbers depend on where the rows stand
-    parts = np.array_split(np.random.default_rng(seed).permutation(groups), folds)
-    return _least(program, "k_fold", _error_of_folds(program, parts))
+    return _least(program, "k_fold", _error_of_folds(program, _drawn(program, folds, seed)))
 
 
 @on_squares
@@ -143,7 +116,10 @@ def two_step(program: Program) -> Selection:
             level = float(coarse[np.argmax(flat)])
             break
     fine = level * np.linspace(0.563 / 3.063, 5.063 / 3.063, 10)
-    score = _left_out_error(program)(fine)
+    if program.closed_form and program.squared is program.model:
+        score = np.sqrt(_of_squares(program)(fine) / len(program.model.b))
+    else:
+        score = _error_of_folds(program, _singly(program))(fine)
     best = int(np.nanargmin(score))
     failed = np.isnan(score)
     interior = 0 < best < len(fine) - 1
@@ -182,15 +158,16 @@ def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray]
     return _error_of_folds(program, parts)(weights)
 
 
-def _left_out_error(program: Program) -> Score:
-    """Return what gives `held_out_error` of configurations left out one by one, with little solving."""
-    if program.closed_form and program.squared is program.model:
-        squares = _of_squares(program)
-        return lambda weights: np.sqrt(squares(weights) / len(program.model.b))
-    if _approximates(program):
-        predicted = _approximately(program)
-        return lambda weights: _error(program, predicted(weights))
-    return _error_of_folds(program, None)
+def _drawn(program: Program, count: int, seed: int = 0) -> list[np.ndarray]:
+    """Return the configurations in so many parts, at random."""
+    groups, place = np.unique(program.model.group, return_index=True)
+    groups = groups[np.argsort(place)]  # by their rows: numbers depend on where the rows stand
+    return np.array_split(np.random.default_rng(seed).permutation(groups), count)
+
+
+def _singly(program: Program) -> list[np.ndarray] | None:
+    """Return None for every configuration alone, or parts of too many."""
+    return _drawn(program, PARTS) if len(np.unique(program.model.group)) > PARTS else None
 
 
 def _error_of_folds(program: Program, parts: Sequence[np.ndarray] | None) -> Score:
@@ -207,18 +184,6 @@ def _error(program: Program, norms: Array) -> Array:
     if program.loss_form is None:
         return np.median(norms, axis=1)
     return np.sqrt(np.sum(norms**2, axis=1) / len(program.model.b))
-
-
-def by_size(group: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Return places of rows (G, k) and configurations (G,), those of k equations together; ``group`` is (m,)."""
-    which, count = np.unique(group, return_inverse=True, return_counts=True)[1:]
-    order = np.argsort(which, kind="stable")
-    first = np.cumsum(count) - count
-    found = []
-    for size in np.unique(count):
-        configurations = np.flatnonzero(count == size)
-        found.append((order[first[configurations][:, None] + np.arange(size)], configurations))
-    return found
 
 
 def _solved(M: Array, v: Array) -> Array:
@@ -249,8 +214,11 @@ def _of_squares(program: Program) -> Score:
     Q, s2, target = influence(program.squared, program.ridge)
     projected = Q.T @ target
     parts = []
-    for places, _ in by_size(program.squared.group):
-        each, k = Q[places], places.shape[1]
+    _, which, count = np.unique(program.squared.group, return_inverse=True, return_counts=True)
+    order, first = np.argsort(which, kind="stable"), np.cumsum(count) - count
+    for k in np.unique(count).tolist():  # configurations of k equations together
+        places = order[first[count == k][:, None] + np.arange(k)]
+        each = Q[places]
         parts.append((places, {(i, j): each[:, i] * each[:, j] for i in range(k) for j in range(i, k)}))
 
     def some(weights: Array) -> Array:
@@ -269,34 +237,6 @@ def _of_squares(program: Program) -> Score:
 
     few = max(1, MANY // len(target))
     return lambda weights: np.concatenate([some(weights[k : k + few]) for k in range(0, len(weights), few)])
-
-
-def _approximates(program: Program) -> bool:
-    """Whether the derivative of the solution serves: cones bend its path, and few configurations are all solved."""
-    if program.loss_form is None or not program.loss_form.diagonal or program.closed_form:
-        return False
-    return program.structure.canonical.polyhedral or len(np.unique(program.model.group)) > EXACTLY
-
-
-def _approximately(program: Program) -> Score:
-    """Return what gives norms (K, N) of left-out configurations' residuals, by the derivative of the solution."""
-    model = program.squared
-    rows = by_size(model.group)
-
-    def norms(estimate: Estimate) -> Array:
-        D, U = program.derivative(estimate)
-        r = model.A @ estimate.z - model.b
-        found = np.zeros(count)
-        for places, configurations in rows:
-            A = model.A[places]
-            hat = np.einsum("gin,nr,gjr->ijg", A, D, U[places], optimize=True)
-            M = np.eye(places.shape[1])[:, :, None] - (hat + hat.transpose(1, 0, 2)) / 2
-            found[configurations] = np.linalg.norm(_solved(M, r[places.T]), axis=0)
-        return found
-
-    count = sum(len(configurations) for _, configurations in rows)
-    nothing = np.full(count, np.nan)
-    return lambda weights: np.array([norms(each) if each else nothing for each in solved(program, weights)])
 
 
 class Folds:
@@ -323,24 +263,14 @@ class Folds:
 
         They are NaN at a weight at which the solver fails.
         """
-        whole, model = self._whole, self._whole.model
-        idle = [whole.idle(weight) for weight in weights]
-        of_all = solved(whole, weights) if any(map(len, idle)) else []
+        model = self._whole.model
         found = []
         for k, out in enumerate(self._rows):
             program = self._kept[k] if self._kept else self._without(out)
-            left_out = model.group[out]
-            same: dict[float, Array] = {}
-            for there, at_rest in zip(of_all, idle, strict=False):
-                if there is None or not np.isin(left_out, at_rest).all():
-                    continue
-                if program.objective(there.z, there.weight) <= there.objective * (1 + SAME):  # zero residuals cost none
-                    same[there.weight] = there.z
-            others = solved(program, [weight for weight in weights if weight not in same])
-            same |= {each.weight: each.z for each in others if each}
-            Z = np.array([same.get(weight, np.full(model.A.shape[1], np.nan)) for weight in weights])
+            nothing = np.full(model.A.shape[1], np.nan)
+            Z = np.array([each.z if each else nothing for each in solved(program, weights)])
             squares = (Z @ model.A[out].T - model.b[out]) ** 2
-            _, which = np.unique(left_out, return_inverse=True)
+            _, which = np.unique(model.group[out], return_inverse=True)
             sums = np.zeros((which.max() + 1, len(weights)))
             np.add.at(sums, which, squares.T)
             found.append(np.sqrt(sums.T))

@@ -277,13 +277,12 @@ class Squares:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A minimum x (N,) of the penalty's form, multipliers of its rows (m,), unknowns and slopes of the exact loss."""
+    """A minimum x (N,) of the penalty's form, multipliers of its rows (m,), and the unknowns of the exact loss."""
 
     x: Array
     dual: Array
     iterations: int = 0
     rest: Array | None = None
-    slope: Array | None = None
 
 
 class Small:
@@ -387,7 +386,7 @@ class Small:
         own = slice(k, k + len(p.b))
         point = Point(x[: p.size], z[own], int(found.iterations))
         if self.loss is not None:
-            point = replace(point, rest=x[p.size + k :], slope=data.link.T @ z[len(z) - data.link.shape[0] :])
+            point = replace(point, rest=x[p.size + k :])
         return point, s[own]
 
 

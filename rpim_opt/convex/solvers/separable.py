@@ -101,18 +101,13 @@ class Rows:
         """Return what the loss gets of a residual (m,): itself, or the norms of the configurations (N,)."""
         return r if self.sizes is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
-    def places(self, which: np.ndarray) -> np.ndarray:
-        """Return the places of the equations of some entries."""
-        if self.sizes is None:
-            return which
-        places = [np.arange(int(self.sizes[i])) + self.starts[i] for i in which]
-        return np.concatenate([np.zeros(0, dtype=int), *places])
-
     def alone(self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int) -> tuple[Small, Array, Array]:
         """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
         expression, own = loss.some(which)
         sizes = None if self.sizes is None else self.sizes[which]
-        places = self.places(which)
+        places = which
+        if self.sizes is not None:
+            places = np.concatenate([np.arange(int(self.sizes[i])) + self.starts[i] for i in which])
         return Small(penalty, squares, Canonical(expression, [], own), sizes), self.A[places], self.b[places]
 
 

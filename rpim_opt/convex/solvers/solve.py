@@ -169,10 +169,8 @@ def _coupled(
         bound = part.value(point.rest) + float(slope @ r) + float(tangent.constant[outside].sum())
         there = Tangent(loss, rows, r)
         if there.value - bound <= GAP * max(abs(bound), 1.0):
-            pull = np.zeros(len(r))
-            pull[rows.places(working)] = point.slope
             warm.count = len(working) // 2
-            return replace(point, slope=pull + slope)
+            return point
         other = np.flatnonzero(np.abs(there.pull - tangent.pull) > INACTIVE * np.abs(there.pull).max())
         more = np.union1d(working, np.union1d(other, there.near[: 4 * n]))
         if len(more) == len(working):
