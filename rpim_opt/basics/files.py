@@ -172,7 +172,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
     or pipe gets the bytes as they are. Nothing is put in its place before the bytes of all are on the disk; when one
     cannot be, those before it, and folders that were made, are taken back.
     """
-    streams = {path: data for path, data in contents.items() if _is_stream(path)}
+    streams = [path for path in contents if path.exists() and not (path.is_file() or path.is_dir())]
     with undoing() as folders, ExitStack() as stack, undoing() as renames:
         made: dict[Path, Path] = {}
         for path in contents:
@@ -199,8 +199,8 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
             file.replace(place)
             if len(contents) > 1:
                 renames.callback(old.replace, place) if known else renames.callback(place.unlink)
-        for path, data in streams.items():
-            path.write_bytes(data)
+        for path in streams:
+            path.write_bytes(contents[path])
 
 
 @contextmanager
@@ -223,15 +223,6 @@ def make_folder(folder: Path, steps: ExitStack) -> None:
 def _remove_empty(folder: Path) -> None:
     with suppress(OSError):
         folder.rmdir()
-
-
-def _is_stream(path: Path) -> bool:
-    """Return whether something is there that cannot be replaced: a pipe, a device."""
-    try:
-        mode = path.stat().st_mode
-    except OSError:
-        return False
-    return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
 
 
 def _keep_mode(handle: int, place: Path) -> None:

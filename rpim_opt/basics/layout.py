@@ -303,19 +303,15 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
     lines = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, lines))
-    units = _units_below(lines, width, grid.blanks)
-    names, groups = _grouped([[*line, *[""] * (width - len(line))] for line in lines[: -1 if units else None]])
-    return [Head(*parts) for parts in zip(names, groups, units or [""] * width, strict=True)], above
-
-
-def _units_below(lines: Sequence[Sequence[str]], width: int, blanks: bool) -> list[str]:
-    """Return the units in the last line of a header, one a column; none where it has names."""
+    units = [""] * width
     bare = [cell.strip("[]()") for cell in lines[-1]]
-    if len(lines) < 2 or not any(bare) or any(cell.lower() not in UNIT_SIGNS for cell in filter(None, bare)):
-        return []
-    signs = ["" if cell in ("-", "1") else cell for cell in bare]
-    lacking = [""] * (width - len(signs))
-    return lacking + signs if blanks else signs + lacking  # a blank cell of the label cannot be seen
+    if len(lines) > 1 and any(bare) and all(cell.lower() in UNIT_SIGNS for cell in filter(None, bare)):
+        signs = ["" if cell in ("-", "1") else cell for cell in bare]
+        lacking = [""] * (width - len(signs))
+        units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
+        lines = lines[:-1]
+    names, groups = _grouped([[*line, *[""] * (width - len(line))] for line in lines])
+    return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
 
 
 def _grouped(lines: Sequence[Sequence[str]]) -> tuple[list[str], list[str]]:
@@ -372,7 +368,16 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
 
 def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOptions) -> tuple[list[Column], str]:
     """Return the columns, those of numbers with decimal points, and the decimal mark that they had."""
-    _require_width(rows, len(heads), options)
+    width = len(heads)
+    for number, row in enumerate(rows, start=1):  # blank cells at the end may be missing or too many
+        while len(row) > width and not row[-1]:
+            row.pop()
+        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
+        if len(row) != width and not lacks_remark:
+            what = "--columns" if options.columns else "the header"
+            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
+            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
+        row += [""] * (width - len(row))
     columns: dict[str, Column] = {}
     for j, head in enumerate(heads):
         cells = [row[j] for row in rows]
@@ -388,22 +393,11 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOpt
         columns[name] = Column(name, head, cells)
     numeric = {name: column.cells for name, column in columns.items() if _is_numeric(column.cells)}
     mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), options.decimal)
+    grouping = "," if mark == "." else "."
     for name, cells in numeric.items():
-        columns[name] = columns[name]._replace(cells=[_as_python(cell, mark) for cell in cells])
+        cells = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
+        columns[name] = columns[name]._replace(cells=cells)
     return list(columns.values()), mark
-
-
-def _require_width(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
-    """Refuse rows that are longer than the header; blank cells at the end may be missing or too many."""
-    for number, row in enumerate(rows, start=1):
-        while len(row) > width and not row[-1]:
-            row.pop()
-        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
-        if len(row) != width and not lacks_remark:
-            what = "--columns" if options.columns else "the header"
-            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
-            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
-        row += [""] * (width - len(row))
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
@@ -448,13 +442,6 @@ def _mark(cell: str) -> str:
     if cell.count(mark) > 1:  # 1.234.567
         return other
     return "?" if mark == "," and GROUPED.fullmatch(cell) else mark
-
-
-def _as_python(cell: str, mark: str) -> str:
-    """Return a numeral as Python writes it; other texts stay."""
-    if not is_numeral(cell):
-        return cell
-    return cell.replace("," if mark == "." else ".", "").replace(mark, ".")
 
 
 def _unit_of(cells: Sequence[str]) -> str:
@@ -514,7 +501,11 @@ def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
             whole.append(each._replace(cells=[own.pop() for own in cells]))
         elif _is_numeric(list(map(str, each.cells))):
             values.append(each)
-    value = _measured(values)
+    measured = [each for each in values if VALUE.search(each.name)] or values
+    if len(measured) != 1:
+        found = f"a row a coordinate, with values {', '.join(each.name for each in measured) or 'nowhere'}"
+        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
+    value = measured[0]
     for letter in "xyz":
         head = Head(letter, "", value.head.unit or split(value.name)[1])
         cells = [str(value.cells[rows[letter]]) if letter in rows else "" for rows in points]
@@ -532,12 +523,3 @@ def _points(letters: Sequence[str], keys: Sequence[Column]) -> list[dict[str, in
         if "" not in points and len(set(rows)) == len(rows) > 2 * len(points):
             return list(points.values())
     return []
-
-
-def _measured(values: Sequence[Column]) -> Column:
-    """Return the one of several columns of numbers that holds what was measured."""
-    measured = [each for each in values if VALUE.search(each.name)] or values
-    if len(measured) != 1:
-        found = f"a row a coordinate, with values {', '.join(each.name for each in measured) or 'nowhere'}"
-        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    return measured[0]

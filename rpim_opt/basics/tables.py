@@ -75,30 +75,26 @@ class Grid(NamedTuple):
 
 def read_columns(source: Any) -> Columns:
     """Return the columns of a file (.csv in UTF-8 with commas, .parquet, .xlsx), a data frame or a mapping."""
-    columns = _file(Path(source)) if isinstance(source, str | Path) else _frame(source)
+    if isinstance(source, str | Path):
+        path = Path(source)
+        readers = {".csv": _csv, ".parquet": _parquet, ".xlsx": lambda file: _rectangle(_excel(file, "").rows)}
+        kind = path.suffix.lower()
+        if kind not in readers:
+            raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(readers), path)
+        require_file(path, LARGEST_DATA, list(readers))
+        columns = readers[kind](path)
+    else:
+        names = list(getattr(source, "column_names", getattr(source, "columns", source)))
+        for name in names:
+            if not isinstance(name, str):
+                raise InputError("the header", f"column {name!r}", "texts as names, every one once")
+        _require_names(names)
+        columns = {name.strip(): source[name] for name in names}
     if not columns:
         raise InputError("the table", "an empty table", "at least one row")
     if not len(next(iter(columns.values()))):
         raise InputError("the table", "a header and no rows", "at least one row")
     return columns
-
-
-def _file(path: Path) -> Columns:
-    readers = {".csv": _csv, ".parquet": _parquet, ".xlsx": lambda file: _rectangle(_excel(file, "").rows)}
-    kind = path.suffix.lower()
-    if kind not in readers:
-        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(readers), path)
-    require_file(path, LARGEST_DATA, list(readers))
-    return readers[kind](path)
-
-
-def _frame(source: Any) -> Columns:
-    names = list(getattr(source, "column_names", getattr(source, "columns", source)))
-    for name in names:
-        if not isinstance(name, str):
-            raise InputError("the header", f"column {name!r}", "texts as names, every one once")
-    _require_names(names)
-    return {name.strip(): source[name] for name in names}
 
 
 def _csv(path: Path) -> Columns:

@@ -22,7 +22,6 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.noise import Scatter
 from rpim_opt.problem.problem import identifiable
-from rpim_opt.robot.chain import Described
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
@@ -292,7 +291,14 @@ def read_problem(
     observations = _observations(table, kinds, path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
-    arm = _arm(table, path, bool(chains))
+    file = find_robot(table.robot, path.parent)
+    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or chains):
+        what = "chain" if chains else "urdf_base, urdf_tip"
+        raise InputError(f"key {what}", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
+    arm = read_arm(file, table.urdf_base, table.urdf_tip, origins=bool(chains))
+    turned = numeric_frame(arm.base)[:3, :3]
+    gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
+    arm = replace(arm, robot=replace(arm.robot, gravity=gravity))
     if table.terms and model is None:
         model = KinematicModel([own_object(term, Term, "key terms", path) for term in table.terms])
     if model is not None:
@@ -304,6 +310,12 @@ def read_problem(
     base = None
     if table.base != "auto":
         base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
+    if not table.tool:
+        tools = {"": tuple(arm.tool)}
+    elif any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
+        tools = {"": _frame(table.tool, "tool", path)}
+    else:
+        tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
     return ProblemFile(
         path=path,
         table=table,
@@ -311,7 +323,7 @@ def read_problem(
         robot=arm.robot,
         kinds=kinds,
         observations=observations,
-        tools=_tools(table, arm, path),
+        tools=tools,
         base=base,
         chains=chains,
         board=_board(table, path),
@@ -333,15 +345,6 @@ def _observations(table: ProblemTable, kinds: Mapping[str, Measurement], path: P
         if each.validation:  # an empty one is how a variant has none
             inside(path.parent, each.validation, "key validation", path)
     return tuple(observations)
-
-
-def _tools(table: ProblemTable, arm: Described, path: Path) -> dict[str, tuple[float, ...]]:
-    """Return where the reflectors start, by marker."""
-    if not table.tool:
-        return {"": tuple(arm.tool)}
-    if any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
-        return {"": _frame(table.tool, "tool", path)}
-    return {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
 
 
 def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
@@ -385,17 +388,6 @@ def _board(table: ProblemTable, path: Path) -> Board | None:
         return grid_board(pattern.columns, pattern.rows, pattern.spacing)
     except InputError as error:
         raise InputError("key target", error.found, error.accepted, path) from None
-
-
-def _arm(table: ProblemTable, path: Path, origins: bool) -> Described:
-    file = find_robot(table.robot, path.parent)
-    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or origins):
-        what = "chain" if origins else "urdf_base, urdf_tip"
-        raise InputError(f"key {what}", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
-    arm = read_arm(file, table.urdf_base, table.urdf_tip, origins=origins)
-    turned = numeric_frame(arm.base)[:3, :3]
-    gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
-    return replace(arm, robot=replace(arm.robot, gravity=gravity))
 
 
 def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:

@@ -47,6 +47,8 @@ from rpim_opt.store.serialize import digest, plain, structured
 FORMAT = "rpim-opt result"
 VERSION = 3
 Models = Model | Mapping[str, Model]
+SHARED = ("weight", "selection", "converged", "message", "history", "certificate", "learned", "mapping")
+"""What a calibration and its file hold under the same name."""
 RELATIVE = 1e-4
 """Standard deviations of hardly identifiable directions differ by that much from one processor to another."""
 ABSOLUTE = 1e-6
@@ -136,16 +138,35 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     path = _result_path(path)
     stored = read_json(path)
     try:
-        _require_format(stored)
+        if not isinstance(stored, dict) or stored.get("format") != FORMAT:
+            raise InputError(
+                "the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()"
+            )
+        written, known = stored.get("version"), stored.get("digest")
+        if written != VERSION:
+            accepted = f"{VERSION}; the rpim-opt that wrote it reads others"
+            raise InputError("key version", repr(written)[:40], accepted)
+        if not isinstance(known, str):
+            found = repr(stored.get("digest", "nothing"))[:40].strip("'")
+            raise InputError("key digest", found, "the digest of the rest")
+        if known != digest(stored):
+            found = f"'{known[:12]}...' for a content of '{digest(stored)[:12]}...'"
+            raise InputError("key digest", found, "the file as it was written: something in it was changed")
         file = structured(stored, Stored)
-        known = {**READY, **{m.name: m for m in measurements}}
+        ready = {**READY, **{m.name: m for m in measurements}}
         kinds = {str(block.measurement) for part in file.data.values() for block in part.blocks}
-        for kind in filter(is_own, kinds - set(known)):
-            known[kind] = replace(own_object(kind, Measurement, "key data", path), name=kind)
+        for kind in filter(is_own, kinds - set(ready)):
+            ready[kind] = replace(own_object(kind, Measurement, "key data", path), name=kind)
         if model is None:
             model = Model([own_object(term, Term, "key record.terms", path) for term in file.record.terms])
-        result = _calibration(file, known, model)
-        _require_agreement(file.rows, result)
+        result = _calibration(file, ready, model)
+        for name, rows in _rows(result).items():
+            for before, now in zip(file.rows.get(name, ()), rows, strict=True):
+                if not all(_agree(a, b) for a, b in zip(before, now, strict=True)):
+                    accepted = (
+                        f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
+                    )
+                    raise InputError(f"key rows.{name}, row {before.label}", f"{before.identified_mm} mm", accepted)
         result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
     except InputError as error:
         raise error.within(path) from None
@@ -266,16 +287,11 @@ def content(result: Calibration) -> dict[str, Any]:
     stated = definition(result.formulation)
     solvable = formulation_of("", stated).solvable
     stored = Stored(
+        **{name: getattr(result, name) for name in SHARED},
         formulation=result.formulation.name,
         definition=stated,
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
-        weight=result.weight,
-        selection=result.selection,
-        converged=result.converged,
-        message=result.message,
-        history=result.history,
         x=result.x,
-        certificate=result.certificate,
         trust=None if solvable else _trust(result),
         held=result.held,
         prices=result.prices,
@@ -286,11 +302,9 @@ def content(result: Calibration) -> dict[str, Any]:
         model=result.problem.parameters,
         data=_sets(result),
         scatter=result.problem.scatter,
-        learned=result.learned,
         record=result.record,
         causes=result.causes,
         rows=_rows(result),
-        mapping=result.mapping,
     )
     parts = {
         "format": FORMAT,
@@ -438,21 +452,6 @@ def _function(stated: str | list[Any] | None, name: str) -> Any:
 # --- reading -----------------------------------------------------------------------------------------------------
 
 
-def _require_format(stored: Any) -> None:
-    """Refuse what another program or version wrote, and what was changed since."""
-    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-        raise InputError("the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()")
-    if stored.get("version") != VERSION:
-        found = repr(stored.get("version"))[:40]
-        raise InputError("key version", found, f"{VERSION}; the rpim-opt that wrote it reads others")
-    if not isinstance(stored.get("digest"), str):
-        raise InputError("key digest", repr(stored.get("digest", "nothing"))[:40].strip("'"), "the digest of the rest")
-    found = digest(stored)
-    if stored["digest"] != found:
-        accepted = "the file as it was written: something in it was changed"
-        raise InputError("key digest", f"'{stored['digest'][:12]}...' for a content of '{found[:12]}...'", accepted)
-
-
 def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models) -> Calibration:
     robots = {name: _robot(name, file, models) for name in file.robots}
     data = {name: _with_measurements(part, known, f"key data.{name}") for name, part in file.data.items()}
@@ -475,18 +474,11 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         problem,
         formulation,
         file.x,
-        weight=file.weight,
-        selection=file.selection,
-        converged=file.converged,
-        message=file.message,
-        history=file.history,
+        **{name: getattr(file, name) for name in SHARED},
         program=program,
-        certificate=file.certificate,
         asked=mapped_as(file.mapping, partial(calibrate, formulation=formulation, weight=weight, model=extensions)),
         record=replace(file.record, validation=validation, digest=file.digest),
         kept=None if formulation.solvable else _kept(file, program),
-        learned=file.learned,
-        mapping=file.mapping,
         known_causes=file.causes,
     )
 
@@ -538,15 +530,6 @@ def _kept(file: Stored, program: Program) -> Kept:
     factor = file.trust.factor**2
     equations = kept_equations(program.model, keep, factor)
     return Kept(file.held, equations, factor, tuple(file.trust.left_out), file.prices)
-
-
-def _require_agreement(stated: Mapping[str, Sequence[RowErrors]], result: Calibration) -> None:
-    """Refuse a script's terms or measurement models with which rows have other errors than the file states."""
-    for name, rows in _rows(result).items():
-        for before, now in zip(stated.get(name, ()), rows, strict=True):
-            if not all(_agree(a, b) for a, b in zip(before, now, strict=True)):
-                accepted = f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
-                raise InputError(f"key rows.{name}, row {before.label}", f"{before.identified_mm} mm", accepted)
 
 
 def _agree(stated: str | float | None, found: str | float | None) -> bool:

@@ -120,7 +120,11 @@ def compare(
     ways = {split.label: split for split in splits_of(splits)}
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
-    numbered = _seeds(seeds)
+    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
+        if seeds > MOST_DRAWS:
+            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
+        seeds = range(max(int(seeds), 0))
+    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
@@ -130,9 +134,16 @@ def compare(
 
     made = provenance()
     cases = list(_cases(product(sources.values(), ways.values(), sizes, factors), numbered, compared.values()))
-    stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
     path = None if journal is None else Path(journal)
-    code = {} if path is None else _journal_code(path, stated)
+    code: dict[str, str] = {}
+    if path is not None:
+        require_package("joblib", "journal")
+        from rpim_opt.study.content_hash import content_hash
+
+        stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
+        code = package_code() | {f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}
+        with refused(path):
+            path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:
         rows = run_cases(cases, work, workers, scheduler, say, path, code, resume)
     axes = {
@@ -168,26 +179,6 @@ def _cases(grid: Iterable[Any], seeds: Sequence[int], methods: Iterable[Method])
                 "noise_factor": factor,
                 "seed": seed,
             }
-
-
-def _journal_code(path: Path, stated: Mapping[str, Any]) -> dict[str, str]:
-    """Return digests of all that replicates follow from, and make the journal's folder."""
-    require_package("joblib", "journal")
-    from rpim_opt.study.content_hash import content_hash
-
-    code = {**package_code(), **{f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}}
-    with refused(path):
-        path.parent.mkdir(parents=True, exist_ok=True)
-    return code
-
-
-def _seeds(stated: Any) -> list[int]:
-    """Return which seeds there are, of a number of them or of several."""
-    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
-        if stated > MOST_DRAWS:
-            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
-        stated = range(max(int(stated), 0))
-    return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:

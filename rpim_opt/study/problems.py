@@ -72,7 +72,13 @@ def _sources(problems: Any, label: str = "") -> Iterator[Source]:
         for name, problem in problems.items():
             yield from _sources(problem, str(name))
     elif isinstance(problems, str | Path):
-        for path in [problems] if label else _folders(problems):
+        place = Path(problems)
+        paths: list[str | Path] = [problems]
+        if not label and place.is_dir() and not (place / "problem.toml").is_file():
+            paths = [each.parent for each in sorted(place.glob("*/problem.toml"))]
+        if not paths:
+            raise InputError("problems", f"no problem.toml in '{place}' or a folder in it", ACCEPTED)
+        for path in paths:
             place = Path(path)
             name = place.parent.name if place.name == "problem.toml" else place.name
             yield Source(label or name or str(path), load(path))
@@ -87,17 +93,6 @@ def _sources(problems: Any, label: str = "") -> Iterator[Source]:
         yield Source(label or getattr(problems, "__name__", type(problems).__name__), problems)
     else:
         raise InputError("problems", f"a {type(problems).__name__}", ACCEPTED)
-
-
-def _folders(path: str | Path) -> list[str | Path]:
-    """Return the folder or name of a problem, or the folders of problems in a folder."""
-    place = Path(path)
-    if not place.is_dir() or (place / "problem.toml").is_file():
-        return [path]
-    inside = sorted(each.parent for each in place.glob("*/problem.toml"))
-    if not inside:
-        raise InputError("problems", f"no problem.toml in '{place}' or a folder in it", ACCEPTED)
-    return list(inside)
 
 
 def _instance(given: Any, label: str) -> Instance | None:

@@ -224,7 +224,15 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     """
     if not ratios:
         return None, None, None
-    groups = [_independent(label, ratios, drawn) for label in dict.fromkeys(pair[0] for pair in ratios)]
+    groups = []  # of every problem the means of what is independent: seeds, or folds where seeds are few
+    for label in dict.fromkeys(pair[0] for pair in ratios):
+        own = {pair: ratio for pair, ratio in ratios.items() if pair[0] == label}
+        by_seed = label in drawn or len({pair[-1] for pair in own}) >= ENOUGH
+        parts: dict[Pair, list[float]] = {}
+        for pair, ratio in own.items():
+            part = (pair[-1],) if by_seed else (pair[-1], *pair[1:3])
+            parts.setdefault(part, []).append(ratio)
+        groups.append(np.array([float(np.mean(each)) for each in parts.values()]))
     means = np.array([each.mean() for each in groups])
     middle = float(np.exp(means.mean()))
     rng = np.random.default_rng(0)
@@ -240,17 +248,6 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     beyond = ndtr(np.sqrt(count / (count - 1)) * stdtrit(count - 1, (1 - CONFIDENCE) / 2))
     low, high = np.quantile(drawn_means, [beyond, 1 - beyond])
     return middle, float(np.exp(low)), float(np.exp(high))
-
-
-def _independent(label: str, ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> Array:
-    """Return the means (parts,) of what is independent in a problem: seeds, or folds where seeds are few."""
-    own = {pair: ratio for pair, ratio in ratios.items() if pair[0] == label}
-    by_seed = label in drawn or len({pair[-1] for pair in own}) >= ENOUGH
-    parts: dict[Pair, list[float]] = {}
-    for pair, ratio in own.items():
-        part = (pair[-1],) if by_seed else (pair[-1], *pair[1:3])
-        parts.setdefault(part, []).append(ratio)
-    return np.array([float(np.mean(each)) for each in parts.values()])
 
 
 def profiles(rows: Rows, metric: str) -> dict[str, Array]:
@@ -293,19 +290,14 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     if late:
         said.append(f"{late} replicates did not converge; their figures count (column status).")
     every = Counter(row["method"] for row in rows)
-    for (method, status, reason), missing in without_figures(rows).items():
+    without: dict[tuple[str, str, str], list[str]] = {}
+    for row in rows:
+        if row["status"] not in WITH_FIGURES:
+            without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
+    for (method, status, reason), missing in without.items():
         where = ""
         if len(missing) < every[method]:
             where = f" ({listed(list(dict.fromkeys(missing)), 4)})"
         count = f"{len(missing)} of {every[method]} replicates{where}"
         said.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
     return tuple(said)
-
-
-def without_figures(rows: Rows) -> dict[tuple[str, str, str], list[str]]:
-    """Return the problems of replicates without figures, by method, status and reason."""
-    of: dict[tuple[str, str, str], list[str]] = {}
-    for row in rows:
-        if row["status"] not in WITH_FIGURES:
-            of.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
-    return of

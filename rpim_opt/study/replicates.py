@@ -51,8 +51,17 @@ def run_cases(
     """
     keyed = [(json.dumps(case, sort_keys=True), case) for case in cases]
     code = code or {}
-    with _opened(journal, resume) as base:
+    if journal is not None and (journal.exists() or journal.is_symlink()):
+        if resume is False:
+            remove_journal(journal)
+        else:
+            require_file(journal, LARGEST_DATA)
+    with _sentence(journal):
+        base = sqlite3.connect(journal or ":memory:", isolation_level=None)
+    with closing(base):
         with _sentence(journal):
+            base.execute("PRAGMA trusted_schema = OFF")
+            base.executescript(SCHEMA)
             stored = _resumed(base, journal, code, resume)
         done = {key: stored[key] for key, _ in keyed if key in stored}
         progress(len(done), len(cases))
@@ -64,22 +73,6 @@ def run_cases(
             done[key] = found
             progress(len(done), len(cases))
     return [{**case, **done[key]} for key, case in keyed]
-
-
-@contextmanager
-def _opened(path: Path | None, resume: bool | None) -> Iterator[sqlite3.Connection]:
-    if path is not None and (path.exists() or path.is_symlink()):
-        if resume is False:
-            remove_journal(path)
-        else:
-            require_file(path, LARGEST_DATA)
-    with _sentence(path):
-        base = sqlite3.connect(path or ":memory:", isolation_level=None)
-    with closing(base):
-        with _sentence(path):
-            base.execute("PRAGMA trusted_schema = OFF")
-            base.executescript(SCHEMA)
-        yield base
 
 
 def _resumed(

@@ -248,6 +248,9 @@ def run_study(
     """
     path = find_study(name)
     require_package("pyarrow", "the study")
+    import pyarrow
+    from pyarrow import parquet
+
     study = load_study(path)
     folder = out or path.parent / "results" / _label(path, quick)
     with refused(folder):
@@ -266,25 +269,17 @@ def run_study(
     journal = folder / f"{REPLICATES}.sqlite"
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, scheduler, progress, journal, code, resume)
     report = study.report(rows)
-    write(folder, study.QUESTION, report, made, replicate_file(rows, made))
+    columns = list(dict.fromkeys(key for row in rows for key in row))
+    table = pyarrow.table({key: [row.get(key) for row in rows] for key in columns})
+    stream = io.BytesIO()
+    parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
+    write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})
     remove_journal(journal)
     return report, folder
 
 
 def _run(path: Path, case: Mapping[str, Any]) -> Row:
     return load_study(path).run(**case)
-
-
-def replicate_file(rows: list[Row], made: str) -> dict[str, bytes]:
-    """Return the replicates as a Parquet file, with what made them, by its name."""
-    import pyarrow as pa
-    from pyarrow import parquet
-
-    columns = list(dict.fromkeys(key for row in rows for key in row))
-    table = pa.table({key: [row.get(key) for row in rows] for key in columns})
-    stream = io.BytesIO()
-    parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
-    return {f"{REPLICATES}.parquet": stream.getvalue()}
 
 
 def read_replicates(folder: Path) -> tuple[list[Row], str]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -150,7 +149,14 @@ class Monitoring:
             since = self._named(self._since(self.alarm))
             lines.append(f"Cumulative sum above its limit: alarm at {self._named(self.alarm)}, since {since}.")
         if self.drift is not None:
-            lines.append(self._explained(self.drift))
+            cause, first = self.drift.cause, self.drift.first
+            course = f"at once before {self._named(first)}" if first else "before the first check"
+            if self.drift.steady:
+                course = "steadily from the first to the last check"
+            lines.append(
+                f"Best explained by {cause.kind} {self.drift.moved or cause.name}, {course}: chi-squared falls by "
+                f"{cause.gain:.1f}, p-value {cause.p_value:.2g}."
+            )
         elif self.drifts:
             lines.append("No parameter and no frame explains it alone.")
         if self.drifts and self.mistake:
@@ -167,16 +173,6 @@ class Monitoring:
         """Return the first check that led to an alarm: after the last sum that was zero."""
         zeros = np.flatnonzero(self.sums[: alarm + 1] == 0)
         return int(zeros[-1]) + 1 if len(zeros) else 0
-
-    def _explained(self, drift: Drift) -> str:
-        cause = drift.cause
-        course = f"at once before {self._named(drift.first)}" if drift.first else "before the first check"
-        if drift.steady:
-            course = "steadily from the first to the last check"
-        return (
-            f"Best explained by {cause.kind} {drift.moved or cause.name}, {course}: chi-squared falls by "
-            f"{cause.gain:.1f}, p-value {cause.p_value:.2g}."
-        )
 
     def _named(self, i: int) -> str:
         return f"{self.label[i]} ({self.times[i]})" if self.times else f"'{self.label[i]}'"
@@ -330,22 +326,17 @@ def cusum_limit(count: int, level: float) -> float:
     low, high = 0.0, HIGHEST_LIMIT
     while high - low > 1e-3:
         middle = (low + high) / 2
-        if _exceeding(middle, count) > level:
+        width = middle / CELLS
+        centre = width * (np.arange(CELLS) + 0.5)
+        # from sum i the next is in cell j where u - ALLOWANCE is within half a cell of their difference; zero is a cell
+        states = np.concatenate([[0.0], centre])
+        upper = ndtr(np.concatenate([[0.0], centre + width / 2])[None, :] - states[:, None] + ALLOWANCE)
+        step = np.diff(upper, axis=1, prepend=0.0)
+        if 1.0 - np.linalg.matrix_power(step, count)[0].sum() > level:
             low = middle
         else:
             high = middle
     return high
-
-
-def _exceeding(h: float, count: int) -> float:
-    """Return the probability that one of so many sums exceeds h > 0."""
-    width = h / CELLS
-    centre = width * (np.arange(CELLS) + 0.5)
-    # from sum i the next is in cell j where u - ALLOWANCE is within half a cell of their difference; zero is a cell
-    states = np.concatenate([[0.0], centre])
-    upper = ndtr(np.concatenate([[0.0], centre + width / 2])[None, :] - states[:, None] + ALLOWANCE)
-    step = np.diff(upper, axis=1, prepend=0.0)
-    return float(1.0 - np.linalg.matrix_power(step, count)[0].sum())
 
 
 # --- every parameter ---------------------------------------------------------------------------------------
@@ -359,27 +350,24 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     # rows of one configuration were read together: the first of them says when
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
-    tried = list(_changes(Misfit(result, model, form), problem, when))
-    best = min(tried, key=lambda drift: (drift.cause.p_value, -drift.cause.gain))
-    return best if best.cause.p_value * len(tried) < level else None
-
-
-def _changes(misfit: Misfit, problem: CalibrationProblem, when: np.ndarray) -> Iterator[Drift]:
-    """Yield all changes with their evidence: of every cause at every moment, and steadily."""
+    misfit = Misfit(result, model, form)
     count = len(problem.data)
     moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int))
     courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
     if count > 2:
         courses.append((0, True, when / (count - 1)))
     free = problem.parameters.free
+    tried = []
     for cause in candidates(free):
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])
-        for first, steady, course in courses:
+        for start, steady, course in courses:
             # parameters that move while readings are taken, by a part of the whole change
             g, G = misfit.projected(slice(misfit.m), misfit.A[:, index] * course[:, None])
             moved = None
             if len(g) == 1 and G[0, 0] > 0:
                 std = scale / np.sqrt(G[0, 0])
                 moved = Moved(cause.name, free.dimensions[index[0]], float(scale * g[0] / G[0, 0]), float(std))
-            yield Drift(misfit.evidence(cause, g, G), first, steady, moved)
+            tried.append(Drift(misfit.evidence(cause, g, G), start, steady, moved))
+    best = min(tried, key=lambda drift: (drift.cause.p_value, -drift.cause.gain))
+    return best if best.cause.p_value * len(tried) < level else None

@@ -265,28 +265,35 @@ def update(
             released += cause.members
         updated = _recalibrated(result, problem, released, prior_inflation, updated.x)
         causes, after = _weighed(result, updated, released)
+    robots = " and ".join(robot.name for robot in result.problem.arms.values())
     if not after.likely:
-        _require_this_robot(result, updated, data)
+        # another unit or order explains them, or they are further off than the robot ever was uncalibrated
+        refuse_misread(result, data)
+        furthest = float(np.nanmax(result.nominal_errors()))
+        missed = float(np.sqrt(np.nanmean(updated.errors(data) ** 2)))
+        if missed > STRANGE * furthest:
+            accepted = f"those of the same robot ({robots}) in the same units and instrument's frame, or --reset "
+            accepted += "with what moved (base_*)"
+            found = f"readings {1e3 * missed:.3g} mm off, whatever is released"
+            raise InputError("the new measurements", found, accepted)
     known = set(result.problem.parameters.free.names)
     moved = tuple(_moved(result, updated, name) for name in released if name in known)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
-    record = _record(result, prior_inflation, released, left_out)
+    old = result.record
+    last = Earlier(
+        old.title or robots,
+        old.made,
+        old.digest or content(result)["digest"],
+        len(result.problem.labels),
+        {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
+        prior_inflation,
+        released,
+        left_out,
+    )
+    excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
+    earlier = (*old.earlier, last)
+    record = Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier, terms=old.terms)
     return Update(replace(updated, record=record), before, after, tuple(changes), first, moved, len(data))
-
-
-def _require_this_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
-    """Refuse readings that another unit or order explains, or further off than the robot ever was uncalibrated."""
-    refuse_misread(result, data)
-    before = float(np.nanmax(result.nominal_errors()))
-    missed = float(np.sqrt(np.nanmean(updated.errors(data) ** 2)))
-    if missed > STRANGE * before:
-        robots = " and ".join(robot.name for robot in result.problem.arms.values())
-        raise InputError(
-            "the new measurements",
-            f"readings {1e3 * missed:.3g} mm off, whatever is released",
-            f"those of the same robot ({robots}) in the same units and instrument's frame, or --reset "
-            "with what moved (base_*)",
-        )
 
 
 def _moved(result: Calibration, updated: Calibration, name: str) -> Moved:
@@ -296,24 +303,6 @@ def _moved(result: Calibration, updated: Calibration, name: str) -> Moved:
     nominal = result.problem.parameters.free.nominal[i]
     change = free.nominal[i] + updated.x[i] - nominal - result.x[i]
     return Moved(name, free.dimensions[i], float(change), float(std))
-
-
-def _record(result: Calibration, inflation: float, released: Sequence[str], left_out: Sequence[str]) -> Record:
-    """Return the provenance of the new result: the previous one, by its digest, and those before it."""
-    old = result.record
-    last = Earlier(
-        old.title or " and ".join(robot.name for robot in result.problem.arms.values()),
-        old.made,
-        old.digest or content(result)["digest"],
-        len(result.problem.labels),
-        {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
-        inflation,
-        tuple(released),
-        tuple(left_out),
-    )
-    excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
-    earlier = (*old.earlier, last)
-    return Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier, terms=old.terms)
 
 
 # --- the previous result as a prior ------------------------------------------------------------------------
