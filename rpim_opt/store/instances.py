@@ -177,7 +177,12 @@ def load(
     data, files, tools = _read_tables(stated)
     validation = data.get("validation")
     try:
-        problem = _problem(stated, data["identification"], tools)
+        rows = data["identification"]
+        temperature = None if table.celsius is None else table.celsius + UNITS["degC"].zero
+        fixtures = place_fixtures(stated.placed, rows)
+        parameters = starting_parameters(stated.robot, rows, stated.base, tools, fixtures, temperature)
+        problem = CalibrationProblem(stated.robot, stated.chosen(parameters, rows), rows)
+        problem = problem.scattered(stated_scatter(table, path))
         if validation is not None:
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(stated, problem)
@@ -193,11 +198,17 @@ def load(
     for key, pair in table.reference.items():
         if len(pair) != 2:
             raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
+    robot = find_robot(table.robot, path.parent)
+    used = {path.name: path, robot.name: robot}
+    named = [file for names in files.values() for file in names]
+    if isinstance(table.target, str):
+        named.append(table.target)
+    used |= {file: path.parent / file for file in named} | table.prior.files(path)
     record = Record(
         title=table.title,
         source=table.source,
         validation=validation,
-        files=_hashes(stated, files),
+        files={name: sha256_of(file) for name, file in used.items()},
         excluded=table.exclude,
         simulated=bool(table.simulation),
         details=details,
@@ -277,16 +288,6 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 """
 
 
-def _problem(stated: ProblemFile, data: Dataset, tools: Tools) -> CalibrationProblem:
-    fixtures = place_fixtures(stated.placed, data)
-    temperature = None
-    if stated.table.celsius is not None:
-        temperature = stated.table.celsius + UNITS["degC"].zero
-    parameters = starting_parameters(stated.robot, data, stated.base, tools, fixtures, temperature)
-    problem = CalibrationProblem(stated.robot, stated.chosen(parameters, data), data)
-    return problem.scattered(stated_scatter(stated.table, stated.path))
-
-
 def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
     formulation = named_formulation(stated.table.formulation, stated.path)
@@ -304,18 +305,6 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
         if isinstance(constraint, Parsed):
             constraint.require_near(parameters)
     return formulation
-
-
-def _hashes(stated: ProblemFile, files: Files) -> dict[str, str]:
-    folder = stated.path.parent
-    robot = find_robot(stated.table.robot, folder)
-    used = {stated.path.name: stated.path, robot.name: robot}
-    if isinstance(stated.table.target, str):
-        used[stated.table.target] = folder / stated.table.target
-    for names in files.values():
-        used |= {file: folder / file for file in names}
-    used |= stated.table.prior.files(stated.path)
-    return {name: sha256_of(file) for name, file in used.items()}
 
 
 # --- the tables of a folder, without the excluded rows -----------------------------------------------------------

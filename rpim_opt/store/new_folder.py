@@ -249,25 +249,23 @@ def _kind(
 
 def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
     """Return whether the camera is on the flange or beside the robot, by what its poses fit, and how that was found."""
-    misfit = {name: _misfit(arm, columns, kind) for name, kind in CAMERAS.items()}
+    misfit = {}  # RMS [m] of the views' poses where base and tool fit best
+    for name, kind in CAMERAS.items():
+        data = read_data(columns, arm.robot, {"pixel_px": 1.0}, kind)
+        poses = posed(data, starting_cameras(data, {}))
+        tools = {block.markers[0]: np.zeros(6) for block in poses.blocks}
+        base, places, _ = locate(arm.robot, poses, tools)
+        squares = []
+        for block in poses.blocks:
+            tool = numeric_frame(places[block.markers[0]])
+            T = numeric_frame(base) @ forward_kinematics(arm.robot, block.q[:, 0]) @ tool
+            squares += np.sum((T[:, :3, 3] - block.y[:, :3]) ** 2, axis=1).tolist()
+        misfit[name] = float(np.sqrt(np.mean(squares)))
     best, other = sorted(misfit, key=lambda name: misfit[name])
     said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CAMERA_CLEARLY * misfit[best]:
         raise InputError("the camera", f"no clear mounting ({best} leaves {said})", f"--measurement {best} or {other}")
     return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {said}"
-
-
-def _misfit(arm: Described, columns: Columns, kind: Measurement) -> float:
-    """Return by how much poses of the views are off (RMS) where base and tool fit best [m]."""
-    data = read_data(columns, arm.robot, {"pixel_px": 1.0}, kind)
-    poses = posed(data, starting_cameras(data, {}))
-    tools = {block.markers[0]: np.zeros(6) for block in poses.blocks}
-    base, places, _ = locate(arm.robot, poses, tools)
-    squares = []
-    for block in poses.blocks:
-        T = numeric_frame(base) @ forward_kinematics(arm.robot, block.q[:, 0]) @ numeric_frame(places[block.markers[0]])
-        squares += np.sum((T[:, :3, 3] - block.y[:, :3]) ** 2, axis=1).tolist()
-    return float(np.sqrt(np.mean(squares)))
 
 
 # --- the text of problem.toml -------------------------------------------------------------------------------------
@@ -284,6 +282,11 @@ def _problem_text(
     base, how = _base(arm, rows, tools, kind)
     parameters = starting_parameters(arm.robot, rows, base, tools)
     names = list(identifiable("auto", arm.robot, parameters, rows))
+    lenses = starting_cameras(rows, {})
+    cameras = []
+    for fixture in sorted({block.fixture for block in camera_blocks(rows)}):
+        values = {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in ("fx", "fy", "cx", "cy")}
+        cameras.append((_subtable(fixture), "\n".join(f"{name}_px = {value:.1f}" for name, value in values.items())))
     touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
@@ -298,7 +301,7 @@ def _problem_text(
         known="where the file has its tip" if arm.tool.any() else "not known, and identified from the flange's origin",
         markers=[_subtable(marker) for marker in markers],
         tool=_frame(arm.tool),
-        cameras=_cameras(rows),
+        cameras=cameras,
         touched=toml(list(dict.fromkeys(touched))[:2]) if kind.touching else "",
         sessions=rows.sessions,
         temperatures=len(rows.temperatures),
@@ -306,16 +309,6 @@ def _problem_text(
         words=kind.words,
     )
     return text, how
-
-
-def _cameras(rows: Dataset) -> list[tuple[str, str]]:
-    """Return the names of the cameras' tables, and what their views show of each."""
-    found = starting_cameras(rows, {})
-    cameras = []
-    for fixture in sorted({block.fixture for block in camera_blocks(rows)}):
-        values = {name: found[of_fixture(f"camera_{name}", fixture)] for name in ("fx", "fy", "cx", "cy")}
-        cameras.append((_subtable(fixture), "\n".join(f"{name}_px = {value:.1f}" for name, value in values.items())))
-    return cameras
 
 
 def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:

@@ -69,7 +69,12 @@ def stated_prior(
     for key in ("inflate", "without"):
         if key in table.model_fields_set and not table.earlier:
             raise InputError(f"key prior.{key}", "no key from beside it", "from = 'other/result.json'", path)
-    offsets = {key: value for key, value in scale.items() if _is_literal(split_unit(key)[0], parameters)}
+    offsets = {}
+    for key, value in scale.items():
+        stem = split_unit(key)[0]
+        matches = [name for name in parameters.names if fits(name, stem)]
+        if stem == JOINT_OFFSET or stem in parameters.names or (matches and all(map(is_joint_offset, matches))):
+            offsets[key] = value
     try:
         prior = Prior(
             centre=table.centre,
@@ -108,10 +113,3 @@ def stated_prior(
             raise InputError(f"key prior.{key}", error.found, error.accepted, path) from None
     prior.stated(parameters)
     return prior
-
-
-def _is_literal(stem: str, parameters: Parameters) -> bool:
-    if stem == JOINT_OFFSET or stem in parameters.names:
-        return True
-    matches = [name for name in parameters.names if fits(name, stem)]
-    return bool(matches) and all(map(is_joint_offset, matches))

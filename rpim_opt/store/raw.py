@@ -216,10 +216,15 @@ def understand_of(
     """Return what raw tables of an arm say, files or data frames, as `understand_tables` does; or tables of targets."""
     options = options or TableOptions()
     files = [each for source in data for each in _sheets(source, options)]
-    known = measurement if isinstance(measurement, Measurement) else _known_type(files, measurement)
+    columns = [raw.columns for _, raw in files]
+    if measurement is None:
+        known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
+    else:
+        known = pick(MEASUREMENTS, measurement, "measurement") if isinstance(measurement, str) else measurement
     for kind in [known] if known else (pose, position):
         tables = _tables(files, arm, kind, options, targets)
-        if known or _has_all_values(tables, kind):
+        stems = set().union(*(each.stems for each in tables))
+        if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
             found = _whole(files, arm, kind, options, tables)
             doubt = next((each.doubt for each in tables if each.doubt), "")
             return _checked(found, files, arm, doubt) if doubt and kind.turning and not targets else found
@@ -227,19 +232,6 @@ def understand_of(
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
-
-
-def _known_type(files: Files, measurement: str | None) -> Measurement | None:
-    """Return the measurement type that is stated, or that columns show; None for poses or positions."""
-    if measurement is not None:
-        return pick(MEASUREMENTS, measurement, "measurement")
-    columns = [raw.columns for _, raw in files]
-    return next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
-
-
-def _has_all_values(tables: Sequence[Understood], kind: Measurement) -> bool:
-    stems = set().union(*(each.stems for each in tables))
-    return any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms)))
 
 
 def _sheets(source: Any, options: TableOptions) -> Files:

@@ -91,7 +91,11 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     if not np.isfinite(stated.robot.limits).all():
         raise InputError("key limits", "a joint without limits", "limits for every joint", stated.path)
     _require_tables(stated)
-    fixtures = [_fixtures(stated, stated.kinds[each.measurement]) for each in stated.observations]
+    fixtures: list[tuple[str, ...]] = []
+    for each in stated.observations:
+        places = [stated.placed.get(name.partition("_")[0], {}) for name in stated.kinds[each.measurement].parameters]
+        nested = [key for table in places for key, value in table.items() if isinstance(value, dict)]
+        fixtures.append(tuple(dict.fromkeys(nested)) or ("",))  # one without a name is the only one
     parameters = _parameters(stated, fixtures)
     x = _deviations(parameters, plan, rng, stated.path)
     tables: dict[str, Columns] = {}
@@ -150,13 +154,6 @@ def _require_tables(stated: ProblemFile) -> None:
 
 
 # --- what is simulated -------------------------------------------------------------------------------------------
-
-
-def _fixtures(stated: ProblemFile, kind: Measurement) -> tuple[str, ...]:
-    """Return the fixtures of a measurement type; one without a name is the only one."""
-    tables = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
-    nested = [key for table in tables for key, value in table.items() if isinstance(value, dict)]
-    return tuple(dict.fromkeys(nested)) or ("",)
 
 
 def _parameters(stated: ProblemFile, fixtures: Sequence[tuple[str, ...]]) -> Parameters:
@@ -378,19 +375,18 @@ class _Table:
         if bool(points) == bool(planes):
             raise InputError("table simulation", "points_mm and planes", "one of them, for either table")
         if planes:
-            return "plane", {name: self._on(square, each) for name, square in planes.items()}
+            things = {}
+            for name, square in planes.items():
+                normal = _vector(square.normal)
+                normal = normal / np.sqrt(np.sum(normal**2))
+                axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
+                first = axis - normal * np.sum(axis * normal)
+                first = first / np.sqrt(np.sum(first**2))
+                second = np.cross(normal, first)
+                places = square.size * (self.rng.uniform(size=(each, 2)) - 0.5)  # uniform on the square
+                things[name] = _vector(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
+            return "plane", things
         return "point", {name: np.tile(_vector(place) / 1e3, (each, 1)) for name, place in points.items()}
-
-    def _on(self, square: PlaneTable, count: int) -> Array:
-        """Return points (count, 3) [m] of a square, uniform."""
-        normal = _vector(square.normal)
-        normal = normal / np.sqrt(np.sum(normal**2))
-        axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
-        first = axis - normal * np.sum(axis * normal)
-        first = first / np.sqrt(np.sum(first**2))
-        second = np.cross(normal, first)
-        places = square.size * (self.rng.uniform(size=(count, 2)) - 0.5)
-        return _vector(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
 
 
 def _vector(values: Sequence[float]) -> Array:

@@ -249,7 +249,7 @@ class Comparison:
     ('rms_mm', 'tikhonov, learned', ('tikhonov, learned', 'tikhonov, reml'), ('arms',))
     >>> best = found.summary().standings[0]
     >>> best.method, len(found.to_frame()), len(found.plot("max_mm").axes)
-    ('tikhonov, learned', 10, 2)
+    ('tikhonov, learned', 10, 1)
     >>> page = found.report("arms_compared")
     >>> page.name, sorted(path.name for path in page.parent.iterdir())
     ('index.html', ['comparison.png', 'comparison.svg', 'index.html', 'replicates.csv'])
@@ -289,7 +289,7 @@ class Comparison:
         return summarize(self.rows, metric or self.metric, self.reference(metric, against), self.drawn)
 
     def plot(self, metric: str | None = None, against: str | None = None) -> Any:
-        """Return a matplotlib figure: every method's errors over the reference's, in pairs, and performance profiles.
+        """Return a matplotlib figure: every method's errors over the reference's, in pairs.
 
         Arguments and errors as for `summary`.
         """

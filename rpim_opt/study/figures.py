@@ -16,16 +16,12 @@ from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarForm
 from rpim_opt.basics.files import refused, write_files
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.report.page import HEIGHT, Block, Table, figure, render
-from rpim_opt.study.ranking import Rows, Summary, figures, number, profiles
+from rpim_opt.study.ranking import Rows, Summary, figures, number
 
 ROW_INCHES = 0.25
 """Height of a method."""
 LARGEST_RATIO = 30.0
 """Ratios beyond are drawn at the edge, with an arrow."""
-NAMED_PROFILES = 6
-"""Methods with a profile of their own; the others are grey."""
-LARGEST_PROFILE_RATIO = 10.0
-"""End of the axis of the profiles; less where all that are named are done before."""
 SHADES = (1.02, 1.1, 1.3, 2.0, 5.0)
 """Ratios to the best of a problem between which a cell's shade changes."""
 
@@ -68,12 +64,10 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
 
 
 def comparison_figure(rows: Rows, summary: Summary) -> Any:
-    """Return the figure: methods from best to worst, and what share of replicates each is near the best of."""
+    """Return the figure: methods from best to worst, with every replicate's ratio to the reference."""
     height = max(ROW_INCHES * len(summary.standings) + 1.5, 3.5)
-    figure = Figure(figsize=(11, height), dpi=150, layout="constrained")
-    left, right = figure.subplots(1, 2, width_ratios=(1.5, 1))
-    _ratios(rows, summary, left)
-    _profiles(rows, summary, right)
+    figure = Figure(figsize=(7, height), dpi=150, layout="constrained")
+    _ratios(rows, summary, figure.add_subplot())
     return figure
 
 
@@ -105,44 +99,6 @@ def _ratios(rows: Rows, summary: Summary, ax: Any) -> None:
     ax.set_xscale("log")
     ax.set_xlabel(f"{summary.metric} over that of {summary.reference}, same replicate")
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
-    _round_ticks(ax)
-
-
-def _inside(ratios: Any) -> Any:
-    return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
-
-
-def _profiles(rows: Rows, summary: Summary, ax: Any) -> None:
-    """Draw what share of replicates is within a ratio of the best method's figure."""
-    of = profiles(rows, summary.metric)
-    # by the area below the logarithm of the ratio
-    area = {name: np.mean(np.maximum(np.log(LARGEST_PROFILE_RATIO) - np.log(of[name]), 0)) for name in of}
-    ranked = sorted(of, key=lambda name: area[name], reverse=True)
-    named = ranked[:NAMED_PROFILES]
-    for name in reversed(ranked):
-        style: dict[str, Any] = {"color": "0.85", "lw": 0.8}
-        if name in named:
-            style = {"color": f"C{named.index(name)}", "lw": 1.6, "label": name}
-        finite = of[name][np.isfinite(of[name])]
-        share = np.arange(len(finite) + 1) / len(of[name])
-        ax.step([1.0, *finite, LARGEST_PROFILE_RATIO], [*share, share[-1]], where="post", **style)
-    reached = np.concatenate([of[name][np.isfinite(of[name])] for name in named])
-    ax.set_xscale("log")
-    ax.set_xlim(1, float(np.clip(1.1 * reached.max(initial=1.0), 1.2, LARGEST_PROFILE_RATIO)))
-    ax.set_ylim(0, 1.02)
-    ax.set_xlabel("ratio to the best method of the replicate")
-    ax.set_ylabel("share of replicates within that ratio")
-    lines, labels = ax.get_legend_handles_labels()
-    ax.legend(lines[::-1], labels[::-1], frameon=False, fontsize=8, loc="lower right")
-    title = "performance profiles"
-    if len(ranked) > len(named):
-        title += f" (the best {NAMED_PROFILES}; grey: {len(ranked) - len(named)} others)"
-    ax.set_title(title, fontsize=9)
-    _round_ticks(ax)
-
-
-def _round_ticks(ax: Any) -> None:
-    """Mark ratios by numbers that people say."""
     ax.grid(axis="x", alpha=0.25)
     low, high = ax.get_xlim()
     subs: Any = [k / 10 for k in range(10, 100)]
@@ -156,15 +112,15 @@ def _round_ticks(ax: Any) -> None:
     ax.xaxis.set_minor_formatter(NullFormatter())
 
 
+def _inside(ratios: Any) -> Any:
+    return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
+
+
 # --- the page --------------------------------------------------------------------------------------------------------
 
 RATIOS = (
     "Every replicate's figure over the reference's on the same data, and the geometric mean with its interval (green "
     "or red where that leaves 1 out)."
-)
-PROFILES = (
-    "The share of replicates on which a method is within a ratio of the best one; a method without a figure counts as "
-    "never."
 )
 
 
@@ -191,10 +147,7 @@ def _html(rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Map
     where = ", ".join(problems) if len(problems) <= 3 else f"{len(problems)} problems"
     heading = f"{len({row['method'] for row in rows})} methods on {where}"
     height = max(18.0 * len(summary.standings) + 90, HEIGHT)
-    drawn = [
-        figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height),
-        figure(partial(_profiles, rows, summary), "Performance profiles", PROFILES, height),
-    ]
+    drawn = [figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height)]
     title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
     ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes)]
     sections: list[tuple[str, list[Block]]] = [

@@ -250,23 +250,6 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     return middle, float(np.exp(low)), float(np.exp(high))
 
 
-def profiles(rows: Rows, metric: str) -> dict[str, Array]:
-    """Return every method's figures over the best one of the same replicate, sorted, (N,); infinite without figure.
-
-    At ratio tau, the share of these below tau is the performance profile (Dolan and Moré, Mathematical Programming 91,
-    2002).
-    """
-    of = figures(rows, metric)
-    best: dict[Pair, float] = {}
-    for own in of.values():
-        for pair, value in own.items():
-            best[pair] = min(value, best.get(pair, np.inf))
-    return {
-        method: np.sort([np.exp(_log_ratio(own[pair], best[pair])) if pair in own else np.inf for pair in best])
-        for method, own in of.items()
-    }
-
-
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> tuple[str, ...]:
     """Return what a reader must know besides the table."""
     said = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]

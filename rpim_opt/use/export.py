@@ -193,7 +193,17 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     """
     if result.learned is None or not result.learned.added:
         return result, []
-    alone = replace(_without_extensions(result, result.learned.added), record=result.record)
+    form = result.program.penalty_form
+    if not result.record.earlier or form is None:
+        alone = calibrate(result.stated, result.formulation)
+    else:  # beside the prior of earlier results with that prior's rows, extensions at zero
+        free = np.array(result.problem.parameters.free.names)
+        kept = ~np.isin(free, result.learned.added)
+        none = [0.0] * int(kept.sum())
+        penalty = prior_penalty(None, none, none, form.matrix[:, kept], form.c, None)
+        problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[kept]))
+        alone = calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
+    alone = replace(alone, record=result.record)
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
@@ -202,19 +212,6 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
     )
     return alone, [said]
-
-
-def _without_extensions(result: Calibration, added: Sequence[str]) -> Calibration:
-    """Calibrate the geometry; beside a prior of earlier results with that prior's rows, extensions at zero."""
-    form = result.program.penalty_form
-    if not result.record.earlier or form is None:
-        return calibrate(result.stated, result.formulation)
-    free = np.array(result.problem.parameters.free.names)
-    kept = ~np.isin(free, added)
-    none = [0.0] * int(kept.sum())
-    penalty = prior_penalty(None, none, none, form.matrix[:, kept], form.c, None)
-    problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[kept]))
-    return calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:

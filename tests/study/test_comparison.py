@@ -413,16 +413,6 @@ def test_few_problems_say_that_intervals_are_of_these() -> None:
     assert all(each.low is None for each in once.summary().standings)
 
 
-def test_a_profile_counts_what_failed_as_never_near() -> None:
-    from rpim_opt.study.ranking import profiles
-
-    rows = rows_of({"a": {"p": 1.0, "q": 4.0}, "b": {"p": 2.0, "q": 2.0}, "c": {"p": 3.0, "q": None}})
-    of = profiles(rows, "rms_mm")
-    np.testing.assert_allclose(of["a"], [1.0, 2.0])
-    np.testing.assert_allclose(of["b"], [1.0, 2.0])
-    np.testing.assert_allclose(of["c"], [3.0, np.inf])
-
-
 @pytest.mark.slow
 def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
     nasty = "<script>alert(1)</script>"

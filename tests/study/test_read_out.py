@@ -103,12 +103,7 @@ def test_ratios_beyond_the_figure_are_arrows_at_its_edge() -> None:
     assert arrows == [[("<", pytest.approx(1 / 30)), (">", pytest.approx(30))], []]
 
 
-def test_of_many_methods_the_best_have_a_profile_of_their_own() -> None:
-    found = compared({f"m{k}": even(1.0 + 0.1 * k) for k in range(9)})
-    axes = found.plot().axes[1]
-    assert axes.get_title() == "performance profiles (the best 6; grey: 3 others)"
-    few = compared({f"m{k}": even(1.0 + 0.1 * k) for k in range(3)})
-    assert few.plot().axes[1].get_title() == "performance profiles"
+def test_a_method_without_figures_is_not_drawn() -> None:
     lost = compared({"a": even(1.0), "b": dict.fromkeys(SIX)})
     assert [text.get_text() for text in lost.plot().axes[0].get_yticklabels()] == ["a"]
 

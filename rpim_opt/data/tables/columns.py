@@ -55,7 +55,15 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
     """Return the columns of numbers [SI]; refuse those that are unknown, in two units, or missing."""
     known = number_columns(robot, kind)
     columns = quantities_of(table, known, text_columns(kind), label)
-    for stem in _required(columns, robot, kind):
+    # joints, measured values, and whole groups of what is there in part
+    joints, *groups = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau", "approach"))
+    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in kind.extra)]
+    if kind.points == 2:
+        groups += [[f"to_{stem}" for stem in group] for group in (joints, *groups)]
+    for group in groups:
+        if any((stem, "") in columns for stem in group):
+            required += group
+    for stem in required:
         if (stem, "") not in columns:
             accepted = kind.accepted.get(stem, " or ".join(with_unit(stem, known[stem][0])))
             if stem[0] == "q" and stem[1:].isdigit():
@@ -97,19 +105,6 @@ def quantities_of(
         if len(known[stem]) == 1:
             columns[stem, ""] = values
     return columns
-
-
-def _required(columns: Numbers, robot: Robot, kind: Measurement) -> list[str]:
-    """Return the stems that must be there: joints, measured values, and whole groups of what is there in part."""
-    joints, *others = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau", "approach"))
-    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in kind.extra)]
-    groups = list(others)
-    if kind.points == 2:
-        groups += [[f"to_{stem}" for stem in group] for group in (joints, *others)]
-    for group in groups:
-        if any((stem, "") in columns for stem in group):
-            required += group
-    return required
 
 
 def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callable[[Array], Array]]:

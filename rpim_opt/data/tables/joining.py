@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -166,7 +167,12 @@ def _keys(
             found = f"{count} rows of joints and {_count(values)} measured"
             raise InputError("--key row", found, "as many of both, or a column that both have")
         if names and pair:
-            _require_order(_normal(left[pair[0].lower()]), _normal(right[pair[1].lower()]), pair)
+            own, others = _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
+            there = set(others)
+            wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
+            if wrong:
+                found = f"{wrong} of {len(own)} rows whose {pair[0]} is the {pair[1]} of another row"
+                raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
         numbers = [str(i) for i in range(1, count + 1)]
         return "the number of the row", numbers, numbers
     if "label" in joints and key in ("", "label"):
@@ -186,15 +192,6 @@ def _keys(
         accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
         raise InputError("--key", found, f"{accepted} for the nearest time")
     return f"column '{name}'", _normal(left[name]), _normal(right[name])
-
-
-def _require_order(own: Sequence[str], others: Sequence[str], pair: tuple[str, str]) -> None:
-    """Refuse rows in an order that the names in two columns contradict."""
-    there = set(others)
-    wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
-    if wrong:
-        found = f"{wrong} of {len(own)} rows whose {pair[0]} is the {pair[1]} of another row"
-        raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
 
 
 def _pairs(moving: Sequence[Understood], seen: Sequence[Understood]) -> list[tuple[str, str]]:
@@ -318,7 +315,10 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
     times = np.array([numeral(text) for text in texts])
     dates = bool(np.isnan(times[:1]).any())
     if dates:
-        times = np.array([_date(text) for text in texts])
+        for i, text in enumerate(texts):
+            with suppress(ValueError):
+                date = datetime.fromisoformat(text)
+                times[i] = date.replace(tzinfo=date.tzinfo or UTC).timestamp()
     if np.isnan(times).any():
         i = int(np.isnan(times).argmax())
         accepted = "numbers, or dates as 2026-05-31T12:00:00"
@@ -333,12 +333,3 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
 def _split_time(name: str) -> tuple[str, str]:
     match = UNIT.fullmatch(name.strip().replace("_", " "))
     return (match[1].strip(), match[2]) if match else (name.strip(), "")
-
-
-def _date(text: str) -> float:
-    """Return the time [s] since 1970 of a date; NaN for another text."""
-    try:
-        date = datetime.fromisoformat(text)
-    except ValueError:
-        return np.nan
-    return date.replace(tzinfo=date.tzinfo or UTC).timestamp()

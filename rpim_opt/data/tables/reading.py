@@ -90,6 +90,16 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     if payload is not None and not (payload >= 0).all():
         row = int(np.argmin(payload))
         raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
+    approach = None
+    if ("approach1", "") in columns:
+        approach = _of_joints("approach", columns, robot, kind, N)
+        for row, point, joint in np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0))):
+            where = f"row {label[row]}, column approach{joint + 1}"
+            raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
+    naming = [column for column in kind.names if column in table]  # points that were touched, or that a camera sees
+    if kind.touching and len(naming) != 1:
+        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: what a row touched"
+        raise InputError("the header", ", ".join(table), accepted)
     whole = Block(
         kind,
         q=q,
@@ -98,9 +108,9 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         row=np.arange(N),
         torque=_of_joints("tau", columns, robot, kind, N) if ("tau1", "") in columns else None,
         payload=payload,
-        approach=_approach(columns, robot, kind, label),
+        approach=approach,
         columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
-        point=_named_points(table, kind, N),
+        point=np.array(_names(table, naming, N), dtype=object)[:, None] if naming else None,
         session=named_sessions(texts(table.get("session", ()), "session"), N),
     )
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
@@ -112,21 +122,21 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     if "configuration" in table:
         configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
     else:
-        configuration = _by_joints(q)
+        joints = q.reshape(N, -1)
+        order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
+        configuration = np.empty(N, dtype=int)
+        configuration[order] = np.cumsum(np.any(np.diff(joints[order], axis=0, prepend=joints[order[:1]]) != 0, axis=1))
     blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
     if {"marker", "to_marker", "fixture"} & set(table):
-        blocks = _blocks(whole, markers, _names(table, ["fixture"], N))
+        groups: dict[tuple[str, ...], list[int]] = {}  # by reflectors and fixture, in the order of their first rows
+        for i, key in enumerate(zip(*markers, _names(table, ["fixture"], N), strict=True)):
+            groups.setdefault(key, []).append(i)
+        parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
+        blocks = tuple(
+            replace(whole.take(index, index), markers=tuple(names), fixture=place) for names, place, index in parts
+        )
     data = Dataset(blocks, label, configuration)
     return data.grouped_by_points() if kind.touching else data
-
-
-def _named_points(table: Columns, kind: Measurement, N: int) -> np.ndarray | None:
-    """Return the names (N, 1) of the points that were touched, or that a camera has seen, as far as they have some."""
-    columns = [column for column in kind.names if column in table]
-    if kind.touching and len(columns) != 1:
-        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: what a row touched"
-        raise InputError("the header", ", ".join(table), accepted)
-    return np.array(_names(table, columns, N), dtype=object)[:, None] if columns else None
 
 
 def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:
@@ -141,45 +151,10 @@ def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: 
     return values[0][:, None] if len(values) == 1 else np.stack(values, axis=1)  # of one point without a copy
 
 
-def _approach(columns: Numbers, robot: Robot, kind: Measurement, label: Sequence[str]) -> Array | None:
-    """Return from which side the joints came (N, p, dof), -1, 0 or +1."""
-    if ("approach1", "") not in columns:
-        return None
-    approach = _of_joints("approach", columns, robot, kind, len(label))
-    for row, point, joint in np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0))):
-        where = f"row {label[row]}, column approach{joint + 1}"
-        raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
-    return approach
-
-
 def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
     """Return the texts of the first of the columns that is there, or N empty ones."""
     column = next((each for each in columns if each in table), None)
     return texts(table[column], column) if column else ("",) * N
-
-
-def _by_joints(q: Array) -> np.ndarray:
-    """Return the number of every row's configuration by equal joint values (N, p, dof)."""
-    joints = q.reshape(len(q), -1)
-    first, which = np.unique(joints[:, 0], return_inverse=True)
-    if len(first) == len(joints):  # then it alone decides the order, too
-        return which
-    order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
-    others = np.any(np.diff(joints[order], axis=0) != 0, axis=1)
-    which[order] = np.concatenate([[0], np.cumsum(others)])
-    return which
-
-
-def _blocks(whole: Block, markers: Sequence[Sequence[str]], fixture: Sequence[str]) -> tuple[Block, ...]:
-    """Return the rows grouped by reflectors and fixture, in the order of their first rows."""
-    groups: dict[tuple[str, ...], list[int]] = {}
-    for i, key in enumerate(zip(*markers, fixture, strict=True)):
-        groups.setdefault(key, []).append(i)
-    blocks = []
-    for (*names, place), rows in groups.items():
-        index = np.array(rows)
-        blocks.append(replace(whole.take(index, index), markers=tuple(names), fixture=place))
-    return tuple(blocks)
 
 
 # --- RoboDK ----------------------------------------------------------------------------------------------------------

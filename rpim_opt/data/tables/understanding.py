@@ -138,22 +138,21 @@ def understand(
         unit = stated.get(dimension_of(each.unit), each.unit)
         if unit != each.unit:
             notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
+    doubt = ""
+    turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
+    named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
+    if not options.quaternion and quaternion_columns(read, robot.dof):
+        doubt = "quaternion"
+    elif len(turns) == 3 and not named and not (options.rotation or rotation):
+        doubt = "rotation"
     return Understood(
         path.name if path else "",
         columns,
         {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
         tuple(meant),
         (*raw.notes, *notes),
-        _doubt(read, options, rotation, robot.dof),
+        doubt,
     )
-
-
-def _doubt(read: Readings, options: TableOptions, rotation: str, dof: int) -> str:
-    if not options.quaternion and quaternion_columns(read, dof):
-        return "quaternion"
-    turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
-    named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
-    return "rotation" if len(turns) == 3 and not named and not (options.rotation or rotation) else ""
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------
@@ -186,7 +185,13 @@ def _readings(
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature whose unit is not there")
     _leave_out(read, targets)
-    _one_label(read, table, options.key)
+    # of several labels the stated key, or the one that does more than count the rows
+    labels = [name for name, each in read.items() if each.stem == "label"]
+    count = [str(i) for i in range(1, len(next(iter(table.values()), ())) + 1)]
+    stated = [name for name in labels if name.lower() == options.key.lower()]
+    chosen = stated or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
+    if len(labels) > 1 and len(chosen) == 1:
+        read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
     return read, rotation
 
 
@@ -334,16 +339,6 @@ def _leave_out(read: Readings, targets: bool) -> None:
                 why = "a commanded value is no measurement"
         if why:
             read[name] = Reading("", "", why)
-
-
-def _one_label(read: Readings, table: Columns, key: str) -> None:
-    """Leave out other labels than the stated key, or than the one that does more than count the rows."""
-    labels = [name for name, each in read.items() if each.stem == "label"]
-    count = [str(i) for i in range(1, len(next(iter(table.values()), ())) + 1)]
-    stated = [name for name in labels if name.lower() == key.lower()]
-    chosen = stated or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
-    if len(labels) > 1 and len(chosen) == 1:
-        read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
 
 
 # --- our names and units -------------------------------------------------------------------------------------------
