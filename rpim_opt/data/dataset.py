@@ -355,8 +355,15 @@ class Dataset(Tabled):
         y = np.asarray(y, dtype=float)
         if q.ndim == 2:
             q = q[:, None]
-        _require_shapes(q, y, measurement)
         N = len(q)
+        points, c = measurement.points, len(measurement.columns)
+        fits = q.ndim == 3 and q.shape[:2] == (len(y), points) and y.shape[1:] == (c,)
+        if not fits or not np.isfinite(q).all() or not np.isfinite(y).all():
+            accepted = f"finite numbers, {points} x dof joint and {c} measured values a row"
+            raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
+        largest = max(np.abs(q).max(initial=0.0), np.abs(y).max(initial=0.0))
+        if largest > LARGEST:
+            raise InputError("q and y", f"{largest:g}", f"sizes of at most {LARGEST:g} m or rad")
         k = len(measurement.components)
         rows = np.arange(N)
         covariance = np.array(sigma, dtype=float)
@@ -417,18 +424,6 @@ def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | No
         if other != name:
             raise InputError("column session", f"'{other}' and '{name}'", "names that differ in letters or digits")
     return found
-
-
-def _require_shapes(q: Array, y: Array, measurement: Measurement) -> None:
-    points = measurement.points
-    columns = len(measurement.columns)
-    fits = q.ndim == 3 and q.shape[:2] == (len(y), points) and y.shape[1:] == (columns,)
-    if not fits or not np.isfinite(q).all() or not np.isfinite(y).all():
-        accepted = f"finite numbers, {points} x dof joint and {columns} measured values a row"
-        raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
-    largest = max(np.abs(q).max(initial=0.0), np.abs(y).max(initial=0.0))
-    if largest > LARGEST:
-        raise InputError("q and y", f"{largest:g}", f"sizes of at most {LARGEST:g} m or rad")
 
 
 def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:

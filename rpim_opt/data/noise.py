@@ -106,13 +106,29 @@ def covariances(
         instrument = np.zeros((len(y), k, k))
         axes = [list(kind.columns).index(axis) for axis in "xyz"]
         instrument[:, :3, :3] = declared["tracker"].covariance(y[:, axes])
-    own = [_of_rows(columns, name, dimension) for name, dimension in kind.components.items()]
-    spread = [
-        _declared(columns, declared, kind, name, bool(instrument[:, i, i].any())) if stated is None else stated
-        for i, (name, stated) in enumerate(zip(names, own, strict=True))
-    ]
+    spread: list[Any] = []
+    lacking = np.zeros(k, dtype=bool)
+    for i, (name, dimension) in enumerate(kind.components.items()):
+        # what rows state: of this component before those of all of its dimension
+        sources = {
+            (f"sigma_{name}", ""): 1.0,
+            ("sigma", dimension): 1.0,
+            (f"u95_{name}", ""): COVERAGE,
+            ("u95", dimension): COVERAGE,
+        }
+        own = next((columns[key] / factor for key, factor in sources.items() if key in columns), None)
+        if own is None:
+            common = next((key for key, of in kind.noise.items() if of == dimension), "")
+            own = declared.get(name, declared.get(common))
+            lacking[i] = True
+        if own is None:
+            if not instrument[:, i, i].any() and (f"cov_{name}_{name}", "") not in columns:
+                column = with_unit(f"sigma_{name}", dimension, 2)[-1]
+                accepted = f"{with_unit(common, dimension, 2)[-1]}, or a column {column}"
+                raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
+            own = 0.0  # the tracker or a column has it all
+        spread.append(own)
     deviation = np.stack(np.broadcast_arrays(*map(np.atleast_1d, spread)), axis=1)
-    lacking = np.array([stated is None for stated in own])
     covariance = deviation[:, :, None] ** 2 * np.eye(k) + instrument * np.outer(lacking, lacking)
     pairs = [(a, b) for a in names for b in names if (f"cov_{a}_{b}", "") in columns]
     if pairs:
@@ -129,28 +145,3 @@ def covariances(
         row = label[int(np.argmin(definite))]
         raise InputError(f"row {row}, columns cov_...", "a covariance that is not positive definite", "one that is")
     return covariance
-
-
-def _of_rows(columns: Numbers, name: str, dimension: str) -> Array | None:
-    """Return the standard deviations that rows state: of this component before those of all of its dimension."""
-    sources = (
-        ((f"sigma_{name}", ""), 1.0),
-        (("sigma", dimension), 1.0),
-        ((f"u95_{name}", ""), COVERAGE),
-        (("u95", dimension), COVERAGE),
-    )
-    return next((columns[key] / factor for key, factor in sources if key in columns), None)
-
-
-def _declared(columns: Numbers, declared: Mapping[str, Any], kind: Measurement, name: str, of_tracker: bool) -> float:
-    """Return the declared standard deviation of a component, zero where the tracker or a column has it all."""
-    dimension = kind.components[name]
-    common = next((key for key, of in kind.noise.items() if of == dimension), "")
-    value = declared.get(name, declared.get(common))
-    if value is not None:
-        return value
-    if not of_tracker and (f"cov_{name}_{name}", "") not in columns:
-        column = with_unit(f"sigma_{name}", dimension, 2)[-1]
-        accepted = f"{with_unit(common, dimension, 2)[-1]}, or a column {column}"
-        raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
-    return 0.0

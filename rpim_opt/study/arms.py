@@ -87,7 +87,12 @@ def simulated_arm(
     name = list(KINDS)[seed % len(KINDS)]
     robot = read_robot(find_robot(name))
     rng = np.random.default_rng([seed, 77])
-    errors = _errors(robot.dof, rng)
+    length = np.exp(rng.uniform(np.log(5e-5), np.log(1e-3)))
+    angle = min(length * np.exp(rng.uniform(0, np.log(30))), 5e-3)
+    local = np.exp(rng.standard_normal((robot.dof, 6)))
+    # a small transform a row: lengths [m], rotation vector [rad]
+    errors = rng.standard_normal((robot.dof, 6)) * local * np.repeat([length, angle], 3)
+    errors[:, 5] += 3 * angle * rng.standard_normal(robot.dof)
     errors[rng.integers(1, robot.dof - 1), 5] += offset * rng.choice([-1.0, 1.0])
     base = _small(np.array(BASE)) @ _small(2e-3 * rng.standard_normal(6))
     tool = np.array(TOOL[:3]) + 3e-3 * rng.standard_normal(3)
@@ -155,16 +160,6 @@ def _torque(robot: Robot, mass: Array, q: Array) -> Array:
         for each, centre in zip(mass[i:], centres[i:], strict=True):
             torque[:, i] += each * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
     return torque
-
-
-def _errors(dof: int, rng: np.random.Generator) -> Array:
-    """Return small transforms (dof, 6): lengths [m], rotation vectors [rad]."""
-    length = np.exp(rng.uniform(np.log(5e-5), np.log(1e-3)))
-    angle = min(length * np.exp(rng.uniform(0, np.log(30))), 5e-3)
-    local = np.exp(rng.standard_normal((dof, 6)))
-    errors = rng.standard_normal((dof, 6)) * local * np.repeat([length, angle], 3)
-    errors[:, 5] += 3 * angle * rng.standard_normal(dof)
-    return errors
 
 
 def _small(numbers: Array) -> Array:

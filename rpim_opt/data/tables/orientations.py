@@ -37,8 +37,14 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
     places = _places(read)
     why = "a matrix, row by row"
     if len(places) == 16:
+        matrices = np.empty((len(next(iter(table.values()))), 4, 4))
+        for name, (i, j) in places.items():
+            matrices[:, i, j] = numbers(table[name], name)
+        row, column = (np.abs(part - [0, 0, 0, 1]).max() < ROUNDED for part in (matrices[:, 3], matrices[:, :, 3]))
+        if not row and not column:
+            raise InputError("the matrices", "neither a last row nor a last column 0 0 0 1", "4 x 4 transforms")
         why = "a matrix, row by row: its last row is 0 0 0 1"
-        if _is_transposed(places, table):
+        if not row:
             places = {name: (j, i) for name, (i, j) in places.items()}
             why = "a matrix, column by column: its last column is 0 0 0 1"
     for name, (row, column) in places.items():
@@ -87,17 +93,6 @@ def _places(read: Readings) -> dict[str, Place]:
     if len(ordered) in (12, 16) and single[ordered[-1]] - single[ordered[0]] == len(ordered) - 1:
         return {name: divmod(k, 4) for k, name in enumerate(ordered)}
     return {}
-
-
-def _is_transposed(places: dict[str, Place], table: Columns) -> bool:
-    matrices = np.empty((len(next(iter(table.values()))), 4, 4))
-    for name, (i, j) in places.items():
-        matrices[:, i, j] = numbers(table[name], name)
-    if np.abs(matrices[:, 3] - [0, 0, 0, 1]).max() < ROUNDED:
-        return False
-    if np.abs(matrices[:, :, 3] - [0, 0, 0, 1]).max() < ROUNDED:
-        return True
-    raise InputError("the matrices", "neither a last row nor a last column 0 0 0 1", "4 x 4 transforms")
 
 
 def require_rotation(stated: str) -> None:
