@@ -27,7 +27,7 @@ from rpim_opt.problem.registration.frames import locate, starting_cameras, start
 from rpim_opt.robot.chain import Described, placed, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
-from rpim_opt.robot.library import RobotSource, find_source, read_arm
+from rpim_opt.robot.library import find_source, read_arm
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.store.raw import NOISE, Understanding, rows_of, understand_of
 
@@ -132,7 +132,12 @@ def new_problem(
         notes += other.sentences
         said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; used for no choice'
     elif hold_out is not None:
-        held = _held_out(rows, hold_out, seed)
+        known = len(np.unique(rows.configuration))
+        if not 0 < hold_out < 1 or known < 2:
+            part = f"{hold_out:g} of {known} configurations"
+            raise InputError("--hold-out", part, "a part between 0 and 1 of two or more")
+        drawn = rows.configurations(min(max(round(hold_out * known), 1), known - 1), seed)
+        held = np.isin(rows.configuration, drawn.configuration)
         tables = {IDENTIFICATION: _rows(columns, ~held), VALIDATION: _rows(columns, held)}
         rows = rows.take(np.flatnonzero(~held))
         said = f'validation = "{VALIDATION}"\nheld_out = true  # drawn with seed {seed}; used once they have validated'
@@ -152,27 +157,7 @@ def new_problem(
         text, guessed = _problem_text(arm, kind, rows, noise, context)
     except InputError as error:
         raise error.within(found.file) from None
-    _write(folder, text, tables, source, arm)
-    counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    notes += [f"Measurement {kind.name}: {how}.", guessed]
-    return Started(folder, counts, tuple(notes), replace(found, kind=kind))
-
-
-def _held_out(rows: Dataset, share: float, seed: int) -> np.ndarray:
-    """Return which rows (N,) belong to a share of the configurations, at least one, which is held out."""
-    known = len(np.unique(rows.configuration))
-    if not 0 < share < 1 or known < 2:
-        raise InputError("--hold-out", f"{share:g} of {known} configurations", "a part between 0 and 1 of two or more")
-    drawn = rows.configurations(min(max(round(share * known), 1), known - 1), seed)
-    return np.isin(rows.configuration, drawn.configuration)
-
-
-def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
-    return {name: [cells[i] for i in np.flatnonzero(chosen).tolist()] for name, cells in columns.items()}
-
-
-def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: RobotSource, arm: Described) -> None:
-    """Make the folder beside its place, and move it there when it is whole."""
+    # beside its place, and moved there when it is whole
     with undoing() as parents, ExitStack() as stack:
         make_folder(folder.parent, parents)
         made = stack.enter_context(scratch_folder(folder)) / folder.name
@@ -184,6 +169,13 @@ def _write(folder: Path, text: str, tables: Mapping[str, Columns], source: Robot
         else:
             write_robot(arm.robot, made / "robot.toml")
         made.rename(folder)
+    counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
+    notes += [f"Measurement {kind.name}: {how}.", guessed]
+    return Started(folder, counts, tuple(notes), replace(found, kind=kind))
+
+
+def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
+    return {name: [cells[i] for i in np.flatnonzero(chosen).tolist()] for name, cells in columns.items()}
 
 
 # --- what was measured, and the board that a camera sees ---------------------------------------------------------

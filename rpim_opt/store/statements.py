@@ -157,7 +157,11 @@ def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | 
     limit = values.pop("limit", None)
     if not isinstance(limit, float):
         raise InputError("table acceptance", "no limit", "limit_mm = 0.1")
-    sides = {stem: _side(value, stem) for stem, value in values.items()}
+    sides: dict[str, Side] = {}
+    for stem, value in values.items():
+        if not isinstance(value, list) or len(value) != 2 or not all(isinstance(each, float) for each in value):
+            raise InputError(f"key acceptance.{stem}", "not two numbers", "[low, high]")
+        sides[stem] = value[0], value[1]
     marker = plain.get("marker", "")
     if not isinstance(marker, str):
         raise InputError("key acceptance.marker", repr(marker)[:60], "the name of a reflector")
@@ -171,12 +175,6 @@ def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | 
         marker=marker,
         confidence=number(plain.get("confidence", CONFIDENCE), "key acceptance.confidence"),
     )
-
-
-def _side(value: Any, stem: str) -> Side:
-    if not isinstance(value, list) or len(value) != 2 or not all(isinstance(each, float) for each in value):
-        raise InputError(f"key acceptance.{stem}", "not two numbers", "[low, high]")
-    return value[0], value[1]
 
 
 # --- places of anchors, planes, spheres --------------------------------------------------------------------------

@@ -256,8 +256,17 @@ def run_study(
     with refused(folder):
         folder.mkdir(parents=True, exist_ok=True)
     if redraw:
-        rows, made = read_replicates(folder)
-        report = study.report(rows)
+        path = folder / f"{REPLICATES}.parquet"
+        if not path.exists():
+            raise InputError("redraw", "no replicates", "a study that was run before", path)
+        require_file(path, LARGEST_DATA)
+        try:
+            table = parquet.read_table(path)
+            made = (table.schema.metadata or {}).get(b"made", b"").decode()
+        except (OSError, ValueError) as error:
+            raise InputError("redraw", str(error), "the replicates of a study", path) from None
+        # without what a replicate does not have
+        report = study.report([{key: v for key, v in row.items() if v is not None} for row in table.to_pylist()])
         write(folder, study.QUESTION, report, made, {})
         return report, folder
     if hasattr(study, "prepare"):
@@ -280,22 +289,6 @@ def run_study(
 
 def _run(path: Path, case: Mapping[str, Any]) -> Row:
     return load_study(path).run(**case)
-
-
-def read_replicates(folder: Path) -> tuple[list[Row], str]:
-    """Return the replicates of an earlier run, without what a replicate does not have, and what made them."""
-    path = folder / f"{REPLICATES}.parquet"
-    if not path.exists():
-        raise InputError("redraw", "no replicates", "a study that was run before", path)
-    require_file(path, LARGEST_DATA)
-    from pyarrow import parquet
-
-    try:
-        table = parquet.read_table(path)
-        made = (table.schema.metadata or {}).get(b"made", b"").decode()
-    except (OSError, ValueError) as error:
-        raise InputError("redraw", str(error), "the replicates of a study", path) from None
-    return [{key: value for key, value in row.items() if value is not None} for row in table.to_pylist()], made
 
 
 def write(folder: Path, question: str, report: Report, made: str, replicates: Mapping[str, bytes]) -> None:

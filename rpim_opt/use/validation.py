@@ -126,19 +126,17 @@ class Validation:
         largest = ""
         if np.isfinite(self.error).any():
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
-        sentences = [*worse, largest, self._judgement(), *self.outside.sentences(), *self.remarks, self.mistake]
-        return "\n".join([*tables, *filter(None, sentences)])
-
-    def _judgement(self) -> str:
-        if not np.isfinite(self.sigmas).any():
-            return "The calibration has no covariance for these rows: there are no prediction intervals."
         covered = ""
         if self.coverage is not None:
             covered = f" {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals of a reading."
-        if not self.beyond:
-            return f"No row is outside its prediction interval.{covered}"
         named = [f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond]
-        return f"Outside their prediction intervals: {listed(named)}.{covered}"
+        judgement = f"Outside their prediction intervals: {listed(named)}.{covered}"
+        if not np.isfinite(self.sigmas).any():
+            judgement = "The calibration has no covariance for these rows: there are no prediction intervals."
+        elif not named:
+            judgement = f"No row is outside its prediction interval.{covered}"
+        sentences = [*worse, largest, judgement, *self.outside.sentences(), *self.remarks, self.mistake]
+        return "\n".join([*tables, *filter(None, sentences)])
 
     def _rows(self) -> dict[str, Sequence[Any]]:
         columns = {"nominal_mm": 1e3 * self.nominal, "error_mm": 1e3 * self.error}
