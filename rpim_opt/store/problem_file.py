@@ -288,7 +288,17 @@ def read_problem(
     if chains:
         own = {key: value for key, value in content.items() if key not in ("variant", "chain")}
         table, placed = _checked(_overlay(own, table.chain[chain or chains[0]]), kinds, path)
-    observations = _observations(table, kinds, path)
+    observations = list(table.observation)  # behind that of the top level
+    if table.identification is not None:
+        keys = ("measurement", "layout", "identification", "validation")
+        observations.insert(0, Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={}))
+    if not observations:
+        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
+    for each in observations:
+        pick(kinds, each.measurement, "key measurement", path)
+        inside(path.parent, each.identification, "key identification", path)
+        if each.validation:  # an empty one is how a variant has none
+            inside(path.parent, each.validation, "key validation", path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
     file = find_robot(table.robot, path.parent)
@@ -316,35 +326,27 @@ def read_problem(
         tools = {"": _frame(table.tool, "tool", path)}
     else:
         tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
+    board = None
+    if isinstance(table.target, str):
+        board = read_board(inside(path.parent, table.target, "key target", path))
+    elif table.target is not None:
+        pattern = _part(GridTable, table.target, "key target", path)
+        try:
+            board = grid_board(pattern.columns, pattern.rows, pattern.spacing)
+        except InputError as error:
+            raise InputError("key target", error.found, error.accepted, path) from None
     return ProblemFile(
         path=path,
         table=table,
         placed=placed,
         robot=arm.robot,
         kinds=kinds,
-        observations=observations,
+        observations=tuple(observations),
         tools=tools,
         base=base,
         chains=chains,
-        board=_board(table, path),
+        board=board,
     )
-
-
-def _observations(table: ProblemTable, kinds: Mapping[str, Measurement], path: Path) -> tuple[Observation, ...]:
-    """Return the tables of measurements, that of the top level first; all lie in the folder."""
-    observations = table.observation
-    if table.identification is not None:
-        keys = ("measurement", "layout", "identification", "validation")
-        first = Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={})
-        observations = [first, *observations]
-    if not observations:
-        raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
-    for each in observations:
-        pick(kinds, each.measurement, "key measurement", path)
-        inside(path.parent, each.identification, "key identification", path)
-        if each.validation:  # an empty one is how a variant has none
-            inside(path.parent, each.validation, "key validation", path)
-    return tuple(observations)
 
 
 def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
@@ -375,19 +377,6 @@ def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
         tables = isinstance(value, Mapping) and isinstance(base.get(key), Mapping)
         merged[key] = _overlay(base[key], value) if tables and value else value  # an empty table clears
     return merged
-
-
-def _board(table: ProblemTable, path: Path) -> Board | None:
-    """Return the points of the board that cameras see: of a table of the folder, or of a pattern."""
-    if table.target is None:
-        return None
-    if isinstance(table.target, str):
-        return read_board(inside(path.parent, table.target, "key target", path))
-    pattern = _part(GridTable, table.target, "key target", path)
-    try:
-        return grid_board(pattern.columns, pattern.rows, pattern.spacing)
-    except InputError as error:
-        raise InputError("key target", error.found, error.accepted, path) from None
 
 
 def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:

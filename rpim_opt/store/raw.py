@@ -267,24 +267,20 @@ def _whole(
         whole = together(tables, arm.robot, kind, options.key, options.within)
     except InputError as error:
         raise error.within(files[0][0] if len(files) == 1 else None) from None
-    shown = tuple(_joined(each, options, whole.notes) for each in tables)
-    return Understanding(kind, whole.columns, whole.raw, shown, whole.notes, options, str(files[0][0] or ""))
-
-
-def _joined(table: Understood, options: TableOptions, notes: Sequence[str]) -> Understood:
-    """Return what was understood of a file, in which the column by which rows were joined is not left out."""
-    by = [note.removeprefix("joined by ").partition(":")[0] for note in notes if note.startswith("joined by ")]
-    used = {name for name in table.raw if f"column '{name.lower()}'" in by or name in " = ".join(by).split(" = ")}
-    if any(note.startswith("joined by the nearest time") for note in notes):
-        clock = time_column(table.raw) if options.key.lower() in ("", "time") else options.key
-        used = {name for name in table.raw if name.lower() == str(clock).lower()}
-    meant = [
-        each._replace(meaning="joins the files", why="rows of equal keys or of the nearest times")
-        if each.column in used and each.meaning == "left out"
-        else each
-        for each in table.meant
-    ]
-    return replace(table, meant=tuple(meant))
+    by = [note.removeprefix("joined by ").partition(":")[0] for note in whole.notes if note.startswith("joined by ")]
+    shown = []  # in what is shown the columns by which rows were joined are not left out
+    for each in tables:
+        used = {name for name in each.raw if f"column '{name.lower()}'" in by or name in " = ".join(by).split(" = ")}
+        if "the nearest time" in by:
+            clock = time_column(each.raw) if options.key.lower() in ("", "time") else options.key
+            used = {name for name in each.raw if name.lower() == str(clock).lower()}
+        meant = list(each.meant)
+        for i, column in enumerate(meant):
+            if column.column in used and column.meaning == "left out":
+                why = "rows of equal keys or of the nearest times"
+                meant[i] = column._replace(meaning="joins the files", why=why)
+        shown.append(replace(each, meant=tuple(meant)))
+    return Understanding(kind, whole.columns, whole.raw, tuple(shown), whole.notes, options, str(files[0][0] or ""))
 
 
 def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any, Literal
 
@@ -90,7 +91,16 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     rng = np.random.default_rng(plan.seed if seed is None else seed)
     if not np.isfinite(stated.robot.limits).all():
         raise InputError("key limits", "a joint without limits", "limits for every joint", stated.path)
-    _require_tables(stated)
+    taken: set[Path] = set()  # nothing else may have a table's name
+    for each, role in product(stated.observations, ("identification", "validation")):
+        file = getattr(each, role)
+        if file:
+            if not file.lower().endswith(".csv"):
+                raise InputError(f"key {role}", f"{file!r}", "a name ending in .csv, to be written", stated.path)
+            place = inside(stated.path.parent, file, f"key {role}", stated.path).resolve()
+            if place in taken:
+                raise InputError(f"key {role}", f"{file!r} twice", "a name of its own for every table", stated.path)
+            taken.add(place)
     fixtures: list[tuple[str, ...]] = []
     for each in stated.observations:
         places = [stated.placed.get(name.partition("_")[0], {}) for name in stated.kinds[each.measurement].parameters]
@@ -135,22 +145,6 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     places = {inside(folder, file, "the file", folder): text.encode() for file, text in texts.items()}
     write_files(places)
     return list(places)
-
-
-def _require_tables(stated: ProblemFile) -> None:
-    """Refuse names that something else has: another table, or a file that is no table."""
-    taken: set[Path] = set()
-    for each in stated.observations:
-        for role in ("identification", "validation"):
-            file = getattr(each, role)
-            if not file:
-                continue
-            if not file.lower().endswith(".csv"):
-                raise InputError(f"key {role}", f"{file!r}", "a name ending in .csv, to be written", stated.path)
-            place = inside(stated.path.parent, file, f"key {role}", stated.path).resolve()
-            if place in taken:
-                raise InputError(f"key {role}", f"{file!r} twice", "a name of its own for every table", stated.path)
-            taken.add(place)
 
 
 # --- what is simulated -------------------------------------------------------------------------------------------

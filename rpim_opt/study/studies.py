@@ -9,6 +9,7 @@ import io
 import os
 import sys
 from collections.abc import Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
 from hashlib import file_digest, sha256
@@ -177,7 +178,13 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
                 raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
             for match in matches:
                 files.update(_beside(match, results=True) if match.is_dir() else [match])
-    return {os.path.relpath(file, folder): _digest(file) for file in sorted(files)}
+    digests = {}
+    for file in sorted(files):
+        name = os.path.relpath(file, folder)
+        digests[name] = "unreadable"  # nor can the study read it
+        with suppress(OSError), file.open("rb") as stream:
+            digests[name] = file_digest(stream, "sha256").hexdigest()
+    return digests
 
 
 def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
@@ -197,14 +204,6 @@ def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
             if count > MOST_FILES or size > MOST_BYTES:
                 found = f"more than {MOST_FILES} files or {MOST_BYTES / 1e9:g} GB in {folder}"
                 raise InputError("DEPENDS", found, "DEPENDS = [...] in the study: names of the files that it reads")
-
-
-def _digest(file: Path) -> str:
-    try:
-        with file.open("rb") as stream:
-            return file_digest(stream, "sha256").hexdigest()
-    except OSError:  # nor can the study read it
-        return "unreadable"
 
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:

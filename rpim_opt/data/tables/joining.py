@@ -88,8 +88,21 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
     first = tables[0]
     if len(tables) == 1:
         return Whole(first.columns, first.raw, ())
-    matched = [_matched(table, first) for table in tables]
-    whole = {name: [cell for columns in matched for cell in columns[name]] for name in matched[0]}
+    wanted = {split_unit(name)[0]: name for name in first.columns if name != "label"}
+    whole: dict[str, list[Any]] = {name: [] for name in wanted.values()}
+    for table in tables:
+        own = {split_unit(name)[0]: name for name in table.columns if name != "label"}
+        lacking = own.keys() ^ wanted.keys()
+        if lacking:
+            found = f"{listed(sorted(lacking))} in one of {first.file} and {table.file} alone"
+            accepted = "the same columns in all files, or one file of joints and one of values"
+            raise InputError("the header", found, accepted)
+        for stem, name in wanted.items():
+            cells = table.columns[own[stem]]
+            old, new = split_unit(own[stem])[1], split_unit(name)[1]
+            if old is not None and new is not None and old.si != new.si:
+                cells = [repr(float(cell) * old.si / new.si) for cell in cells]
+            whole[name].extend(cells)
     counts = ", ".join(f"{table.file} {_count(table.columns)}" for table in tables)
     notes = [f"rows of the files below each other: {counts}."]
     names = [name for table in tables for name in _labels(table.columns)]
@@ -108,23 +121,6 @@ def _count(columns: Columns) -> int:
 
 def _labels(columns: Columns) -> list[str]:
     return [str(label) for label in columns.get("label", range(1, _count(columns) + 1))]
-
-
-def _matched(table: Understood, first: Understood) -> dict[str, Sequence[Any]]:
-    """Return a table's columns but for labels under the first one's names, in its units."""
-    own, wanted = ({split_unit(name)[0]: name for name in each.columns if name != "label"} for each in (table, first))
-    lacking = own.keys() ^ wanted.keys()
-    if lacking:
-        found = f"{listed(sorted(lacking))} in one of {first.file} and {table.file} alone"
-        raise InputError("the header", found, "the same columns in all files, or one file of joints and one of values")
-    columns: dict[str, Sequence[Any]] = {}
-    for stem, name in wanted.items():
-        cells = table.columns[own[stem]]
-        old, new = split_unit(own[stem])[1], split_unit(name)[1]
-        if old is not None and new is not None and old.si != new.si:
-            cells = [repr(float(cell) * old.si / new.si) for cell in cells]
-        columns[name] = cells
-    return columns
 
 
 # --- by a key ------------------------------------------------------------------------------------------------------
