@@ -258,35 +258,31 @@ class Prior:
                 if not any(fits(name, pattern) for name in parameters.names):
                     raise InputError("prior, key groups", f"'{pattern}'", choices(pattern, parameters.names))
         free = parameters.free
-        keys = [self._group_of(name, dimension) for name, dimension in zip(free.names, free.dimensions, strict=True)]
+        keys = []
+        for name, dimension in zip(free.names, free.dimensions, strict=True):
+            own, found = own_name(name), _GEOMETRY.fullmatch(own_name(name))
+            stated = [group for group in self.groups if any(fits(name, pattern) for pattern in group)]
+            if own.startswith(f"{BASE}_"):
+                keys.append(BASE)
+            elif stated:
+                keys.append(" ".join(stated[0]))
+            elif of_session(name):
+                keys.append(SESSIONS[dimension])
+            elif is_joint_offset(name):
+                keys.append(OFFSETS)
+            else:
+                keys.append(f"{MDH_DIMENSION[found[1]]}s" if found else family_of(name))
         of_base = np.array([own_name(name).startswith(f"{BASE}_") for name in parameters.names])
         fixed = (parameters.placed & (known | ~of_base))[parameters.identified]
         names = tuple(dict.fromkeys(key for key, alone in zip(keys, fixed, strict=True) if not alone))
         numbers = [FIXED if alone else names.index(key) for key, alone in zip(keys, fixed, strict=True)]
         return np.array(numbers, dtype=int), names
 
-    def _group_of(self, name: str, dimension: str) -> str:
-        if own_name(name).startswith(f"{BASE}_"):
-            return BASE
-        for group in self.groups:
-            if any(fits(name, pattern) for pattern in group):
-                return " ".join(group)
-        if of_session(name):
-            return SESSIONS[dimension]
-        if is_joint_offset(name):
-            return OFFSETS
-        found = _GEOMETRY.fullmatch(own_name(name))
-        if found is None:
-            return family_of(name)
-        return f"{MDH_DIMENSION[found[1]]}s"
-
 
 def family_of(name: str) -> str:
     """Return the model extension of a parameter that is not geometry: ``ecc`` of ``ecc_cos3``."""
     found = _FAMILY.match(own_name(name))
-    if found is None:
-        return own_name(name)
-    return found[1]
+    return found[1] if found else own_name(name)
 
 
 def _patterns(group: str | Iterable[str]) -> tuple[str, ...]:

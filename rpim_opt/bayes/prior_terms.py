@@ -245,7 +245,10 @@ class Statement:
         known = [name for name in self.names if name in here]
         place = np.array([here[name] for name in known], dtype=int)
         own = np.array([self.names.index(name) for name in known], dtype=int)
-        offset = self._offset(parameters, place, own)
+        offset = np.zeros(len(place))  # by how much nominal values [SI] differ from the reference
+        if self.reference is not None:
+            offset = parameters.nominal[place] - np.array(self.reference)[own]
+            self._require_near(parameters, place, own, offset)
         identified = parameters.identified[place]
         rows = np.array(self.rows, dtype=float).reshape(len(self.values), len(self.names))
         values = np.array(self.values, dtype=float)
@@ -263,20 +266,16 @@ class Statement:
         says = full.any(axis=1)
         return full[says], values[says], replaced
 
-    def _offset(self, parameters: Parameters, place: np.ndarray, own: np.ndarray) -> Array:
-        """Return by how much nominal values (p,) [SI] differ from the reference; zero where that is nominal."""
-        if self.reference is None:
-            return np.zeros(len(place))
-        offset = parameters.nominal[place] - np.array(self.reference)[own]
+    def _require_near(self, parameters: Parameters, place: np.ndarray, own: np.ndarray, offset: Array) -> None:
+        """Refuse turned frames, and values far from nominal."""
         if self.whole:
             some = parameters.take(place)
             turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
             if len(turned):  # angles of frames do not add up
                 found = f"'{some.names[turned[0]]}' relative to another nominal orientation"
-                raise InputError(
-                    self.where, found, "the frame's earlier nominal values; or no prior on a frame that was set up anew"
-                )
-            return offset
+                accepted = "the frame's earlier nominal values; or no prior on a frame that was set up anew"
+                raise InputError(self.where, found, accepted)
+            return
         rows = np.array(self.rows)[:, own]
         apart = np.abs(np.array(self.values) - rows @ offset)
         if (apart > FAR * (1 + np.linalg.norm(rows * parameters.scale[place], axis=1))).any():
@@ -285,7 +284,6 @@ class Statement:
             unit, si = display(parameters.dimensions[place[0]])
             found = f"a value {size / si:.4g} {unit} off nominal"
             raise InputError(self.where, found, "one near it; '= nominal +- ...' where the nominal value is meant")
-        return offset
 
 
 def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array]:
@@ -342,32 +340,26 @@ class Result(Protocol):
     @property
     def problem(self) -> Source:
         """What was asked."""
-        ...
 
     @property
     def x(self) -> Array:
         """Deviations (n,) [SI]."""
-        ...
 
     @property
     def program(self) -> Program:
         """The convex program at the solution."""
-        ...
 
     @property
     def learned(self) -> Any:
         """The hyperparameters (`Learned`), where they were estimated."""
-        ...
 
     @cached_property
     def flagged(self) -> Sequence[Any]:
         """Outlying rows, each with a ``label``."""
-        ...
 
     @cached_property
     def spread(self) -> Any:
         """The equations and the penalty of the fit (`Spread`), or InputError without covariance."""
-        ...
 
 
 def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:

@@ -52,19 +52,6 @@ def possible(problem: CalibrationProblem) -> bool:
     return len(problem.arms) == 1 and problem.touches is None and one_stop
 
 
-def curves_over(q: Array, joint_types: Sequence[str], margin: float) -> tuple[Curve, ...]:
-    """Return the curves of the revolute joints that turned, for joint values (N, dof) [rad]."""
-    low, high = q.min(axis=0), q.max(axis=0)
-    travel = high - low
-    joints = [j for j, kind in enumerate(joint_types) if kind == "revolute" and travel[j] > SHORTEST]
-    turns = np.minimum(travel + 2 * margin, 2 * np.pi) / (2 * np.pi)
-    cycles = min(FINEST, COLUMNS * max(len(joints), 6) / 2 / max(np.sum(turns[joints]), 1e-9))
-    centre = (low + high) / 2
-    return tuple(
-        Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), max(int(cycles * turns[j]), 1)) for j in joints
-    )
-
-
 def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
     """Return the columns (m, c) of all coefficients, from joint values and slopes by them (m, dof)."""
     found = [np.zeros((len(q), 0))]
@@ -150,10 +137,15 @@ def _most_likely(
     size = np.log(CURVES["transmission size"][0])
     starts = [np.array([size, np.log(length), *plain.logs]) for length in STARTS]
     margin = BEYOND
+    centre, travel = (q.min(axis=0) + q.max(axis=0)) / 2, np.ptp(q, axis=0)
+    joints = [j for j, kind in enumerate(problem.robot.joint_types) if kind == "revolute" and travel[j] > SHORTEST]
+    if not joints:
+        return None
     while True:
-        curves = curves_over(q, problem.robot.joint_types, margin)
-        if not curves:
-            return None
+        turns = np.minimum(travel + 2 * margin, 2 * np.pi) / (2 * np.pi)
+        cycles = min(FINEST, COLUMNS * max(len(joints), 6) / 2 / max(np.sum(turns[joints]), 1e-9))
+        counts = np.maximum(cycles * turns, 1).astype(int)
+        curves = tuple(Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), int(counts[j])) for j in joints)
         columns = series(curves, q, slopes)
         beside = given(columns, curves)
         start = min((beside.at(logs) for logs in starts), key=lambda point: point.value)

@@ -18,7 +18,7 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.select import Selector
 from rpim_opt.convex.structure import in_blocks
-from rpim_opt.convex.trust import Squares, trusted_rows
+from rpim_opt.convex.trust import Squares, trusted
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel, around
 from rpim_opt.problem.problem import CalibrationProblem
@@ -202,7 +202,7 @@ class Loop:
         if self.reweigh is None:
             return state.program.on_squares(state.program.trusted(state.z))
         x = self.scale * state.z
-        trust = trusted_rows(self.source, x, self.formulation)
+        trust = trusted(self.formulation, *self.source.configuration_errors(x))
         return state.program.on(around(self.source.linearize(x, trust), *self.about))
 
     # --- one step --------------------------------------------------------------------------------------------

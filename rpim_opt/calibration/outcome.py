@@ -35,7 +35,7 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
 from rpim_opt.convex.select import Selection
-from rpim_opt.convex.trust import trusted_rows
+from rpim_opt.convex.trust import trusted
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
@@ -358,7 +358,7 @@ class Outcome:
         if source.keeps_rows or program.formulation is self.formulation:
             trust = program.trust(self.z)
         else:
-            trust = trusted_rows(source, self.x, self.formulation)
+            trust = trusted(self.formulation, *source.configuration_errors(self.x))
         if trust is None:
             form = program.loss_form
             return program.squared, 1.0 if form is None else form.size

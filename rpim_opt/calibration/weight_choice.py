@@ -10,7 +10,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import phase
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight
-from rpim_opt.convex.select import Selection, Selector, selector_of
+from rpim_opt.convex.select import Selection, Selector, weight_of
 
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this share of the solution, then stays."""
@@ -141,8 +141,7 @@ def _resolution(selection: Selection | None) -> float:
 
 def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
     """Return how a weight is to be found: a number, a selector, or a ready selector's name; or refuse it."""
-    if isinstance(weight, str):
-        weight = selector_of(weight, also="a number, a selector, ")
+    weight = weight_of(weight)
     if callable(weight):
         return WeightChoice(weight, settled=not penalized, final=not penalized)
     if isinstance(weight, bool) or not isinstance(weight, int | float | np.integer | np.floating):

@@ -183,20 +183,7 @@ class Program(Brief):
 
     @property
     def closed_form(self) -> bool:
-        """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares).
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
-        >>> for stated in (ro.tikhonov, ro.bounded, ro.lasso, ro.robust):
-        ...     p = ro.convex.pose(stated, model)
-        ...     print(f"{stated.name:17}", p.closed_form, p.quadratic, p.linear_penalty, p.constrained)
-        Tikhonov          True True True False
-        bounded Tikhonov  False True True True
-        lasso             False False False False
-        Huber             False False True False
-        """
+        """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares)."""
         return self.quadratic and not self.constrained
 
     @property
@@ -460,15 +447,7 @@ class Program(Brief):
 
     @one_blas_thread
     def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
-        """Return the solutions at many weights (K,), zero or more: all at once by formula, or each from its neighbour.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> program = ro.convex.pose(ro.lasso, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> [round(estimate.penalty, 2) for estimate in program.path([1e2, 1e4, 1e6])]
-        [10.07, 3.56, 0.33]
-        """
+        """Return the solutions at many weights (K,), zero or more: by formula, or each from its neighbour."""
         checked = np.array([self._weight(weight) for weight in weights])
         if self.closed_form:
             Z = self.ridge.minima(checked)

@@ -47,12 +47,10 @@ def compare(program: Program) -> dict[str, Selection]:
     gcv      1
     """
     quick = program.closed_form and len(np.unique(program.model.group)) <= 200
-    asked = dict(SELECTORS)
-    if not quick:
-        for slow in ("leave_one_out", "k_fold", "two_step"):
-            del asked[slow]
     chosen = {}
-    for name, rule in asked.items():
+    for name, rule in SELECTORS.items():
+        if not quick and name in ("leave_one_out", "k_fold", "two_step"):
+            continue
         with contextlib.suppress(InputError, NoSolutionFound):  # it does not serve this formulation or these data
             chosen[name] = rule(program)
     return chosen
@@ -94,9 +92,4 @@ def weight_of(stated: Any) -> Any:
     """
     if not isinstance(stated, str):
         return stated
-    return None if stated == LEARNED else selector_of(stated, also=f"a number, a selector, {LEARNED}, ")
-
-
-def selector_of(stated: Selector | str, also: str = "a selector, ") -> Selector:
-    """Return a selector, or the ready one of that name; ``also`` is what else a user could state."""
-    return pick(SELECTORS, stated, "weight", also=also) if isinstance(stated, str) else stated
+    return None if stated == LEARNED else pick(SELECTORS, stated, "weight", also=f"a number, a selector, {LEARNED}, ")

@@ -34,7 +34,7 @@ from rpim_opt.convex.given import given
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
 from rpim_opt.convex.solvers.conic import Canonical
 from rpim_opt.convex.solvers.separable import Loss
-from rpim_opt.convex.trust import SMALL, Squares, Trusted, separable, trusted
+from rpim_opt.convex.trust import Squares, Trusted, separable, trusted
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 
@@ -390,17 +390,7 @@ class Structure:
 
     def trusted(self, lengths: Array, count: np.ndarray) -> Trusted:
         """Return the rows that the loss trusts, of configurations with these norms and numbers of equations (N,)."""
-
-        def slope_at(v: Array) -> Array | None:
-            if len(self.answers.loss.expression.variables()) > 1:  # own ones, of whose values the slope depends
-                return None
-            size = self.answers.loss.variable.size
-            if size < len(v):  # a program of n + 1 rows
-                return term(self.formulation.loss, len(v), "loss").slope(v)
-            slope = self.answers.loss.slope(np.concatenate([v, np.full(size - len(v), SMALL)]))
-            return None if slope is None else slope[: len(v)]
-
-        return trusted(self.formulation.name, slope_at, lengths, count, self.formulation.loss_over)
+        return trusted(self.formulation, lengths, count, self.answers.loss)
 
     def met(self, z: Array) -> bool:
         """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""

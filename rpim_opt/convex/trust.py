@@ -14,7 +14,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.expressions import Term, term
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
 
 RARE = 0.01
@@ -83,41 +82,30 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
     return replace(model, A=A, b=b, group=model.group[keep])
 
 
-def trusted(
-    name: str, slope_at: Callable[[Array], Array | None], norms: Array, count: np.ndarray, over: str
-) -> Trusted:
-    """Return what a robust formulation trusts: its factor is the median of loss'(v) / (2 v) over what it keeps.
+def trusted(formulation: Formulation, norms: Array, count: np.ndarray, loss: Term | None = None) -> Trusted:
+    """Return what a robust formulation trusts of configurations with whitened norms (N,) and ``count`` equations.
 
-    v are the norms of the configurations (N,); of a loss over equations norm / sqrt(count), each equation's share, so
-    that storage does not matter. InputError for a loss without a slope, or that rests on few equations (minimax).
+    Its factor is the median of loss'(v) / (2 v) over what it keeps, v the norms, or of a loss over equations norm /
+    sqrt(count), each equation's share, so that storage does not matter. ``loss`` is that of one posed program.
+    InputError for a loss without a slope, or that rests on few equations (minimax).
     """
     noise = noise_level(norms, count)
     keep = norms <= limits(noise, len(norms), count)
-    v = norms[keep]
-    if over == "equation":
-        v = v / np.sqrt(count[keep])
-    v = np.maximum(v, SMALL)
-    found, accepted = (
-        f"formulation '{name}'",
-        "a loss with slopes, which covariances and most rules need; monte_carlo, l_curve, k_fold do not",
-    )
-    slope = slope_at(v)
-    if slope is None or len(slope) != len(v):
+    share = np.sqrt(count[keep]) if formulation.loss_over == "equation" else 1.0
+    v = np.maximum(norms[keep] / share, SMALL)
+    if loss is None or loss.variable.size < len(v):  # of blocks, or of n + 1 rows
+        loss = term(formulation.loss, len(v), f"formulation '{formulation.name}', loss")
+    slope = None
+    if len(loss.expression.variables()) == 1:  # else there are own ones, on whose values the slope depends
+        slope = loss.slope(np.concatenate([v, np.full(loss.variable.size - len(v), SMALL)]))
+    found = f"formulation '{formulation.name}'"
+    accepted = "a loss with slopes, which covariances and most rules need; monte_carlo, l_curve, k_fold do not"
+    if slope is None:
         raise InputError(found, "a loss without slope", accepted)
-    factor = float(np.median(np.abs(slope) / (2 * v))) if len(v) else 0.0
+    factor = float(np.median(np.abs(slope[: len(v)]) / (2 * v))) if len(v) else 0.0
     if not factor > 0:
         raise InputError(found, "a loss that rests on a few equations", accepted)
     return Trusted(noise, len(norms), factor)
-
-
-def trusted_rows(source: Source, x: Array, formulation: Formulation) -> Trusted:
-    """Return what a robust formulation trusts of measurements in memory or blocks, at deviations x (n,) [SI]."""
-    norms, count = source.configuration_errors(x)
-
-    def slope_at(v: Array) -> Array | None:
-        return term(formulation.loss, len(v), f"formulation '{formulation.name}', loss").slope(v)
-
-    return trusted(formulation.name, slope_at, norms, count, formulation.loss_over)
 
 
 # --- blocks of rows ---
@@ -160,7 +148,17 @@ class Squares:
         priced = term(self.loss, len(v), f"formulation '{self.name}', loss")
         slope = self.slope(priced, v)
         across = slope / (2 * v)
-        along = np.maximum(self._along(model, z, which, v, priced), LEAST_CURVATURE * across)
+        # half the curvature along residuals, by the slopes here and where a step may lead: at first where the slope,
+        # which is odd, is the negative one, as such squares lie nowhere below the loss
+        change = 2 * v
+        if self.before is not None:
+            moved = np.sqrt(np.bincount(which, (model.A @ (z - self.before)) ** 2))
+            change = np.clip(SHARE * moved, STEP * v, 2 * v)
+            if self.slope(priced, np.full(len(v), SMALL))[0] > 0.1 * self.slope(priced, np.ones(len(v)))[0]:
+                change = np.where(moved > CROSSING * v, 2 * v, change)
+        there = v - change
+        slope_there = np.sign(there) * self.slope(priced, np.maximum(np.abs(there), SMALL))
+        along = np.maximum((slope - slope_there) / (2 * change), LEAST_CURVATURE * across)
         u = r / v[which]
         along_u = scipy.sparse.csr_array((u, (which, np.arange(len(r)))), (len(v), len(r)))
         projected = along_u @ model.A  # u'A, group by group
@@ -169,18 +167,6 @@ class Squares:
         shift = np.divide(slope, 2 * np.sqrt(along), out=np.zeros_like(slope), where=along > 0)
         b = A @ z - shift[which] * u
         return replace(model, A=A, b=b), priced(norms) - float(np.sum((A @ z - b) ** 2))
-
-    def _along(self, model: LinearModel, z: Array, which: np.ndarray, v: Array, priced: Term) -> Array:
-        """Return half the curvature along residuals of norms v, by the slopes here and where a step may lead."""
-        change = 2 * v  # where the slope, which is odd, is the negative one: such squares lie nowhere below the loss
-        if self.before is not None:
-            moved = np.sqrt(np.bincount(which, (model.A @ (z - self.before)) ** 2))
-            change = np.clip(SHARE * moved, STEP * v, 2 * v)
-            if self.slope(priced, np.full(len(v), SMALL))[0] > 0.1 * self.slope(priced, np.ones(len(v)))[0]:
-                change = np.where(moved > CROSSING * v, 2 * v, change)
-        there = v - change
-        slope_there = np.sign(there) * self.slope(priced, np.maximum(np.abs(there), SMALL))
-        return (self.slope(priced, v) - slope_there) / (2 * change)
 
     def slope(self, priced: Term, v: Array) -> Array:
         """Return the loss's slopes at norms v, one each; InputError where CVXPY knows none."""

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 import rpim_opt as ro
-from rpim_opt.convex.trust import Trusted, kept_equations, limits, noise_level, outlying, trusted, trusted_rows
+from rpim_opt.convex.trust import Trusted, kept_equations, limits, noise_level, outlying, trusted
 from rpim_opt.problem.linear import LinearModel
 from tests.simulate import simulated
 
@@ -24,9 +24,7 @@ def linear() -> LinearModel:
     return problem.linearize(np.zeros(len(problem.parameters.free)))
 
 
-def huber_slope(v: np.ndarray) -> np.ndarray:
-    """Of v^2 up to 1.5, and of 3 v - 2.25 beyond."""
-    return 2 * np.minimum(v, 1.5)
+HUBER = ro.Formulation("f", loss=ro.huber(1.5), loss_over="configuration")
 
 
 @pytest.mark.parametrize(("scatter", "noise"), [(0.3, 1.0), (1.0, 1.0), (7.0, 7.0)])
@@ -94,8 +92,8 @@ def test_a_factor_is_the_losss_over_the_squares() -> None:
     """Huber's loss is the square within its threshold, and falls behind it as threshold / v."""
     norms = np.array([0.1, 1.0, 1.2, 3.0, 3.1, 3.2, 3.3, 1e9])
     count = np.full(8, 3)
-    assert trusted("f", huber_slope, norms[:3], count[:3], "configuration").factor == 1.0
-    some = trusted("f", huber_slope, norms, count, "configuration")
+    assert trusted(HUBER, norms[:3], count[:3]).factor == 1.0
+    some = trusted(HUBER, norms, count)
     assert some.factor == pytest.approx(1.5 / 3.0, rel=1e-12)  # the median of seven: the blunder is not among them
     assert some.configurations == 8
     assert some.noise == pytest.approx(noise_level(norms, count), rel=1e-12)
@@ -103,25 +101,25 @@ def test_a_factor_is_the_losss_over_the_squares() -> None:
 
 def test_a_factor_by_equations_is_that_of_their_sizes() -> None:
     norms, count = np.full(4, 3.0 * np.sqrt(3)), np.full(4, 3)  # three sigmas of each equation
-    assert trusted("f", huber_slope, norms, count, "equation").factor == pytest.approx(1.5 / 3.0, rel=1e-12)
+    assert trusted(replace(HUBER, loss_over="equation"), norms, count).factor == pytest.approx(1.5 / 3.0, rel=1e-12)
 
 
 def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
-    found = trusted("f", np.ones_like, np.zeros(3), np.full(3, 3), "configuration")
+    found = trusted(ro.sum_of_norms, np.zeros(3), np.full(3, 3))
     assert found.factor == pytest.approx(0.5e6, rel=1e-12)
 
 
 @pytest.mark.parametrize(
-    ("slope", "said"),
+    ("loss", "said"),
     [
-        (lambda v: None, "a loss without slope"),
-        (lambda v: np.ones(len(v) + 1), "a loss without slope"),
-        (lambda v: np.eye(1, len(v))[0], "a loss that rests on a few equations"),
+        (lambda v: cp.sum_squares(v - cp.Variable()), "a loss without slope"),
+        (cp.max, "a loss that rests on a few equations"),
     ],
 )
-def test_a_loss_that_has_no_factor_is_named(slope: Any, said: str) -> None:
+def test_a_loss_that_has_no_factor_is_named(loss: Any, said: str) -> None:
+    mine = ro.Formulation("mine", loss=loss)
     with pytest.raises(ro.InputError, match=f"formulation 'mine': found {said}, accepted: a loss with slopes"):
-        trusted("mine", slope, np.full(5, 2.0), np.full(5, 3), "configuration")
+        trusted(mine, np.full(5, 2.0), np.full(5, 3))
 
 
 def test_what_parts_trust_is_what_whole_data_do() -> None:
@@ -129,7 +127,7 @@ def test_what_parts_trust_is_what_whole_data_do() -> None:
     x = ro.calibrate(instance.problem, ro.robust, 1.0).x
     z = x / instance.problem.parameters.free.scale
     program = ro.convex.pose(ro.robust, instance.problem.linearize(x))
-    whole, parts = program.trust(z), trusted_rows(instance.problem, x, ro.robust)
+    whole, parts = program.trust(z), trusted(ro.robust, *instance.problem.configuration_errors(x))
     assert whole is not None
     assert (parts.noise, parts.factor) == pytest.approx((whole.noise, whole.factor), rel=1e-9)
     assert parts.configurations == whole.configurations
@@ -141,5 +139,5 @@ def test_parts_take_the_equations_of_a_configuration_as_alike() -> None:
     formulation = replace(ro.robust, loss=cp.norm1, loss_over="equation")
     norms, count = instance.problem.configuration_errors(x)
     typical = norms[norms <= outlying(norms, count)] / np.sqrt(3)
-    parts = trusted_rows(instance.problem, x, formulation)
+    parts = trusted(formulation, norms, count)
     assert parts.factor == pytest.approx(np.median(0.5 / typical), rel=0.2)

@@ -13,7 +13,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics import threads
 from rpim_opt.calibration import words
-from rpim_opt.convex.trust import Squares, trusted_rows
+from rpim_opt.convex.trust import Squares, trusted
 from rpim_opt.problem import blocks as parts_module
 from rpim_opt.problem.blocks import PartitionedProblem, in_parts, on_cluster, whole_configurations
 
@@ -189,7 +189,8 @@ def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationPro
     assert here.spread.noise_variance == pytest.approx(there.spread.noise_variance, rel=1e-5)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=0, atol=1e-5 * np.abs(there.covariance).max())
     chosen = ro.calibrate(apart(whole), ro.robust, ro.reml)
-    squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, trusted_rows(whole, chosen.x, ro.robust)))
+    trust = trusted(ro.robust, *whole.configuration_errors(chosen.x))
+    squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, trust))
     # the weight stays from where steps are shorter than a thousandth of the solution
     assert chosen.weight == pytest.approx(ro.reml(squared).weight, rel=1e-2)
 

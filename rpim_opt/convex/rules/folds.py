@@ -171,19 +171,41 @@ def _singly(program: Program) -> list[np.ndarray] | None:
 
 
 def _error_of_folds(program: Program, parts: Sequence[np.ndarray] | None) -> Score:
-    """Return what gives `held_out_error`."""
-    groups = np.unique(program.model.group)
+    """Return what gives `held_out_error`: the program without each of the parts, solved again."""
+    model = program.model
+    groups = np.unique(model.group)
     if len(groups) < 2:
         raise InputError("data", "one configuration", "two or more to hold one out")
-    folds = Folds(program, list(groups[:, None]) if parts is None else parts)
-    return lambda weights: _error(program, folds.norms(weights))
+    if parts is None:
+        parts = list(groups[:, None])
+    part_of = np.full(int(groups.max()) + 1, -1)
+    for k, part in enumerate(parts):
+        part_of[part] = k
+    rows = [np.flatnonzero(part_of[model.group] == k) for k in range(len(parts))]
 
+    def without(out: np.ndarray) -> Program:
+        kept = np.ones(len(model.group))
+        kept[out] = 0.0
+        return program.apart(model.scaled(kept))
 
-def _error(program: Program, norms: Array) -> Array:
-    """Return what left-out norms (K, N) amount to: (K,)."""
-    if program.loss_form is None:
-        return np.median(norms, axis=1)
-    return np.sqrt(np.sum(norms**2, axis=1) / len(program.model.b))
+    kept = [without(out) for out in rows] if len(parts) * model.A.nbytes <= MEMORY else []
+
+    def error(weights: Array) -> Array:
+        found = []
+        for k, out in enumerate(rows):
+            estimates = solved(kept[k] if kept else without(out), weights)
+            Z = np.array([each.z if each else np.full(model.A.shape[1], np.nan) for each in estimates])
+            squares = (Z @ model.A[out].T - model.b[out]) ** 2
+            which = np.unique(model.group[out], return_inverse=True)[1]
+            sums = np.zeros((which.max() + 1, len(weights)))
+            np.add.at(sums, which, squares.T)
+            found.append(sums)
+        norms2 = np.vstack(found)  # of the left-out configurations, at every weight
+        if program.loss_form is None:
+            return np.median(np.sqrt(norms2), axis=0)
+        return np.sqrt(np.sum(norms2, axis=0) / len(model.b))
+
+    return error
 
 
 def _solved(M: Array, v: Array) -> Array:
@@ -237,41 +259,3 @@ def _of_squares(program: Program) -> Score:
 
     few = max(1, MANY // len(target))
     return lambda weights: np.concatenate([some(weights[k : k + few]) for k in range(0, len(weights), few)])
-
-
-class Folds:
-    """A program without each of some parts of its configurations, solved again."""
-
-    def __init__(self, program: Program, parts: Sequence[np.ndarray]):
-        self._whole = program
-        group = program.model.group
-        part_of = np.full(int(group.max()) + 1, -1)
-        for k, part in enumerate(parts):
-            part_of[part] = k
-        self._rows = [np.flatnonzero(part_of[group] == k) for k in range(len(parts))]
-        self._kept: list[Program] = []
-        if len(parts) * program.model.A.nbytes <= MEMORY:
-            self._kept = [self._without(rows) for rows in self._rows]
-
-    def _without(self, rows: np.ndarray) -> Program:
-        kept = np.ones(len(self._whole.model.group))
-        kept[rows] = 0.0
-        return self._whole.apart(self._whole.model.scaled(kept))
-
-    def norms(self, weights: Array) -> Array:
-        """Return the norms (K, N) of the residuals of what is left out, in the order of the parts.
-
-        They are NaN at a weight at which the solver fails.
-        """
-        model = self._whole.model
-        found = []
-        for k, out in enumerate(self._rows):
-            program = self._kept[k] if self._kept else self._without(out)
-            nothing = np.full(model.A.shape[1], np.nan)
-            Z = np.array([each.z if each else nothing for each in solved(program, weights)])
-            squares = (Z @ model.A[out].T - model.b[out]) ** 2
-            _, which = np.unique(model.group[out], return_inverse=True)
-            sums = np.zeros((which.max() + 1, len(weights)))
-            np.add.at(sums, which, squares.T)
-            found.append(np.sqrt(sums.T))
-        return np.hstack(found)

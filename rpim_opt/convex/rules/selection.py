@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
@@ -192,35 +193,22 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     if program.quadratic:
         return grid_of(program.ridge, count)
     weights = grid_of(ridge(program.model, program.penalty_form), count)
-    largest = _largest(program)
-    if largest is None:
-        return weights
-    least = float(np.clip(weights[0], LEAST * largest, MOST * largest))
-    return np.geomspace(least, largest, count)
-
-
-def _largest(program: Program) -> float | None:
-    """Return the weight from which a penalty leaves nothing to identify; None where there is none.
-
-    Of a positively homogeneous penalty it is max { -g'z : penalty(z) <= 1 }, g the loss's slope at nominal.
-    """
-    if program.linear_penalty or program.structure.inner or program.loss_form is None:
-        return None
     n = program.model.A.shape[1]
-    slope = program.gradient(np.zeros(n), 0.0)
+    slope = None if program.linear_penalty or program.structure.inner else program.gradient(np.zeros(n), 0.0)
     probe = np.cos(np.arange(1, n + 1))
-    once, twice = program.value(probe)[1], program.value(2 * probe)[1]
-    if slope is None or program.value(0 * probe)[1] != 0 or abs(twice - 2 * once) > HOMOGENEOUS * once:
-        return None
+    none, once, twice = (program.value(k * probe)[1] for k in (0, 1, 2))
+    if slope is None or none != 0 or abs(twice - 2 * once) > HOMOGENEOUS * once:
+        return weights
+    # of a positively homogeneous penalty the largest is max { -g'z : penalty(z) <= 1 }, g the loss's slope at nominal
     answers = program.structure.answers
     problem = cp.Problem(cp.Minimize(slope @ answers.z), [answers.penalty_of_z <= 1])
     answers.z.save_value(None)
-    try:
+    with contextlib.suppress(cp.SolverError):
         problem.solve(solver=cp.CLARABEL)
-    except cp.SolverError:
-        return None
     value: Any = problem.value
-    return -float(value) if problem.status == cp.OPTIMAL and value < 0 else None
+    if problem.status != cp.OPTIMAL or not value < 0:
+        return weights
+    return np.geomspace(np.clip(weights[0], LEAST * -value, MOST * -value), -value, count)
 
 
 def grid_of(form: Ridge, count: int = 200) -> Array:

@@ -347,20 +347,6 @@ def gram(A: Array, weights: Array) -> Array:
     return H
 
 
-def kink_of(loss: Loss, rows: Rows) -> float:
-    """Return the largest jump of a loss's slope: by residuals, or where norms are zero."""
-    size = float(np.sqrt(np.mean(rows.entries(rows.b) ** 2))) or 1.0
-    kink = loss.jump(size)
-    if rows.sizes is None:
-        return kink
-    count = len(rows.sizes)
-    at_zero = float(loss.slope(np.full(count, 1e-12 * size)).max())
-    far = float(loss.slope(np.full(count, size)).max())
-    if at_zero > 1e-3 * far:  # f(|r|) has a kink where f rises at once
-        return max(kink, at_zero)
-    return kink
-
-
 # --- sums over entries, read from CVXPY's expression tree ---
 
 
@@ -473,8 +459,9 @@ class Loss:
         total = cp.sum(_restricted(self.entries, self.variable, own, which))
         return total if self.threshold is None else total + self.threshold, own
 
-    def jump(self, size: float) -> float:
-        """Return the largest jump of the slope within 5 ``size`` of zero, 0 where f is smooth; by bisection."""
+    def kink(self, rows: Rows) -> float:
+        """Return the largest jump of the slope by residuals of usual size, or where norms are zero; 0 for none."""
+        size = float(np.sqrt(np.mean(rows.entries(rows.b) ** 2))) or 1.0
         which = np.unique(np.linspace(0, self.variable.size - 1, PROBES).astype(int))
         own = cp.Variable(len(which))
         evaluated = evaluation(_restricted(self.entries, self.variable, own, which), own)
@@ -486,16 +473,18 @@ class Loss:
         high = np.full(len(which), 5.0 * size)
         slope_low, slope_high = slope(low), slope(high)
         total = slope_high - slope_low
-        for _ in range(45):
+        for _ in range(45):  # by bisection
             middle = (low + high) / 2
             at = slope(middle)
             left = at - slope_low > slope_high - at
             high, slope_high = np.where(left, middle, high), np.where(left, at, slope_high)
             low, slope_low = np.where(left, low, middle), np.where(left, slope_low, at)
         jump = slope_high - slope_low
-        if (jump > JUMP * total).any():
-            return float(jump.max())
-        return 0.0
+        kink = float(jump.max()) if (jump > JUMP * total).any() else 0.0
+        if self.positive:  # f(|r|) has a kink where f rises at once
+            at_zero, far = (float(self.slope(np.full(self.variable.size, at)).max()) for at in (1e-12 * size, size))
+            kink = max(kink, at_zero) if at_zero > 1e-3 * far else kink
+        return kink
 
 
 # --- the expression tree -----------------------------------------------------------------------------------------

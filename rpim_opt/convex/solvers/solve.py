@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.solvers.conic import EQUILIBRATED, Canonical, Damping, Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows, kink_of
+from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows
 
 GENERATIONS = 40
 """Working sets of entries before all rows are taken."""
@@ -89,7 +89,7 @@ def minimum(
 
 def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
     if warm.kink < 0:
-        warm.kink = kink_of(loss, rows)
+        warm.kink = loss.kink(rows)
     if warm.kink and loss.variable.size <= FEW:
         return _all_rows(loss, rows, warm, weight, None, damping)
     small = warm.program(rows.A.shape[1] + 1)
