@@ -233,12 +233,6 @@ class Judged:
     evidence: Evidence
     point: Point
 
-    @cached_property
-    def residual(self) -> Array:
-        """Residuals (m,) [SI]."""
-        data = self.evidence.data
-        return data.y - data.X @ self.point.z
-
 
 class Comparison(Models):
     """Models with and without extensions, all at the linearization of one result, whatever its weight.
@@ -291,11 +285,6 @@ class Comparison(Models):
         if families:
             model = self._fitted(families, self.members(families))
         return Candidate(model.point.value + SPEAK * len(families), families, model)
-
-    @cached_property
-    def gain(self) -> float:
-        """By how much -2 ln L falls from the result's model to the best."""
-        return self.plain.point.value - self.best.point.value
 
     def rise_without(self, members: np.ndarray) -> float:
         """Return by how much -2 ln L would rise without some of the result's own parameters (n,)."""

@@ -9,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes import prior_terms as terms
 from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
+from rpim_opt.convex.given import places
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
 from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
 from rpim_opt.robot.parameters import Parameters, overlay
@@ -253,10 +254,8 @@ class Prior:
 
     def _grouped(self, parameters: Parameters, known: np.ndarray) -> tuple[np.ndarray, tuple[str, ...]]:
         """Return every identified parameter's group by number, and the names; some scales (P,) are known."""
-        for group in self.groups:
-            for pattern in group:
-                if not any(fits(name, pattern) for name in parameters.names):
-                    raise InputError("prior, key groups", f"'{pattern}'", choices(pattern, parameters.names))
+        for pattern in (pattern for group in self.groups for pattern in group):
+            places(parameters.names, pattern, "prior, key groups")
         free = parameters.free
         keys = []
         for name, dimension in zip(free.names, free.dimensions, strict=True):

@@ -282,7 +282,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         repeatable=float(np.sqrt(share * total)),
         missing=best.families,
         parameters=tuple(p for family in best.families for p in EXTENSIONS[family].identify),
-        gain=compared.gain,
+        gain=compared.plain.point.value - best.point.value,
         share=share,
         present=present,
         alike=_residual_autocorrelation(compared, best),
@@ -408,10 +408,11 @@ def _residual_autocorrelation(compared: Comparison, model: Judged) -> Autocorrel
         return None
     scatter = model.evidence.scatter(model.point.logs)
     stacks = model.evidence.data.stacks
+    residual = model.evidence.data.y - model.evidence.data.X @ model.point.z
     widest = max(stack.index.shape[1] for stack in stacks)
     errors, kinds, first = [], [], []
     for kind, stack in enumerate(stacks):
-        e = model.residual[stack.index] / np.sqrt(np.einsum("nkk->nk", stack.covariance(scatter)))
+        e = residual[stack.index] / np.sqrt(np.einsum("nkk->nk", stack.covariance(scatter)))
         errors.append(np.pad(e, ((0, 0), (0, widest - e.shape[1]))))
         kinds.append(np.full(len(e), kind))
         first.append(compared.row[stack.index[:, 0]])

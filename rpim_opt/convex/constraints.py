@@ -12,7 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import UNITS, display, fits
+from rpim_opt.basics.units import UNITS, display
 from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
 from rpim_opt.problem.workspace import within_box, within_ranges
@@ -242,11 +242,7 @@ def matching(parameters: Parameters, patterns: Sequence[str], what: str) -> np.n
         raise InputError(what, "no pattern", "names or patterns of identified parameters")
     chosen = np.zeros(len(parameters), dtype=bool)
     for pattern in patterns:
-        hits = np.array([fits(name, pattern) for name in parameters.names])
-        if not hits.any():
-            accepted = "identified parameters: " + choices(pattern, parameters.names)
-            raise InputError(what, f"pattern '{pattern}'", accepted)
-        chosen |= hits
+        chosen[places(parameters.names, pattern, what, "identified parameters")] = True
     return chosen
 
 

@@ -17,11 +17,11 @@ from rpim_opt.problem.workspace import Predicted, markers, moved, predicted
 from rpim_opt.robot.parameters import Parameters
 
 
-def places(names: Sequence[str], pattern: str, where: str) -> list[int]:
+def places(names: Sequence[str], pattern: str, where: str, kind: str = "parameters") -> list[int]:
     """Return which names match a pattern (``*``, ``?``, ``[...]``), one at least."""
     found = [i for i, name in enumerate(names) if fits(name, pattern)]
     if not found:
-        raise InputError(where, f"'{pattern}'", "parameters: " + choices(pattern, names))
+        raise InputError(where, f"'{pattern}'", f"{kind}: {choices(pattern, names)}")
     return found
 
 

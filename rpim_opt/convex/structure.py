@@ -99,18 +99,16 @@ def answers(formulation: Formulation, parameters: Parameters, equations: int, gr
         of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
         live.append(listed(called(constraint, of, z, known), of))
     penalty_of_z = None if penalty is None else over_z(penalty.expression)
+    composed = {"penalty": penalty_of_z}
     if seen is not r:  # norms are convex and nonnegative, as absolute values are
-        _require_convex(f"{where}, loss", substituted(loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))}))
-    _require_convex(f"{where}, penalty", penalty_of_z)
+        composed["loss"] = substituted(loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))})
+    for what, expression in composed.items():
+        if expression is not None and not expression.is_convex():
+            accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
+            raise InputError(f"{where}, {what}", "a program that is not convex", accepted)
     constraints = [[frozen(each) for each in group] for group in live]
     stated = live_loss, over_z(live_penalty), live
     return Answers(z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, stated, bool(known.asked))
-
-
-def _require_convex(where: str, expression: Any) -> None:
-    if expression is not None and not expression.is_convex():
-        accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
-        raise InputError(where, "a program that is not convex", accepted)
 
 
 def declared_form(function: Any, size: int) -> Quadratic | None:

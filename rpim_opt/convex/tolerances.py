@@ -245,7 +245,10 @@ class _Reader:
             if len(set(relations)) > 1 or len(relations) > (1 if "=" in relations else 2):
                 accepted = "one relation, or a chain like '89.9 deg <= alpha2 <= 90.1 deg'"
                 raise self._wrong(" and ".join(relations), accepted)
-            sums = tuple(self._difference(*pair) for pair in pairwise(each for _, (each,) in sides))
+            pairs = list(pairwise(each for _, (each,) in sides))
+            if any(left.nominal and right.nominal for left, right in pairs):
+                raise self._wrong("nominal on both sides", "on one of them")
+            sums = tuple(left.plus(right, -1) for left, right in pairs)
             if "=" in relations:
                 limit = tolerance or 0.0
                 kind = "within" if limit else "equal"
@@ -323,8 +326,3 @@ class _Reader:
         twice = [name for name, times in Counter(found.names).items() if times > 1]
         if twice:
             raise self._wrong(f"'{twice[0]}' twice", "every parameter once")
-
-    def _difference(self, left: Sum, right: Sum) -> Sum:
-        if left.nominal and right.nominal:
-            raise self._wrong("nominal on both sides", "on one of them")
-        return left.plus(right, -1)
