@@ -26,7 +26,13 @@ def least(function: Callable[[float], float], low: float, high: float, accuracy:
         middle = (low + high) / 2
         if abs(best - middle) + (high - low) / 2 <= accuracy:
             break
-        step = _to_vertex(points) if len(points) == 3 else None
+        step = None
+        if len(points) == 3:  # to the lowest point of their parabola
+            (x, y), (v, f), (w, g) = points
+            one = (x - v) * (y - g)
+            other = (x - w) * (y - f)
+            if one != other:
+                step = ((x - w) * other - (x - v) * one) / (2 * (one - other))
         if step is None or abs(step) >= abs(before) / 2 or not low < best + step < high:
             last = low - best if best > middle else high - best
             step = GOLDEN * last
@@ -39,12 +45,3 @@ def least(function: Callable[[float], float], low: float, high: float, accuracy:
         low, high = (outer[0], high) if outer[0] < inner[0] else (low, outer[0])
         points = sorted([tried, *points], key=lambda point: point[1])[:3]
     return points[0]
-
-
-def _to_vertex(points: list[Point]) -> float | None:
-    """Return the way from the first of three points to their parabola's lowest; None where there is none."""
-    (x, y), (v, f), (w, g) = points
-    one = (x - v) * (y - g)
-    other = (x - w) * (y - f)
-    below = 2 * (one - other)
-    return ((x - w) * other - (x - v) * one) / below if below else None

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -36,20 +35,15 @@ class Table(BaseModel):
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
-    @classmethod
-    @cache
-    def _dimensions(cls) -> dict[str, tuple[str, ...]]:
-        known = {unit.dimension for unit in UNITS.values()}
-        found = {name: tuple(m for m in field.metadata if m in known) for name, field in cls.model_fields.items()}
-        return {name: dimensions for name, dimensions in found.items() if dimensions}
-
     @model_validator(mode="before")
     @classmethod
     def _to_si(cls, table: Any) -> Any:
         """Return a table with its quantities [SI]; a stem may stand there once, whatever its unit."""
         if not isinstance(table, dict):
             return table
-        dimensions = cls._dimensions()
+        every = {unit.dimension for unit in UNITS.values()}
+        of_fields = {name: tuple(m for m in field.metadata if m in every) for name, field in cls.model_fields.items()}
+        dimensions = {name: known for name, known in of_fields.items() if known}
         plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
         others = {key: value for key, value in table.items() if key not in plain}
         try:

@@ -329,8 +329,13 @@ def _excel(path: Path, sheet: str) -> Grid:
                 raise InputError("the file", f"{size} bytes unpacked", accepted)
             book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
             names = [each.title for each in book.worksheets]
-            chosen = ""
-            for chosen in [_sheet(names, sheet)] if sheet else names:
+            chosen = sheet
+            if sheet and sheet not in names:
+                number = int(sheet) if sheet.isdigit() else 0
+                if not 0 < number <= len(names):
+                    raise InputError("--sheet", f"'{sheet}'", choices(sheet, names))
+                chosen = names[number - 1]
+            for chosen in [chosen] if sheet else names:
                 rows = list(_filled(book[chosen]))
                 if rows:
                     break
@@ -341,14 +346,6 @@ def _excel(path: Path, sheet: str) -> Grid:
     how = "as stated" if sheet else "the first with cells; another one, or several, by --sheet"
     notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
-
-
-def _sheet(names: Sequence[str], stated: str) -> str:
-    if stated not in names and stated.isdigit() and 0 < int(stated) <= len(names):
-        return names[int(stated) - 1]
-    if stated not in names:
-        raise InputError("--sheet", f"'{stated}'", choices(stated, names))
-    return stated
 
 
 def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:

@@ -163,7 +163,23 @@ def number(value: float | None) -> str:
 def summarize(rows: Rows, metric: str, reference: str, drawn: AbstractSet[str]) -> Summary:
     """Return the methods in their order, each against a reference; ``drawn`` are problems that a seed draws."""
     of = figures(rows, metric)
-    known = [_standing(rows, method, of[method], of[reference], drawn) for method in of if of[method]]
+    other = of[reference]
+    least = np.finfo(float).tiny  # figures that are zero are as good as a rounding error
+    known = []
+    for method, own in of.items():
+        if not own:
+            continue
+        mine = [row for row in rows if row["method"] == method]
+        logs = {pair: np.log(max(own[pair], least) / max(other[pair], least)) for pair in own if pair in other}
+        compared = {_pair(row) for row in mine} & (set(own) | set(other))
+        wins = sum(pair in own and (pair not in other or logs[pair] < -TIE) for pair in compared)
+        losses = sum(pair in other and (pair not in own or logs[pair] > TIE) for pair in compared)
+        unconverged = sum(row["status"] == UNCONVERGED for row in mine)
+        standing = Standing(
+            method, len(mine), len(mine) - len(own), unconverged, float(np.median(list(own.values()))),
+            max(own.values()), *interval(logs, drawn), wins, len(compared) - wins - losses, losses,
+        )  # fmt: skip
+        known.append(standing)
     known.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
     return Summary(metric, reference, tuple(known), _notes(rows, known, drawn, reference))
 
@@ -190,27 +206,6 @@ def geometric_mean(ratios: Sequence[float] | Array) -> float:
 
 def _pair(row: Mapping[str, Any]) -> Pair:
     return tuple(row[name] for name in SAME_DATA)
-
-
-def _standing(
-    rows: Rows, method: str, own: Mapping[Pair, float], other: Mapping[Pair, float], drawn: AbstractSet[str]
-) -> Standing:
-    mine = [row for row in rows if row["method"] == method]
-    ratios = {pair: _log_ratio(own[pair], other[pair]) for pair in own if pair in other}
-    compared = {_pair(row) for row in mine} & (set(own) | set(other))
-    wins = sum(pair in own and (pair not in other or ratios[pair] < -TIE) for pair in compared)
-    losses = sum(pair in other and (pair not in own or ratios[pair] > TIE) for pair in compared)
-    unconverged = sum(row["status"] == UNCONVERGED for row in mine)
-    return Standing(
-        method, len(mine), len(mine) - len(own), unconverged, float(np.median(list(own.values()))), max(own.values()),
-        *interval(ratios, drawn), wins, len(compared) - wins - losses, losses,
-    )  # fmt: skip
-
-
-def _log_ratio(one: float, other: float) -> float:
-    """Return the logarithm of a ratio; figures that are zero are as good as a rounding error."""
-    least = np.finfo(float).tiny
-    return float(np.log(max(one, least) / max(other, least)))
 
 
 def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[float | None, float | None, float | None]:

@@ -126,7 +126,16 @@ def understand(
             read, rotation = _readings(raw, robot, kind, options, joints, targets)
         columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
         if "rx" in known and (options.rotation or rotation) not in ("", "extrinsic xyz"):
-            columns, meant = _as_quaternions(columns, meant, options.rotation or rotation)
+            how = options.rotation or rotation
+            names = {split_unit(name)[0]: name for name in columns}
+            if any(turn not in names for turn in TURNED):
+                raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
+            turned = [names[turn] for turn in TURNED]
+            angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns.pop(name), name) for name in turned]
+            columns |= quaternions(np.column_stack(angles), how)
+            said = "rotation vector" if how == "vector" else f"turn, {how}"
+            new = "qw, qx, qy, qz"
+            meant = [each._replace(meaning=said, name=new, unit="") if each.name in turned else each for each in meant]
         kept, notes = range(len(next(iter(columns.values()), ()))), []
         if not targets:
             kept, notes = _rows_with_values(columns, robot, kind)
@@ -428,22 +437,6 @@ def _values(cells: Sequence[Any], name: str) -> np.ndarray:
     missing = [is_missing(str(cell)) for cell in cells]
     found = numbers([0.0 if lacks else cell for cell, lacks in zip(cells, missing, strict=True)], name)
     return np.where(missing, np.nan, found)
-
-
-def _as_quaternions(
-    columns: dict[str, Sequence[Any]], meant: Sequence[Meant], rotation: str
-) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
-    """Return columns whose rotation vector, or turns other than roll, pitch, yaw, are a quaternion."""
-    names = {split_unit(name)[0]: name for name in columns}
-    if any(turn not in names for turn in TURNED):
-        raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
-    turned = [names[turn] for turn in TURNED]
-    angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns[name], name) for name in turned]
-    others = {name: cells for name, cells in columns.items() if name not in turned}
-    said = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
-    new = "qw, qx, qy, qz"
-    changed = [each._replace(meaning=said, name=new, unit="") if each.name in turned else each for each in meant]
-    return {**others, **quaternions(np.column_stack(angles), rotation)}, changed
 
 
 # --- rows ----------------------------------------------------------------------------------------------------------
