@@ -329,13 +329,14 @@ def _excel(path: Path, sheet: str) -> Grid:
                 raise InputError("the file", f"{size} bytes unpacked", accepted)
             book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
             names = [each.title for each in book.worksheets]
-            chosen = sheet
+            chosen = ""
+            wanted = [sheet] if sheet else names
             if sheet and sheet not in names:
                 number = int(sheet) if sheet.isdigit() else 0
                 if not 0 < number <= len(names):
                     raise InputError("--sheet", f"'{sheet}'", choices(sheet, names))
-                chosen = names[number - 1]
-            for chosen in [chosen] if sheet else names:
+                wanted = [names[number - 1]]
+            for chosen in wanted:
                 rows = list(_filled(book[chosen]))
                 if rows:
                     break
