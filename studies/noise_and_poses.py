@@ -14,10 +14,11 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
+from scipy.stats import gmean
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
-from rpim_opt.study import Metric, Report, geometric_mean
+from rpim_opt.study import Metric, Report
 
 QUESTION = "How does the error fall with the noise and the number of configurations, and how near is it to the bound?"
 NOISES, COUNTS = (0.01, 0.03, 0.1, 0.3), (8, 12, 20, 35, 60, 100)
@@ -154,7 +155,7 @@ def _of_unknown(rows: list[dict[str, Any]]) -> tuple[str, dict[str, float]]:
             v = np.array([row[name] for row in part])
             over = v / [row["least_squares"] for row in part]
             share = np.mean([row[f"{name}_covers"] for row in part])
-            figures = [f"{np.median(v):.4f}", f"{v.max():.2f}", f"{geometric_mean(over):.2f}", f"{over.max():.2f}"]
+            figures = [f"{np.median(v):.4f}", f"{v.max():.2f}", f"{gmean(over):.2f}", f"{over.max():.2f}"]
             lines.append([str(count), title, *figures, f"{100 * share:.0f} %"])
     seeds = len({row["seed"] for row in rows})
     text = (
@@ -165,7 +166,7 @@ def _of_unknown(rows: list[dict[str, Any]]) -> tuple[str, dict[str, float]]:
     )
     head = ["configurations", "method", "RMS, median", "worst", "over least squares", "worst", "covers"]
     metrics = {
-        "unknown_learned_over_reml": geometric_mean([row["learned"] / row["reml"] for row in rows]),
-        "unknown_auto_over_learned": geometric_mean([row["auto"] / row["learned"] for row in rows]),
+        "unknown_learned_over_reml": gmean([row["learned"] / row["reml"] for row in rows]),
+        "unknown_auto_over_learned": gmean([row["auto"] / row["learned"] for row in rows]),
     }
     return text + markdown(head, lines), metrics

@@ -9,11 +9,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.stats import gmean
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import markdown
-from rpim_opt.study import Metric, Report, distributions, geometric_mean
+from rpim_opt.study import Metric, Report, distributions
 
 QUESTION = "How accurate is a calibration on real measurements, with all configurations and with ten?"
 FOLDER = Path(__file__).resolve().parents[2] / "shared" / "data"
@@ -82,7 +83,7 @@ def report(rows: list[dict[str, Any]]) -> Report:
         figures = [float(np.mean([row[m] for row in part])) for m in ("nominal", *METHODS)]
         over = [row[OURS] / row["reml"] for row in part]
         covers = [float(np.mean([row[f"{m}, covers"] for row in part])) for m in ("reml", OURS)]
-        middle = [f"{f:.3f}" for f in figures] + [f"{geometric_mean(over):.2f}", f"{max(over):.2f}"]
+        middle = [f"{f:.3f}" for f in figures] + [f"{gmean(over):.2f}", f"{max(over):.2f}"]
         lines.append([name, str(count or "all"), str(len(part)), *middle, *(f"{100 * c:.0f} %" for c in covers)])
     metrics = {
         "auto_over_least_squares": _over(rows, OURS, "least squares"),
@@ -110,4 +111,4 @@ def report(rows: list[dict[str, Any]]) -> Report:
 
 
 def _over(rows: list[dict[str, Any]], method: str, other: str) -> float:
-    return geometric_mean([row[method] / row[other] for row in rows])
+    return gmean([row[method] / row[other] for row in rows])

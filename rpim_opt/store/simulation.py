@@ -102,12 +102,31 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
                 raise InputError(f"key {role}", f"{file!r} twice", "a name of its own for every table", stated.path)
             taken.add(place)
     fixtures: list[tuple[str, ...]] = []
+    none = np.empty(0, dtype=int)
+    blocks = []  # without rows, for every measurement and fixture: what has parameters of its own
     for each in stated.observations:
-        places = [stated.placed.get(name.partition("_")[0], {}) for name in stated.kinds[each.measurement].parameters]
+        kind = stated.kinds[each.measurement]
+        places = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
         nested = [key for table in places for key, value in table.items() if isinstance(value, dict)]
         fixtures.append(tuple(dict.fromkeys(nested)) or ("",))  # one without a name is the only one
-    parameters = _parameters(stated, fixtures)
-    x = _deviations(parameters, plan, rng, stated.path)
+        empty = np.empty((0, kind.points, stated.robot.dof)), np.empty((0, len(kind.columns))), np.empty((0, 1, 1))
+        blocks += [Block(kind, *empty, none, fixture=fixture) for fixture in fixtures[-1]]
+    nothing = Dataset(tuple(blocks), (), none)
+    own = place_fixtures(stated.placed, nothing)
+    entries = {}
+    for block in blocks:
+        named = {of_fixture(name, block.fixture): of for name, of in block.measurement.parameters.items()}
+        entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
+    base = (0.0,) * 6 if stated.base is None else stated.base
+    parameters = stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
+    free = parameters.free
+    x = plan.spread * rng.normal(size=len(free)) * free.scale
+    dimensions = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
+    try:
+        for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
+            x[free.names.index(name)] = value
+    except InputError as error:
+        raise error.within(stated.path) from None
     tables: dict[str, Columns] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
@@ -123,7 +142,6 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
                 maker = _Table(stated, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
                 tables[file], wrong = maker.made(q)
                 blunders += wrong
-    free = parameters.free
     truth = zip(free.names, free.dimensions, x.tolist(), strict=True)
     return Simulated(tables, {name: (dimension, value) for name, dimension, value in truth}, tuple(blunders))
 
@@ -148,36 +166,6 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
 
 
 # --- what is simulated -------------------------------------------------------------------------------------------
-
-
-def _parameters(stated: ProblemFile, fixtures: Sequence[tuple[str, ...]]) -> Parameters:
-    none = np.empty(0, dtype=int)
-    blocks = []
-    for each, of in zip(stated.observations, fixtures, strict=True):
-        kind = stated.kinds[each.measurement]
-        for fixture in of:
-            q = np.empty((0, kind.points, stated.robot.dof))
-            blocks.append(Block(kind, q, np.empty((0, len(kind.columns))), np.empty((0, 1, 1)), none, fixture=fixture))
-    nothing = Dataset(tuple(blocks), (), none)
-    own = place_fixtures(stated.placed, nothing)
-    entries = {}
-    for block in blocks:
-        named = {of_fixture(name, block.fixture): of for name, of in block.measurement.parameters.items()}
-        entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
-    base = (0.0,) * 6 if stated.base is None else stated.base
-    return stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
-
-
-def _deviations(parameters: Parameters, plan: Simulation, rng: np.random.Generator, path: Path) -> Array:
-    free = parameters.free
-    truth = plan.spread * rng.normal(size=len(free)) * free.scale
-    dimensions = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
-    try:
-        for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
-            truth[free.names.index(name)] = value
-    except InputError as error:
-        raise error.within(path) from None
-    return truth
 
 
 @dataclass(frozen=True, eq=False)

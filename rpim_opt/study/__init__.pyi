@@ -6,6 +6,5 @@ from .figures import distributions as distributions
 from .methods import Fitted as Fitted
 from .ranking import Standing as Standing
 from .ranking import Summary as Summary
-from .ranking import geometric_mean as geometric_mean
 from .studies import Metric as Metric
 from .studies import Report as Report

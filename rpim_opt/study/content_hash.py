@@ -103,7 +103,15 @@ def _content(thing: Any) -> tuple[Any, ...] | None:
             given = (thing.__defaults__, thing.__kwdefaults__)
             return "function", code, given, _read_by(thing), dict(vars(thing))
         case type() if not _is_library(thing.__module__):
-            return "class", thing.__qualname__, thing.__bases__, _own(thing)
+            python = GetSetDescriptorType | MemberDescriptorType
+            own = {
+                name: value
+                for name, value in vars(thing).items()
+                if (callable(value) or not name.startswith("__"))
+                and name != "_abc_impl"
+                and not isinstance(value, python)
+            }
+            return "class", thing.__qualname__, thing.__bases__, own
         case ModuleType():
             file = getattr(thing, "__file__", None)
             if file is None or str(Path(file).resolve()).startswith(LIBRARIES):
@@ -145,16 +153,6 @@ def _read_by(function: FunctionType) -> dict[str, Any]:
     for module in modules:
         found |= {f"{module.__name__}.{name}": getattr(module, name) for name in names if hasattr(module, name)}
     return found
-
-
-def _own(cls: type) -> dict[str, Any]:
-    """Return what a class of a script defines."""
-    python = GetSetDescriptorType | MemberDescriptorType
-    return {
-        name: value
-        for name, value in vars(cls).items()
-        if (callable(value) or not name.startswith("__")) and name != "_abc_impl" and not isinstance(value, python)
-    }
 
 
 def _is_library(module: str) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from collections.abc import Set as AbstractSet
@@ -11,7 +12,6 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table, listed, table
 
@@ -170,7 +170,7 @@ def summarize(rows: Rows, metric: str, reference: str, drawn: AbstractSet[str]) 
         if not own:
             continue
         mine = [row for row in rows if row["method"] == method]
-        logs = {pair: np.log(max(own[pair], least) / max(other[pair], least)) for pair in own if pair in other}
+        logs = {pair: math.log(max(own[pair], least) / max(other[pair], least)) for pair in own if pair in other}
         compared = {_pair(row) for row in mine} & (set(own) | set(other))
         wins = sum(pair in own and (pair not in other or logs[pair] < -TIE) for pair in compared)
         losses = sum(pair in other and (pair not in own or logs[pair] > TIE) for pair in compared)
@@ -192,16 +192,6 @@ def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
         if row.get(metric) is not None:
             own[_pair(row)] = row[metric]
     return of
-
-
-def geometric_mean(ratios: Sequence[float] | Array) -> float:
-    """Return the mean of positive ratios (N,) that treats twice and half alike.
-
-    >>> import rpim_opt as ro
-    >>> round(ro.study.geometric_mean([0.5, 2.0]), 12)
-    1.0
-    """
-    return float(np.exp(np.mean(np.log(ratios))))
 
 
 def _pair(row: Mapping[str, Any]) -> Pair:

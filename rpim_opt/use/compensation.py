@@ -286,7 +286,13 @@ def compensate(
     N = len(targets.label)
     masses = None
     if payload is not None or payload_centre is not None:
-        masses = _masses(cell, payload, N)
+        if not cell.loads.payload:
+            accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
+            raise InputError("payload", "a payload that bends nothing", accepted)
+        mass = np.asarray(cell.robot.gravity.payload if payload is None else payload, dtype=float)
+        if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
+            raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
+        masses = np.broadcast_to(mass, N)
 
     def compensated(start: int) -> dict[str, Array]:
         def rows(values: Array | None) -> Array | None:
@@ -356,17 +362,6 @@ def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> 
         row = int(np.argmin(finite))
         raise InputError(f"{name}, row {row + 1}", f"{values[row].tolist()}", "finite numbers")
     return values
-
-
-def _masses(cell: _Cell, payload: float | Array | None, N: int) -> Array:
-    """Return the payload of every row (N,) [kg]; refuse one that has no effect."""
-    if not cell.loads.payload:
-        accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
-        raise InputError("payload", "a payload that bends nothing", accepted)
-    values = np.asarray(cell.robot.gravity.payload if payload is None else payload, dtype=float)
-    if values.shape not in ((), (N,)) or not (values >= 0).all() or not np.isfinite(values).all():
-        raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
-    return np.broadcast_to(values, N)
 
 
 # --- the controller's robot beside the identified one ------------------------------------------------------

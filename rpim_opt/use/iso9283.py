@@ -278,7 +278,14 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
         elif of is not None and meaning.stem in {*AXES, *(stem for group in ROTATIONS for stem in group)}:
             if meaning.stem in of:
                 raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
-            of[meaning.stem] = name, _size(name, "length" if meaning.stem in AXES else "angle", unit, units)
+            dimension = "length" if meaning.stem in AXES else "angle"
+            unit = unit or units.get(dimension, "")
+            if not unit or dimension_of(unit) != dimension:
+                raise InputError(
+                    "the header", f"column '{name}' without a unit of {dimension}", "x_mm, or --units deg,mm"
+                )
+            ours, size = FOREIGN.get(unit, (unit, 1.0))
+            of[meaning.stem] = name, size * UNITS[ours].si
     attained, commanded = found.values()
     pose = poses.get("configuration", poses.get("label"))
     if pose is None or not set(AXES) <= set(attained):
@@ -302,14 +309,3 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
         beside(commanded, angles),
         angles or ROTATIONS[0],
     )
-
-
-def _size(name: str, dimension: str, unit: str, units: Mapping[str, str]) -> float:
-    """Return the size of a column's unit in SI."""
-    unit = unit or units.get(dimension, "")
-    if not unit or dimension_of(unit) != dimension:
-        raise InputError("the header", f"column '{name}' without a unit of {dimension}", "x_mm, or --units deg,mm")
-    if unit in FOREIGN:
-        ours, size = FOREIGN[unit]
-        return size * UNITS[ours].si
-    return UNITS[unit].si

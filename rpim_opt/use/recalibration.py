@@ -276,14 +276,20 @@ def update(
             accepted += "with what moved (base_*)"
             found = f"readings {1e3 * missed:.3g} mm off, whatever is released"
             raise InputError("the new measurements", found, accepted)
-    known = set(result.problem.parameters.free.names)
-    moved = tuple(_moved(result, updated, name) for name in released if name in known)
+    old, new = result.problem.parameters.free, updated.problem.parameters.free
+    moved = []
+    for name in released:
+        if name in old.names:
+            i = new.names.index(name)
+            std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
+            change = new.nominal[i] + updated.x[i] - old.nominal[i] - result.x[i]
+            moved.append(Moved(name, new.dimensions[i], float(change), float(std)))
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
-    old = result.record
+    record = result.record
     last = Earlier(
-        old.title or robots,
-        old.made,
-        old.digest or content(result)["digest"],
+        record.title or robots,
+        record.made,
+        record.digest or content(result)["digest"],
         len(result.problem.labels),
         {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
         prior_inflation,
@@ -291,18 +297,15 @@ def update(
         left_out,
     )
     excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
-    earlier = (*old.earlier, last)
-    record = Record(old.title, old.source, excluded=excluded, simulated=old.simulated, earlier=earlier, terms=old.terms)
-    return Update(replace(updated, record=record), before, after, tuple(changes), first, moved, len(data))
-
-
-def _moved(result: Calibration, updated: Calibration, name: str) -> Moved:
-    free = updated.problem.parameters.free
-    i = free.names.index(name)
-    std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
-    nominal = result.problem.parameters.free.nominal[i]
-    change = free.nominal[i] + updated.x[i] - nominal - result.x[i]
-    return Moved(name, free.dimensions[i], float(change), float(std))
+    record = Record(
+        record.title,
+        record.source,
+        excluded=excluded,
+        simulated=record.simulated,
+        earlier=(*record.earlier, last),
+        terms=record.terms,
+    )
+    return Update(replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data))
 
 
 # --- the previous result as a prior ------------------------------------------------------------------------
