@@ -386,15 +386,15 @@ def numbers(cells: Sequence[Any], column: str, labels: Sequence[str] = ()) -> np
             return values.astype(float)
     except (TypeError, ValueError):
         pass
-    return np.array([_number(cell, labels[i] if labels else str(i + 1), column) for i, cell in enumerate(cells)])
-
-
-def _number(cell: Any, row: str, column: str) -> float:
-    text = "" if cell is None else str(cell).strip()
-    value = math.nan if isinstance(cell, bool | np.bool_) else numeral(text)
-    if math.isnan(value):
-        raise InputError(f"row {row}, column {column}", f"'{text[:40]}'", "a finite number")
-    return value
+    found = []
+    for i, cell in enumerate(cells):
+        text = "" if cell is None else str(cell).strip()
+        value = math.nan if isinstance(cell, bool | np.bool_) else numeral(text)
+        if math.isnan(value):
+            row = labels[i] if labels else i + 1
+            raise InputError(f"row {row}, column {column}", f"'{text[:40]}'", "a finite number")
+        found.append(value)
+    return np.array(found)
 
 
 def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:

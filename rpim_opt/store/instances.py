@@ -367,38 +367,31 @@ def _read(stated: ProblemFile, each: Observation, path: Path, tcps: dict[str, li
 def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Dataset:
     """Return the measurements of a role with the known distances and angles of what they touch."""
     known: list[Known] = []
-    for number, distance in enumerate(table.known_distance, start=1):
-        pair, sigma = _relation(distance, f"key known_distance {number}", path)
-        if distance.validation == (role == "validation"):
-            known.append(KnownDistance(pair, distance.distance, sigma))
-    for number, angle in enumerate(table.known_angle, start=1):
-        where = f"key known_angle {number}"
-        if angle.deg not in RIGHT:
-            raise InputError(f"{where}.deg", f"{angle.deg:g}", "0 (parallel) or 90 (square)", path)
-        pair, sigma = _relation(angle, where, path)
-        if angle.validation == (role == "validation"):
-            known.append(KnownAngle(pair, angle.deg == 0, sigma))
+    distances = [(f"key known_distance {i}", each) for i, each in enumerate(table.known_distance, start=1)]
+    angles = [(f"key known_angle {i}", each) for i, each in enumerate(table.known_angle, start=1)]
+    for where, each in (*distances, *angles):
+        if isinstance(each, AngleTable) and each.deg not in RIGHT:
+            raise InputError(f"{where}.deg", f"{each.deg:g}", "0 (parallel) or 90 (square)", path)
+        if len(each.between) != 2:
+            raise InputError(f"{where}.between", f"{len(each.between)} names", "two", path)
+        if each.sigma is None and not each.validation:
+            unit = "mm" if isinstance(each, DistanceTable) else "mrad"
+            accepted = "the standard deviation of the stated value"
+            raise InputError(f"{where}.sigma_{unit}", "nothing", accepted, path)
+        if each.validation != (role == "validation"):
+            continue
+        first, second = each.between
+        sigma = UNSTATED if each.sigma is None else each.sigma
+        if isinstance(each, DistanceTable):
+            known.append(KnownDistance((first, second), each.distance, sigma))
+        else:
+            known.append(KnownAngle((first, second), each.deg == 0, sigma))
     try:
         whole = with_known(data, known)
         _require_enough(whole)
     except InputError as error:
         raise error.within(path) from None
     return whole
-
-
-def _relation(table: DistanceTable | AngleTable, where: str, path: Path) -> tuple[tuple[str, str], float]:
-    """Return what a known distance or angle is between, and its standard deviation."""
-    if len(table.between) != 2:
-        raise InputError(f"{where}.between", f"{len(table.between)} names", "two", path)
-    first, second = table.between
-    sigma = table.sigma
-    if sigma is None:
-        if not table.validation:
-            unit = "mm" if isinstance(table, DistanceTable) else "mrad"
-            accepted = "the standard deviation of the stated value"
-            raise InputError(f"{where}.sigma_{unit}", "nothing", accepted, path)
-        sigma = UNSTATED
-    return (first, second), sigma
 
 
 def _require_enough(data: Dataset) -> None:

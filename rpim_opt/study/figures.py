@@ -128,26 +128,11 @@ def write_page(
     folder: Path, rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Mapping[str, str]
 ) -> Path:
     """Write the page, the replicates and the figure into a folder: all of them, or none; return the page's path."""
-    drawing = comparison_figure(rows, summary)
-    names = list(rows[0])
-    cells = [["" if row[name] is None else str(row[name]) for name in names] for row in rows]
-    files = {
-        "index.html": _html(rows, summary, axes, provenance).encode(),
-        "replicates.csv": csv_text(names, cells).encode(),
-        "comparison.svg": picture(drawing, "comparison", "svg"),
-        "comparison.png": picture(drawing, "comparison", "png"),
-    }
-    with refused(folder):
-        write_files({folder / name: content for name, content in files.items()})
-    return folder / "index.html"
-
-
-def _html(rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Mapping[str, str]) -> str:
     problems = list(dict.fromkeys(row["problem"] for row in rows))
     where = ", ".join(problems) if len(problems) <= 3 else f"{len(problems)} problems"
     heading = f"{len({row['method'] for row in rows})} methods on {where}"
     height = max(18.0 * len(summary.standings) + 90, HEIGHT)
-    drawn = [figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height)]
+    ratios = figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height)
     title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
     ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes)]
     sections: list[tuple[str, list[Block]]] = [
@@ -155,9 +140,20 @@ def _html(rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Map
         ("By problem", [("table", _medians(rows, summary, problems))]),
         ("How it was made", [("facts", [*axes.items(), *provenance.items()])]),
     ]
-    top: list[Block] = [("lead", {"text": headline(summary), "alarm": False}), ("figures", drawn)]
+    top: list[Block] = [("lead", {"text": headline(summary), "alarm": False}), ("figures", [ratios])]
     kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
-    return render(f"Comparison: {heading}", kind, heading, top, sections)
+    drawing = comparison_figure(rows, summary)
+    names = list(rows[0])
+    cells = [["" if row[name] is None else str(row[name]) for name in names] for row in rows]
+    files = {
+        "index.html": render(f"Comparison: {heading}", kind, heading, top, sections).encode(),
+        "replicates.csv": csv_text(names, cells).encode(),
+        "comparison.svg": picture(drawing, "comparison", "svg"),
+        "comparison.png": picture(drawing, "comparison", "png"),
+    }
+    with refused(folder):
+        write_files({folder / name: content for name, content in files.items()})
+    return folder / "index.html"
 
 
 def headline(summary: Summary) -> str:

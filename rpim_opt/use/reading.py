@@ -184,7 +184,15 @@ def read_measurements(
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
-    data = rows_of(found, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, _noise(result, stated, kind))
+    # the typical standard deviation of every component, as [noise] has it
+    known = [block for block in blocks if block.measurement is stated]
+    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in known], axis=0)
+    noise = {}
+    for (component, dimension), sigma in zip(stated.components.items(), np.sqrt(variance), strict=True):
+        if component in kind.components:
+            unit = next(unit for unit in accepted_units(dimension) if UNITS[unit].si == 1.0)
+            noise[f"{component}_{unit}"] = float(sigma)
+    data = rows_of(found, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
     name = time_column(found.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in found.raw[name]))
     left_out = tuple(column for column in found.left_out if column != name)
@@ -209,12 +217,3 @@ def _understood(
         with suppress(InputError):  # one that has our names already
             return understand_of(replace(arm, names=()), sources, kind, stated, targets)
         raise
-
-
-def _noise(result: Calibration, stated: Measurement, kind: Measurement) -> dict[str, float]:
-    """Return the typical standard deviation of every component of a type or a part of it, as ``[noise]`` has it."""
-    blocks = [block for block in result.problem.data.blocks if block.measurement is stated]
-    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
-    si = {d: next(u for u in accepted_units(d) if UNITS[u].si == 1.0) for d in stated.components.values()}
-    sigma = zip(stated.components.items(), np.sqrt(variance), strict=True)
-    return {f"{name}_{si[dimension]}": float(value) for (name, dimension), value in sigma if name in kind.components}
