@@ -17,7 +17,6 @@ from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
 from rpim_opt.calibration.verdict import Verdict, rms
-from rpim_opt.convex.select import disagreement
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.problem import CalibrationProblem
@@ -171,8 +170,7 @@ def _one_weight(result: Outcome) -> str:
     if result.selection is None:
         return f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."
     rule = ": ".join(filter(None, [selector(result), result.selection.note]))
-    text = f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."
-    return " ".join(filter(None, [text, disagreement(result.program)]))
+    return f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."
 
 
 def remarks(result: Outcome) -> list[str]:

@@ -56,18 +56,6 @@ def compare(program: Program) -> dict[str, Selection]:
     return chosen
 
 
-def disagreement(program: Program) -> str:
-    """Return a warning where L-curve, GCV and REML lie more than a decade apart, else nothing."""
-    if not program.closed_form or program.model.constrained:
-        return ""
-    found = {rule.__name__: rule(program).weight for rule in (l_curve, gcv, reml)}
-    decades = np.ptp(np.log10(list(found.values())))
-    if decades <= 1:
-        return ""
-    weights = ", ".join(f"{name} {weight:.2g}" for name, weight in found.items())
-    return f"The selectors disagree by {decades:.1f} decades: {weights}."
-
-
 SELECTORS: dict[str, Selector] = {
     "reml": reml,
     "l_curve": l_curve,

@@ -14,8 +14,8 @@ import rpim_opt as ro
 from rpim_opt.convex.rules import scores as select_scores
 from rpim_opt.convex.rules.curve import menger
 from rpim_opt.convex.rules.folds import held_out_error
-from rpim_opt.convex.rules.selection import Selection, weight_grid
-from rpim_opt.convex.select import SELECTORS, disagreement
+from rpim_opt.convex.rules.selection import weight_grid
+from rpim_opt.convex.select import SELECTORS
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 from tests.simulate import simulated
@@ -214,7 +214,7 @@ def test_held_out_errors_of_a_robust_loss_are_medians() -> None:
         out = program.model.group == g
         z = program.on(program.model.scaled(np.where(out, 0.0, 1.0))).solve(2.0).z
         norms.append(np.linalg.norm(program.model.A[out] @ z - program.model.b[out]))
-    assert held_out_error(program, np.array([2.0]))[0] == pytest.approx(np.median(norms), rel=1e-6)
+    assert held_out_error(program)(np.array([2.0]))[0] == pytest.approx(np.median(norms), rel=1e-6)
 
 
 def test_folds_hold_configurations_out_together() -> None:
@@ -228,9 +228,9 @@ def test_folds_hold_configurations_out_together() -> None:
             A, b = NOISY.A[~out], NOISY.b[~out]
             z = np.linalg.solve(A.T @ A + w * np.eye(12), A.T @ b)
             squares[k] += np.sum((NOISY.A[out] @ z - NOISY.b[out]) ** 2)
-    assert held_out_error(PROGRAM, weights, parts) == pytest.approx(np.sqrt(squares / 60), rel=1e-9)
+    assert held_out_error(PROGRAM, parts)(weights) == pytest.approx(np.sqrt(squares / 60), rel=1e-9)
     chosen = ro.k_fold(PROGRAM, folds=4, seed=3)
-    assert chosen.score == pytest.approx(held_out_error(PROGRAM, chosen.weights, parts), rel=1e-9)
+    assert chosen.score == pytest.approx(held_out_error(PROGRAM, parts)(chosen.weights), rel=1e-9)
     assert chosen.weight == chosen.weights[np.argmin(chosen.score)]
     assert len(chosen.weights) == 200
 
@@ -241,7 +241,7 @@ def test_folds_are_not_more_than_configurations() -> None:
         ro.k_fold(PROGRAM, folds=21)
     one = replace(NOISY, group=np.zeros(60, dtype=int))
     with pytest.raises(ro.InputError, match="one configuration"):
-        held_out_error(ro.convex.pose(ro.tikhonov, one), np.ones(1))
+        held_out_error(ro.convex.pose(ro.tikhonov, one))
 
 
 @pytest.mark.parametrize(("values", "edge"), [("exact", "lower"), ("noise", "upper")])
@@ -277,31 +277,11 @@ def test_two_steps_are_those_of_the_paper() -> None:
     norms = np.sqrt([e.loss for e in PROGRAM.path(coarse)])
     level = next(w for k, w in enumerate(coarse[:-1]) if norms[k + 1] >= 0.99 * norms[k])
     assert chosen.weights == pytest.approx(level * np.linspace(0.563, 5.063, 10) / 3.063, rel=1e-9)
-    assert chosen.score == pytest.approx(held_out_error(PROGRAM, chosen.weights), rel=1e-9)
+    assert chosen.score == pytest.approx(held_out_error(PROGRAM)(chosen.weights), rel=1e-9)
     k = int(np.argmin(chosen.score))
     assert chosen.weight == chosen.weights[k]
     assert chosen.interior == (0 < k < 9)
     assert ("a wider range of weights may be better" in chosen.note) != chosen.interior
-
-
-def test_selectors_that_are_a_decade_apart_disagree(monkeypatch: pytest.MonkeyPatch) -> None:
-    def answer(weight: float, name: str) -> Any:
-        def rule(_: Any) -> Selection:
-            return Selection(weight, name, np.ones(1), np.ones(1), interior=True)
-
-        rule.__name__ = name
-        return rule
-
-    for low, high, decades in ((1.0, 9.9, ""), (1.0, 200.0, "2.3"), (3e-3, 3.0, "3.0")):
-        for name, weight in (("l_curve", high), ("gcv", low), ("reml", 1.5 * low)):
-            monkeypatch.setattr(f"rpim_opt.convex.select.{name}", answer(weight, name))
-        said = disagreement(PROGRAM)
-        assert bool(said) == bool(decades)
-        if decades:
-            assert f"disagree by {decades} decades" in said
-            assert f"l_curve {high:.2g}" in said
-    assert disagreement(ro.convex.pose(ro.lasso, NOISY)) == ""
-    assert disagreement(ro.convex.pose(ro.tikhonov, replace(NOISY, constrained=True))) == ""
 
 
 def test_all_selectors_are_compared_where_they_are_quick() -> None:

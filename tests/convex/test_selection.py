@@ -79,7 +79,7 @@ def test_held_out_error_is_that_of_fits_without_the_configuration() -> None:
         z = np.linalg.solve(A.T @ A + weight * np.eye(12), A.T @ b)
         total += np.sum((m.A[out] @ z - m.b[out]) ** 2)
     expected = np.sqrt(total / len(m.b))
-    assert held_out_error(ro.convex.pose(ro.tikhonov, m), np.array([weight]))[0] == pytest.approx(expected, rel=1e-9)
+    assert held_out_error(ro.convex.pose(ro.tikhonov, m))(np.array([weight]))[0] == pytest.approx(expected, rel=1e-9)
 
 
 def tail(r: Any) -> Any:
@@ -99,7 +99,7 @@ def test_what_rests_on_few_configurations_is_solved_without_each(formulation: ro
         out = model.group == k
         z = ro.convex.pose(formulation, model.scaled(np.where(out, 0.0, 1.0))).solve(10.0).z
         expected.append(np.linalg.norm(model.A[out] @ z - model.b[out]))
-    assert held_out_error(program, np.array([10.0]))[0] == pytest.approx(np.median(expected), rel=1e-5)
+    assert held_out_error(program)(np.array([10.0]))[0] == pytest.approx(np.median(expected), rel=1e-5)
 
 
 def test_two_step_ends_below_the_corner_with_ten_held_out_errors() -> None:

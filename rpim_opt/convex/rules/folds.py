@@ -56,7 +56,7 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     if program.closed_form and not mixed:
         note = "smallest error of configurations left out one by one"
         return linear_rule(program, "leave_one_out", _of_squares, note)
-    return _least(program, "leave_one_out", _error_of_folds(program, None if exact else _singly(program)))
+    return _least(program, "leave_one_out", held_out_error(program, None if exact else _singly(program)))
 
 
 @on_squares
@@ -79,10 +79,10 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
         if len(present) < 2 or not np.array_equal(np.sort(np.concatenate(present)), groups):
             found = f"{len(present)} that have {sum(map(len, present))} of {len(groups)} configurations"
             raise InputError("selector k_fold, parts", found, "two or more, with every configuration in one of them")
-        return _least(program, "k_fold", _error_of_folds(program, present))
+        return _least(program, "k_fold", held_out_error(program, present))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
-    return _least(program, "k_fold", _error_of_folds(program, _drawn(program, folds, seed)))
+    return _least(program, "k_fold", held_out_error(program, _drawn(program, folds, seed)))
 
 
 @on_squares
@@ -119,7 +119,7 @@ def two_step(program: Program) -> Selection:
     if program.closed_form and program.squared is program.model:
         score = np.sqrt(_of_squares(program)(fine) / len(program.model.b))
     else:
-        score = _error_of_folds(program, _singly(program))(fine)
+        score = held_out_error(program, _singly(program))(fine)
     best = int(np.nanargmin(score))
     failed = np.isnan(score)
     interior = 0 < best < len(fine) - 1
@@ -150,14 +150,6 @@ def _least(program: Program, name: str, error: Score) -> Selection:
 # --- errors of what is left out --------------------------------------------------------------------------------
 
 
-def held_out_error(program: Program, weights: Array, parts: Sequence[np.ndarray] | None = None) -> Array:
-    """Return the RMS (K,) of the whitened residual of held-out configurations, predicted from all the others.
-
-    A loss that is no square judges the median of their norms: an outlier held out is no error of the prediction.
-    """
-    return _error_of_folds(program, parts)(weights)
-
-
 def _drawn(program: Program, count: int, seed: int = 0) -> list[np.ndarray]:
     """Return the configurations in so many parts, at random."""
     groups, place = np.unique(program.model.group, return_index=True)
@@ -170,8 +162,11 @@ def _singly(program: Program) -> list[np.ndarray] | None:
     return _drawn(program, PARTS) if len(np.unique(program.model.group)) > PARTS else None
 
 
-def _error_of_folds(program: Program, parts: Sequence[np.ndarray] | None) -> Score:
-    """Return what gives `held_out_error`: the program without each of the parts, solved again."""
+def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) -> Score:
+    """Return what gives the RMS (K,) of the whitened residual of parts held out, predicted by solving without them.
+
+    A loss that is no square judges the median of their norms: an outlier held out is no error of the prediction.
+    """
     model = program.model
     groups = np.unique(model.group)
     if len(groups) < 2:

@@ -10,7 +10,6 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Ridge, identity, ridge, robot_alone
 from rpim_opt.convex.rules.selection import (
@@ -24,9 +23,6 @@ from rpim_opt.convex.rules.selection import (
     with_rows,
 )
 from rpim_opt.problem.linear import LinearModel
-
-TOGETHER = 250_000
-"""Frequencies of residuals that are in memory together, of many weights."""
 
 
 def linear_rule(
@@ -256,16 +252,11 @@ def ncp(program: Program) -> Selection:
         columns = np.hstack([spectra.real, spectra.imag])
         line = np.arange(1, count + 1) / count
 
-        def farthest(weights: Array) -> Array:
-            left = columns[-1] - (s2 / (s2 + weights[:, None]) * projected) @ columns[:-1]
-            power = left[:, :count] ** 2 + left[:, count:] ** 2
-            cumulative = np.cumsum(power, axis=1)
-            return np.max(np.abs(cumulative / cumulative[:, -1:] - line), axis=1)
+        def farthest(weight: float) -> float:
+            left = columns[-1] - (s2 / (s2 + weight) * projected) @ columns[:-1]
+            cumulative = np.cumsum(left[:count] ** 2 + left[count:] ** 2)
+            return float(np.max(np.abs(cumulative / cumulative[-1] - line)))
 
-        def score(weights: Array) -> Array:
-            few = max(1, TOGETHER // count)
-            return np.concatenate(on_all_cores(farthest, [weights[k : k + few] for k in range(0, len(weights), few)]))
-
-        return score
+        return lambda weights: np.array([farthest(weight) for weight in weights])
 
     return linear_rule(program, "ncp", score_of, "whitest residual")

@@ -102,15 +102,13 @@ def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
     def chosen(program: Program, *given: Any, **options: Any) -> Selection:
         if not program.separable or program.formulation.penalty is None:
             return rule(program, *given, **options)
-        weight, selection = 1.0, None
+        weight = 1.0
         for _ in range(ROUNDS):
             z = program.solve(weight).z
             selection = rule(program.on_squares(program.trusted(z)), *given, **options)
             if abs(np.log(max(selection.weight, SMALLEST) / weight)) < SETTLED:
                 break
             weight = max(selection.weight, SMALLEST)
-        if selection is None:
-            raise InputError("selector", "no choice", "a rule that answers")
         return selection
 
     return chosen

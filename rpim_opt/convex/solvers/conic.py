@@ -117,11 +117,6 @@ class Canonical:
         made.cone_sizes = []
         return made
 
-    @property
-    def polyhedral(self) -> bool:
-        """Whether all constraints are equations and inequalities."""
-        return self.linear == len(self.b)
-
     @cached_property
     def dense(self) -> tuple[Array, Array]:
         """A and P as dense matrices."""
@@ -301,7 +296,8 @@ class Small:
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
-        by_active_set = p.polyhedral and not p.own and len(p.b) * p.size <= DENSE  # own variables: Clarabel is quicker
+        # equations and inequalities alone; with variables of their own Clarabel is quicker
+        by_active_set = p.linear == len(p.b) and not p.own and len(p.b) * p.size <= DENSE
         if squares is None or self.loss is not None or not by_active_set:
             return self._by_cones(squares, weight, A, b)[0]
         found = self._on_faces(squares, weight, self.face, self.near)

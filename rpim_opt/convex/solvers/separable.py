@@ -174,11 +174,11 @@ class Newton:
     def _total(self, r: Array) -> float:
         return float(self.loss.values(self.rows.entries(r)).sum())
 
-    def _value(self, z: Array, x: Array) -> float:
-        return self._total(self._residual(z)) + self.weight * self.penalty.value(x) + self._damping(z)
+    def _others(self, z: Array, x: Array) -> float:
+        return self.weight * self.penalty.value(x) + (0.0 if self.damping is None else self.damping.value(z))
 
-    def _damping(self, z: Array) -> float:
-        return 0.0 if self.damping is None else self.damping.value(z)
+    def _value(self, z: Array, x: Array) -> float:
+        return self._total(self._residual(z)) + self._others(z, x)
 
     def _solved(self, z: Array, gradient: Array, H: Array, small: Small | None = None, *exact: Array) -> Point:
         """Return the minimum of the quadratic model around z (n,), with the penalty and the constraints."""
@@ -297,7 +297,7 @@ class Newton:
 
     def _exact(self, z: Array, near: np.ndarray, h: float) -> Array | None:
         """Return the minimum with rows near a kink as they are, the others by their model, until no other row bends."""
-        at, T, weight = self.penalty.at, self.rows.whitened[1], self.weight
+        at, T = self.penalty.at, self.rows.whitened[1]
         x, best = self.x, self.point
         value = self._value(z, x)
         for _ in range(8):
@@ -315,14 +315,12 @@ class Newton:
                 return None
             ahead = point.x[at]
             d = ahead - z
-            r_ahead = self._residual(ahead)
-            v, v_ahead = self.rows.entries(r), self.rows.entries(r_ahead)
+            v, v_ahead = self.rows.entries(r), self.rows.entries(self._residual(ahead))
             old, new = self.loss.values(v)[near].sum(), self.loss.values(v_ahead)[near].sum()
-            chord = weight * (self.penalty.value(point.x) - self.penalty.value(x))
-            damping = self._damping(ahead) - self._damping(z)
             u = T @ d
-            promised = -(gradient @ u + 0.5 * u @ H @ u + chord + damping + new - old)
-            there = self._total(r_ahead) + weight * self.penalty.value(point.x) + self._damping(ahead)
+            chord = self._others(ahead, point.x) - self._others(z, x)
+            promised = -(gradient @ u + 0.5 * u @ H @ u + chord + new - old)
+            there = self._value(ahead, point.x)
             if there <= value:
                 z, value, x, best = ahead, there, point.x, point
             if promised <= 1e-9 * max(abs(value), 1e-9):
