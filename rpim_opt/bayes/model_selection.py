@@ -246,7 +246,13 @@ class Comparison(Models):
         if result.learned is not None:
             more = ("instrument",) if "instrument" in result.learned.noise else ()
             estimator = Estimator(KNOWN, NOISE + more)
-        super().__init__(_without_outliers(result), estimator, named(result.problem, result.x))
+        problem = sampled(result.problem.scattered(None))  # in memory, without noise estimates
+        labels = {label: i for i, label in enumerate(problem.labels)}
+        rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
+        if 0 < len(rows) <= len(labels) / 4:  # without flagged rows unless their neighbours are
+            alone = {problem.labels[i] for i in rows[~clustered(problem, result.x, rows)]}
+            problem = problem.without(alone) if alone else problem
+        super().__init__(problem, estimator, named(result.problem, result.x))
         stacks = self.columns.data.stacks
         self.configurations = len(np.unique(self.problem.data.configuration))
         # angles where no length was measured, pixels where a camera alone has seen
@@ -296,16 +302,3 @@ class Comparison(Models):
         evidence = self.columns.restricted(keep)
         start = _starts(evidence, _hyperparameters(self.plain.evidence, self.plain.point))[:1]
         return Judged(families, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])
-
-
-def _without_outliers(result: Result) -> CalibrationProblem:
-    """Return the problem in memory without noise estimates, and without flagged rows unless their neighbours are."""
-    problem = sampled(result.problem.scattered(None))
-    labels = {label: i for i, label in enumerate(problem.labels)}
-    rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
-    if not len(rows) or len(rows) > len(labels) / 4:
-        return problem
-    alone = rows[~clustered(problem, result.x, rows)]
-    if not len(alone):
-        return problem
-    return problem.without({problem.labels[i] for i in alone})

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any
 
@@ -87,7 +87,11 @@ class Prior:
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre", dict(self.centre))
         object.__setattr__(self, "scale", dict(self.scale))
-        object.__setattr__(self, "groups", tuple(_patterns(group) for group in self.groups))
+        groups = [tuple(group.split() if isinstance(group, str) else group) for group in self.groups]
+        for group in groups:
+            if not group or not all(isinstance(pattern, str) and pattern for pattern in group):
+                raise InputError("prior, key groups", f"{group!r}", 'names or patterns of parameters, "a? d?"')
+        object.__setattr__(self, "groups", tuple(groups))
         object.__setattr__(self, "statements", tuple(self.statements))
         for key in ("tails", "joint_offset", "frames"):
             value = getattr(self, key)
@@ -282,10 +286,3 @@ def family_of(name: str) -> str:
     """Return the model extension of a parameter that is not geometry: ``ecc`` of ``ecc_cos3``."""
     found = _FAMILY.match(own_name(name))
     return found[1] if found else own_name(name)
-
-
-def _patterns(group: str | Iterable[str]) -> tuple[str, ...]:
-    patterns = tuple(group.split() if isinstance(group, str) else group)
-    if not patterns or not all(isinstance(pattern, str) and pattern for pattern in patterns):
-        raise InputError("prior, key groups", f"{group!r}", 'names or patterns of parameters, "a? d?"')
-    return patterns

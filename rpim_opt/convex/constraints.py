@@ -411,7 +411,18 @@ class Parsed:
     def _sums(self, p: Given) -> tuple[Array, Array, Array]:
         """Return sums E z + f [SI], (K, k, n) and (K, k), of which k together are to be small, and sizes (K,) of E."""
         if self.demanded.kind == "move":
-            found = every_movement(p, self._configurations(p))
+            known = {place.name: place for place in self.where}
+            q: list[Array] = []  # joint values (N, dof) at which movements are bounded
+            for name in self.demanded.places:
+                if name == WORKSPACE and name not in known:
+                    q.append(within_ranges(machine_of(p)))
+                    continue
+                if name not in known:
+                    raise self._wrong(f"place '{name}'", choices(name, [*known, WORKSPACE]))
+                numbers = np.array(known[name].numbers)
+                is_box = known[name].is_box
+                q.append(within_box(machine_of(p), numbers[:, 0], numbers[:, 1]) if is_box else numbers)
+            found = every_movement(p, np.concatenate(q))
             size = np.linalg.norm(found.slope, axis=(1, 2))
             moving = size > 0
             if not moving.any():
@@ -460,21 +471,6 @@ class Parsed:
                     raise self._wrong(what, "its deviation: '= nominal +- 0.1 mrad'")
                 constant += factor * table.nominal[i]
             yield row, constant
-
-    def _configurations(self, p: Given) -> Array:
-        """Return the joint values (N, dof) at which movements are bounded."""
-        known = {place.name: place for place in self.where}
-        q: list[Array] = []
-        for name in self.demanded.places:
-            if name in known:
-                numbers = np.array(known[name].numbers)
-                is_box = known[name].is_box
-                q.append(within_box(machine_of(p), numbers[:, 0], numbers[:, 1]) if is_box else numbers)
-            elif name == WORKSPACE:
-                q.append(within_ranges(machine_of(p)))
-            else:
-                raise self._wrong(f"place '{name}'", choices(name, [*known, WORKSPACE]))
-        return np.concatenate(q)
 
 
 def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:

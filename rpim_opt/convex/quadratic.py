@@ -220,7 +220,20 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
     R = model.triangle
     n = R.shape[1] - 1
     A, b = R[:n, :n], R[:n, n]
-    T, N, start = _standard_form(penalty or identity(n), n)
+    # z = start + T y + N y0 with |L z - c|^2 = |y|^2 + const; T is None for the identity
+    form = penalty or identity(n)
+    T: Array | None = None
+    if form.diagonal:
+        held = form.L > 0
+        inverse = np.divide(1.0, form.L, out=np.zeros(n), where=held)
+        start, N = inverse * form.c, np.eye(n)[:, ~held]
+        if not (form.L == 1).all():
+            T = np.eye(n)[:, held] * inverse[held]
+    else:
+        U, s, Vt = np.linalg.svd(form.L)
+        rank = int(np.count_nonzero(s > RANK_TOLERANCE * np.max(s, initial=0.0)))
+        T, N = Vt[:rank].T / s[:rank], Vt[rank:].T
+        start = T @ (U[:, :rank].T @ form.c)
     b = b - A @ start
     Q, free, null = np.zeros((n, 0)), N, N
     if N.size:  # what the data see of the directions that L leaves free
@@ -249,22 +262,6 @@ def ridge(model: LinearModel, penalty: Quadratic | None) -> Ridge:
         start = start + free @ (Q.T @ b)
     perp = float(R[n, n] ** 2 + left @ left)
     return Ridge(beta, s, B, start, perp, free, null)
-
-
-def _standard_form(penalty: Quadratic, n: int) -> tuple[Array | None, Array, Array]:
-    """Return T (None for the identity), N and z0 with z = z0 + T y + N y0 and |L z - c|^2 = |y|^2 + const."""
-    if penalty.diagonal:
-        held = penalty.L > 0
-        inverse = np.divide(1.0, penalty.L, out=np.zeros(n), where=held)
-        z0 = inverse * penalty.c
-        eye = np.eye(n)
-        if (penalty.L == 1).all():
-            return None, np.zeros((n, 0)), z0
-        return eye[:, held] * inverse[held], eye[:, ~held], z0
-    U, s, Vt = np.linalg.svd(penalty.L)
-    rank = int(np.count_nonzero(s > RANK_TOLERANCE * np.max(s, initial=0.0)))
-    T = Vt[:rank].T / s[:rank]
-    return T, Vt[rank:].T, T @ (U[:, :rank].T @ penalty.c)
 
 
 def robot_alone(penalty: Quadratic, frames: np.ndarray) -> Quadratic:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Literal
@@ -125,34 +124,28 @@ class _Reader:
             raise InputError(where, repr(text)[:60], f"a statement like {ACCEPTED[what]}")
         if len(text) > LONGEST:
             raise InputError(f"statement '{text[:60]}...'", f"{len(text)} characters", f"at most {LONGEST}")
-        self._tokens = list(self._split(text if part is None else part))
-        self._at = 0
-        self.unit = self._unit()
-
-    def _wrong(self, found: str, accepted: str = "") -> InputError:
-        accepted = accepted or f"a statement like {ACCEPTED[self.what]}"
-        return InputError(f"{self.what} '{self.text.strip()}'", found, accepted)
-
-    def _split(self, part: str) -> Iterator[tuple[str, str]]:
+        part = (text if part is None else part).rstrip()
+        self._tokens: list[tuple[str, str]] = []
         place = 0
-        end = len(part.rstrip())
-        while place < end:
+        while place < len(part):
             token = _TOKEN.match(part, place)
             if token is None:
                 raise self._wrong(f"'{part[place:].strip()}'")
             kind = str(token.lastgroup)
-            yield kind, _SIGNS.get(token[kind], token[kind])
+            self._tokens.append((kind, _SIGNS.get(token[kind], token[kind])))
             place = token.end()
-
-    def _unit(self) -> str:
-        """Return the unit of numbers that have none of their own: the last one."""
-        said = [word for kind, word in self._tokens if kind == "name" and word in UNITS]
-        for each in said:
+        self._at = 0
+        named = [word for kind, word in self._tokens if kind == "name" and word in UNITS]
+        for each in named:
             if UNITS[each].dimension not in DIMENSIONS:
                 raise self._wrong(f"unit '{each}'", choices(each, units()))
-        if len({UNITS[each].dimension for each in said}) > 1:
-            raise self._wrong(f"units {' and '.join(said)}", "units of one dimension")
-        return said[-1] if said else ""
+        if len({UNITS[each].dimension for each in named}) > 1:
+            raise self._wrong(f"units {' and '.join(named)}", "units of one dimension")
+        self.unit = named[-1] if named else ""  # of numbers that have none of their own
+
+    def _wrong(self, found: str, accepted: str = "") -> InputError:
+        accepted = accepted or f"a statement like {ACCEPTED[self.what]}"
+        return InputError(f"{self.what} '{self.text.strip()}'", found, accepted)
 
     def _next(self, *words: str) -> str:
         """Return the next token and pass it, where it is one of these words or kinds; empty otherwise."""

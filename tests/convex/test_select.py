@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.rules import scores as select_scores
 from rpim_opt.convex.rules.curve import menger
 from rpim_opt.convex.rules.folds import held_out_error
 from rpim_opt.convex.rules.selection import weight_grid
@@ -79,13 +78,6 @@ SCORES: dict[str, Any] = {
     "ncp": periodogram,
     "leave_one_out": left_out,
 }
-
-
-def test_white_residuals_are_scored_alike_where_weights_are_taken_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    program = ro.convex.pose(ro.tikhonov, NOISY)
-    together = SELECTORS["ncp"](program).score
-    monkeypatch.setattr(select_scores, "TOGETHER", 7 * len(NOISY.b) // 2)
-    assert SELECTORS["ncp"](program).score == pytest.approx(together, rel=1e-12)
 
 
 @pytest.mark.parametrize("name", SCORES)
