@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.convex.formulation import FORMULATIONS, Formulation, formulation_of
+from rpim_opt.convex.formulation import FORMULATIONS, formulation_of
 from rpim_opt.convex.rules.selection import require_weight
 from rpim_opt.convex.select import LEARNED, SELECTORS, weight_of
 from rpim_opt.data.dataset import Dataset
@@ -107,10 +107,14 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
     """
     methods: list[Method] = []
     weights = [_selector(label, each) for label, each in _listed(selectors)]
-    for name, formulation in (_formulation(label, each) for label, each in _listed(formulations)):
+    for given, each in _listed(formulations):
+        name = given or FOLDER
         stated = dict(options)
         pairs = weights
-        if formulation is not None:
+        if each != FOLDER:
+            formulation = formulation_of(each)
+            ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
+            name = given or (each if isinstance(each, str) else ready)
             stated["formulation"] = formulation
             if formulation.penalty is None:
                 pairs = [(NONE, 0.0)]
@@ -148,15 +152,6 @@ def _named(label: str, each: Any, ready: Mapping[str, Any], where: str, argument
 
 def _name(function: Any) -> str:
     return getattr(function, "__name__", type(function).__name__)
-
-
-def _formulation(label: str, each: Any) -> tuple[str, Formulation | None]:
-    """Return the name of a formulation, and what it is; None where the folder's own is meant."""
-    if each == FOLDER:
-        return label or FOLDER, None
-    formulation = formulation_of(each)
-    ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
-    return label or (each if isinstance(each, str) else ready), formulation
 
 
 def _selector(label: str, each: Any) -> tuple[str, Any]:

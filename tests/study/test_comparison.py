@@ -427,7 +427,7 @@ def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
     found.report(tmp_path / "out")
     assert {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()} == before
-    assert len(found.plot("max_mm").axes) == 2
+    assert len(found.plot("max_mm").axes) == 1
     assert "<table>" in found._repr_html_()
 
 

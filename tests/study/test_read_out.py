@@ -89,7 +89,7 @@ def test_the_page_says_of_many_problems_how_many_and_which_have_no_figure(tmp_pa
     assert '<td class="none">-</td>' in page
     assert '<td class="shade5">50.0</td>' in page  # five times the best and more
     all_of_them = compared({"a": even(1.0), "b": even(0.5) | dict.fromkeys(SIX)}).report(tmp_path / "all")
-    assert "<td>all</td>" in all_of_them.read_text(encoding="utf-8")
+    assert "6 of 6 replicates" in all_of_them.read_text(encoding="utf-8")
 
 
 def test_ratios_beyond_the_figure_are_arrows_at_its_edge() -> None:
