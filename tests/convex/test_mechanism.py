@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from functools import lru_cache, partial
 from typing import Any
 
@@ -11,7 +12,9 @@ import pytest
 from scipy.optimize import lsq_linear
 
 import rpim_opt as ro
+from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.convex.program import Damping
+from rpim_opt.convex.select import SELECTORS
 from tests.convex.plain import objective_at, plain, violation
 from tests.simulate import simulated
 
@@ -246,6 +249,42 @@ def test_storage_decides_nothing(formulation: str, rule: str, monkeypatch: pytes
         assert whole.converged
         assert found.weight == pytest.approx(whole.weight, rel=1e-4)  # both end where an answer moves it by 1e-6
         assert found.z == pytest.approx(whole.z, abs=1e-5)
+
+
+def calibrated(problem: Any, formulation: str, rule: str) -> ro.Calibration | None:
+    """Return a calibration; None where the rule is refused."""
+    try:
+        return ro.calibrate(problem, formulation, rule)
+    except ro.InputError:
+        return None
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("formulation", FORMULATIONS)
+def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By every rule, but those that hold rows out, which blocks refuse."""
+    monkeypatch.setattr(ro.problem.PartitionedProblem, "gathered", lambda self: None)
+    problem, _ = simulated(configurations=42, noise=1e-4, seed=1)
+    blocks = [partial(problem.data.take, rows) for rows in np.array_split(np.arange(42), 3)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the cluster's own, of ports and event loops
+        from distributed import Client, LocalCluster
+
+        with (
+            LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
+            Client(cluster) as client,
+        ):
+            compute = ro.problem.on_cluster(client)
+            parted = ro.problem.PartitionedProblem(problem.robot, problem.parameters, problem.data, blocks, compute)
+            for rule in SELECTORS:
+                whole, found = calibrated(problem, formulation, rule), calibrated(parted, formulation, rule)
+                if whole is None or found is None:
+                    assert found is None
+                    assert whole is None or rule in ("leave_one_out", "k_fold", "two_step"), rule
+                    continue
+                assert found.weight == pytest.approx(whole.weight, rel=1e-4), rule
+                if np.abs(whole.z).max() < 1e3:  # without a penalty redundant parameters run away, where rounding wants
+                    assert found.z == pytest.approx(whole.z, abs=1e-5), rule
 
 
 @pytest.mark.slow
