@@ -260,9 +260,9 @@ def calibrated(problem: Any, formulation: str, rule: str) -> ro.Calibration | No
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("formulation", FORMULATIONS)
+@pytest.mark.parametrize("formulation", [name for name in FORMULATIONS if name != "minimax"])
 def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """By every rule, but those that hold rows out, which blocks refuse."""
+    """By every rule, but those that need the rows; they, and minimax, are refused where no memory has these."""
     monkeypatch.setattr(ro.problem.PartitionedProblem, "gathered", lambda self: None)
     problem, _ = simulated(configurations=42, noise=1e-4, seed=1)
     blocks = [partial(problem.data.take, rows) for rows in np.array_split(np.arange(42), 3)]
@@ -280,7 +280,7 @@ def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.Monke
                 whole, found = calibrated(problem, formulation, rule), calibrated(parted, formulation, rule)
                 if whole is None or found is None:
                     assert found is None
-                    assert whole is None or rule in ("leave_one_out", "k_fold", "two_step"), rule
+                    assert whole is None or rule in ("leave_one_out", "k_fold", "two_step", "ncp"), rule
                     continue
                 assert found.weight == pytest.approx(whole.weight, rel=1e-4), rule
                 if np.abs(whole.z).max() < 1e3:  # without a penalty redundant parameters run away, where rounding wants
