@@ -19,6 +19,7 @@ from rpim_opt.problem.diagnosis import (
     copied_rows,
     exchanged_rows,
     left_out_together,
+    mixed_reflectors,
     moved,
     moved_far,
     odd_columns,
@@ -116,7 +117,8 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     better = better_reading(ordered) or lost_row(ordered)
     if better is not None:
         return [*rows_without_values(problem), better.sentence]
-    found = [*_of_rows(problem), *(list(moved_far(problem)) or list(moved(problem, result.x)))]
+    found = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
+    found = found or list(moved(problem, result.x))
     found = found or list(transmission(*_geometry(result, problem)))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     found = found or list(rounded(problem, error))

@@ -60,6 +60,8 @@ UNRELATED = 0.5
 """Part of the spread of positions that a fit leaves where joint values do not explain them."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
+MOST_ROUNDS = 20
+"""Of telling rows of one reflector from those of another."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 MOST_EQUATIONS = 3000
@@ -646,6 +648,41 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
             f"{three_digits(1e3 * far)} mm away: {what}; calibrate "
             "the two parts apart, or register the second one anew."
         )
+
+
+def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
+    """Say which rows are of another reflector that no column names: rows fall into groups in the flange frame."""
+    points = points_of(problem)
+    if points is None or len(points.row) < 4 * FEWEST or len(points.tools) > 1 or points.turns is not None:
+        return
+    robot = problem.robot
+    whole = misfit(robot, points)
+    if whole < FAR_MOVED:
+        return
+    flange = forward_kinematics(robot, points.q)
+    for count in (2, 3):
+        named, marker = points, points.marker
+        for _ in range(MOST_ROUNDS):
+            fit = placed(robot, named)
+            frames = fit.base @ flange
+            seen = np.einsum("nij,ni->nj", frames[:, :3, :3], points.y - frames[:, :3, 3])
+            tools, before = fit.tools, marker
+            if named is points:  # to begin with, in parts along the direction in which they spread most
+                along = np.linalg.svd(seen - seen.mean(axis=0), full_matrices=False)[2][0]
+                tools = np.array([seen[part].mean(axis=0) for part in np.array_split(np.argsort(seen @ along), count)])
+            marker = np.linalg.norm(seen[:, None] - tools, axis=2).argmin(axis=1)
+            if named is not points and (marker == before).all():
+                break
+            named = replace(points, marker=marker, tools=tools)
+        sizes = np.bincount(marker, minlength=count)
+        if sizes.min() >= FEWEST // 2 and misfit(robot, named) < FITS * whole:
+            far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()
+            others = [problem.data.label[i] for i in points.row[marker != sizes.argmax()]]
+            yield (
+                f"the rows are of {count} reflectors, up to {three_digits(far)} mm apart: {_rows(others, 'is', 'are')} "
+                "not of the first; name each row's reflector in a column `marker`."
+            )
+            return
 
 
 def part_way(problem: CalibrationProblem) -> Iterator[str]:

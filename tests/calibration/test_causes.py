@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -230,6 +231,22 @@ def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys
     made(monkeypatch, tmp_path, values(lambda _: y.round(4))(problem))
     assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
     assert "computed from it" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("rows", [np.arange(COUNT) % 3 == 0, np.random.default_rng(3).random(COUNT) < 0.5])
+def test_rows_of_reflectors_that_no_column_names_are_told_apart(rows: np.ndarray) -> None:
+    """However they are spread over the table; by how far the reflectors are apart and the rows of the fewer."""
+    problem = simulated_arm("ur5e", markers=2)
+    first, second = (block.y for block in problem.data.blocks)
+    causes = likely_causes(
+        ro.calibrate(values(lambda _: np.where(rows[:, None], second, first))(simulated_arm("ur5e")))
+    )
+    nominal = dict(zip(problem.parameters.names, problem.parameters.nominal, strict=True))
+    tools = np.array([[nominal[f"tool_{block.markers[0]}_{axis}"] for axis in "xyz"] for block in problem.data.blocks])
+    apart = 1e3 * np.linalg.norm(tools[1] - tools[0])
+    found = re.search(r"of 2 reflectors, up to ([\d.]+) mm apart", causes[1])
+    assert found
+    assert float(found[1]) == pytest.approx(apart, abs=2)
 
 
 def test_an_exchanged_reflector_is_no_moved_foot() -> None:
