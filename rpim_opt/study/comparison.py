@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from itertools import product
@@ -17,7 +17,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import counted, progress_bar
-from rpim_opt.study.methods import USUAL, Method, measure, methods_of, metrics_of
+from rpim_opt.study.methods import USUAL, Method, answer_of, measure, methods_of, metrics_of
 from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
 from rpim_opt.study.provenance import package_code, provenance
 from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED, WITH_FIGURES, Summary, figures, summarize
@@ -133,7 +133,26 @@ def compare(
         )
 
     made = provenance()
-    cases = list(_cases(product(sources.values(), ways.values(), sizes, factors), numbered, compared.values()))
+    cases: list[Row] = []
+    for source, split, count, factor in product(sources.values(), ways.values(), sizes, factors):
+        drawn = source.drawn or split.label != FOLDER or factor > 1  # what no seed changes is there once
+        if count is not None and not drawn:
+            drawn = count < len(np.unique(source.instance(0).problem.data.configuration))
+        folds = range(1, split.folds + 1)
+        cases += [
+            {
+                "problem": source.label,
+                "method": method.label,
+                "formulation": method.formulation,
+                "selector": method.selector,
+                "split": split.label,
+                "fold": fold,
+                "count": count,
+                "noise_factor": factor,
+                "seed": seed,
+            }
+            for seed, fold, method in product(numbered if drawn else numbered[:1], folds, compared.values())
+        ]
     path = None if journal is None else Path(journal)
     code: dict[str, str] = {}
     if path is not None:
@@ -152,33 +171,13 @@ def compare(
         "Held out": ways,
         "Configurations": ["all" if count is None else str(count) for count in sizes],
         "Noise factors": [f"{factor:g}" for factor in factors],
-        "Seeds": [str(seed) for seed in numbered],
+        "Seeds": map(str, numbered),
         "Metrics": figured,
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
     }
     asked = {name: ", ".join(values) for name, values in axes.items() if values}
     families = frozenset(label for label, source in sources.items() if source.drawn)
     return Comparison(tuple(rows), tuple(figured), families, asked, made)
-
-
-def _cases(grid: Iterable[Any], seeds: Sequence[int], methods: Iterable[Method]) -> Iterator[Row]:
-    """Yield the cases of a grid of source, split, count and noise factor; what no seed changes is there once."""
-    for source, split, count, factor in grid:
-        random = source.drawn or split.label != FOLDER or factor > 1
-        if count is not None and not random:
-            random = count < len(np.unique(source.instance(0).problem.data.configuration))
-        for seed, fold, method in product(seeds if random else seeds[:1], range(1, split.folds + 1), methods):
-            yield {
-                "problem": source.label,
-                "method": method.label,
-                "formulation": method.formulation,
-                "selector": method.selector,
-                "split": split.label,
-                "fold": fold,
-                "count": count,
-                "noise_factor": factor,
-                "seed": seed,
-            }
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
@@ -201,8 +200,9 @@ def replicate(
     try:
         instance = divide(source.instance(seed), split, case["fold"], case["count"], case["noise_factor"], seed)
         begun = time.perf_counter()
-        answer = method.solve(instance)
+        returned = method.solve(instance)
         seconds = time.perf_counter() - begun
+        answer = answer_of(returned, instance.problem, method.label)
         values = measure(instance, answer, seconds, metrics)
         row["configurations"] = len(np.unique(instance.problem.data.configuration))
         row["parameters"] = len(instance.problem.parameters.free)
@@ -311,22 +311,21 @@ class Comparison:
         if metric is not None and metric not in self.metrics:
             raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
         of = figures(self.rows, metric or self.metric)
-        known = [method for method, values in of.items() if values]
-        if against is None and not known:
-            first = self.rows[0]
-            raise InputError("comparison", f"no replicate with figures; {first['status']}: {first['reason']}", "one")
         if against is None:
+            known = [method for method, values in of.items() if values]
+            if not known:
+                reason = f"{self.rows[0]['status']}: {self.rows[0]['reason']}"
+                raise InputError("comparison", f"no replicate with figures; {reason}", "one")
             return known[0]
         if against not in of:
             raise InputError("against", f"'{against}'", choices(against, of))
-        if against not in known:
+        if not of[against]:
             raise InputError("against", f"'{against}', which has no figures", "a method that has some")
         return against
 
     def __repr__(self) -> str:
         """Return one line."""
-        counts = Counter(row["status"] for row in self.rows)
-        said = ", ".join(f"{count} {status}" for status, count in counts.items())
+        said = ", ".join(f"{count} {status}" for status, count in Counter(row["status"] for row in self.rows).items())
         what = f"{counted(len(self.methods), 'method')} on {counted(len(self.problems), 'problem')}"
         return f"Comparison: {what}, {len(self.rows)} replicates ({said})"
 

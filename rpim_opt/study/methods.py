@@ -43,10 +43,10 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A method by the names that rows call it, and the function of an instance that returns its `Answer`."""
+    """A method by the names that rows call it, and the function of an instance whose result `answer_of` takes."""
 
     label: str
-    solve: Callable[[Instance], Answer]
+    solve: Callable[[Instance], Any]
     formulation: str = NONE
     selector: str = NONE
 
@@ -91,15 +91,6 @@ def _predicted(predict: Callable[[Array], Any], data: Dataset, dimension: str) -
     return errors
 
 
-def _calibrate(instance: Instance, stated: Mapping[str, Any]) -> Answer:
-    result = instance.calibrate(**stated)
-    return Answer(result.errors, result)
-
-
-def _apply(instance: Instance, function: Callable[[CalibrationProblem], Any], label: str) -> Answer:
-    return answer_of(function(instance.problem), instance.problem, label)
-
-
 def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mapping[str, Any]) -> tuple[Method, ...]:
     """Return every formulation with every selector, then the functions; InputError for unknown or repeated names.
 
@@ -123,10 +114,10 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
             if name == selector == FOLDER:
                 label = "as the folder says"
             own = stated if selector == FOLDER else {**stated, "weight": weight}
-            methods.append(Method(label, partial(_calibrate, stated=own), name, selector))
+            methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
     for label, each in _listed(functions):
         name, function = _named(label, each, BASELINES, "methods", "the problem")
-        methods.append(Method(name, partial(_apply, function=function, label=name)))
+        methods.append(Method(name, partial(_apply, function)))
     if not methods:
         raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
     return each_once("methods", methods, "...")
@@ -152,6 +143,10 @@ def _named(label: str, each: Any, ready: Mapping[str, Any], where: str, argument
 
 def _name(function: Any) -> str:
     return getattr(function, "__name__", type(function).__name__)
+
+
+def _apply(function: Callable[[CalibrationProblem], Any], instance: Instance) -> Any:
+    return function(instance.problem)
 
 
 def _selector(label: str, each: Any) -> tuple[str, Any]:

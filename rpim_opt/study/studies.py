@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import glob
 import importlib.util
 import io
@@ -30,8 +29,6 @@ FILE = "study.py"
 MOST_FILES = 10_000
 MOST_BYTES = 4_000_000_000
 """Of the files beside a study, each of which is read before its replicates are resumed."""
-EXTRA = {"distributed", "joblib", "pandas", "pyarrow"}
-"""Packages of the extra ``studies``."""
 REPLICATES = "replicates"
 
 
@@ -134,8 +131,6 @@ def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module
     try:
-        for package in sorted(EXTRA & set(_imports(ast.parse(path.read_bytes())))):
-            require_package(package, "the study")
         spec.loader.exec_module(module)
     except SyntaxError as error:
         raise InputError(f"line {error.lineno}", str(error.msg), "Python", path) from None
@@ -145,17 +140,6 @@ def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
     if missing:
         raise InputError("the study", f"no '{missing[0]}'", ", ".join(needed), path)
     return module
-
-
-def _imports(node: ast.AST) -> Iterator[str]:
-    """Yield the packages that are imported without a condition, also inside functions."""
-    if isinstance(node, ast.Import):
-        yield from (alias.name.partition(".")[0] for alias in node.names)
-    elif isinstance(node, ast.ImportFrom) and not node.level:
-        yield str(node.module).partition(".")[0]
-    elif not isinstance(node, ast.If | ast.Try):
-        for child in ast.iter_child_nodes(node):
-            yield from _imports(child)
 
 
 # --- what its replicates follow from ---------------------------------------------------------------------------------

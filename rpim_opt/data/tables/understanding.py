@@ -174,7 +174,16 @@ def _readings(
     table, dof = raw.columns, robot.dof
     names = [*number_columns(robot, kind), *text_columns(kind)]
     read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
-    rotation = _of_letters(read, dof)
+    rotation = ""
+    stems = {found.stem for found in read.values()}
+    for words, why in JOINTS:
+        if dof == len(words) and stems >= set(words):
+            _rename(read, {word: f"q{i}" for i, word in enumerate(words, start=1)}, why)
+    for letters, new, why, turns in TURNS:
+        if {"x", "y", "z", *letters} <= stems:
+            _rename(read, dict(zip(letters, new, strict=True)), why)
+            rotation = turns
+            break
     numbered(read, table, dof, options.quaternion or "wxyz")
     _by_joint_names(read, table, joints, dof)
     read.update(_from_one(read, dof))
@@ -229,19 +238,6 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
     return found._replace(unit=unit)
 
 
-def _of_letters(read: Readings, dof: int) -> str:
-    """Take letters for joints or angles where all of them are there, and return the rotation that they tell."""
-    stems = {found.stem for found in read.values()}
-    for words, why in JOINTS:
-        if dof == len(words) and stems >= set(words):
-            _rename(read, {word: f"q{i}" for i, word in enumerate(words, start=1)}, why)
-    for letters, meant, why, rotation in TURNS:
-        if {"x", "y", "z", *letters} <= stems:
-            _rename(read, dict(zip(letters, meant, strict=True)), why)
-            return rotation
-    return ""
-
-
 def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
     read.update({name: each._replace(stem=new[each.stem], why=why) for name, each in read.items() if each.stem in new})
 
@@ -252,28 +248,24 @@ def _by_joint_names(read: Readings, table: Columns, joints: Sequence[str], dof: 
     named = {int(match[1]): name for name, match in matches.items() if match}
     if not named or f"q{min(named)}" not in {found.stem for found in read.values()}:
         return
-    places = {f"q{i}": _joint_named(table[column], column, joints, dof) for i, column in named.items()}
+    places: dict[str, int] = {}  # 0 for a joint that the robot does not have
+    for i, column in named.items():
+        called = {str(cell) for cell in table[column]}
+        if len(called) > 1:
+            raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
+        (joint,) = called
+        number = ur_joint(joint)
+        if joints:
+            number = joints.index(joint) + 1 if joint in joints else 0
+        elif not number or dof != len(UR_JOINTS):
+            accepted = "a robot from a URDF, which names its joints"
+            raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
+        places[f"q{i}"] = number
     for name, found in list(read.items()):
-        number = places.get(found.stem)
-        if number:
-            read[name] = found._replace(stem=f"q{number}", why="the joint that its column of names names")
-        elif number == 0:
+        if places.get(found.stem):
+            read[name] = found._replace(stem=f"q{places[found.stem]}", why="the joint that its column of names names")
+        elif found.stem in places:
             read[name] = found._replace(stem=f"another {found.stem}")
-
-
-def _joint_named(cells: Sequence[Any], column: str, joints: Sequence[str], dof: int) -> int:
-    """Return the number of the joint that all cells name, 0 for one that the robot does not have."""
-    names = {str(cell) for cell in cells}
-    if len(names) > 1:
-        raise InputError("the header", f"column '{column}' with {len(names)} names", "one joint a column")
-    name = names.pop()
-    if joints:
-        return joints.index(name) + 1 if name in joints else 0
-    number = ur_joint(name)
-    if number and dof == len(UR_JOINTS):
-        return number
-    accepted = "a robot from a URDF, which names its joints"
-    raise InputError("the header", f"joint '{name}' in column '{column}'", accepted)
 
 
 def _from_one(read: Readings, dof: int) -> Readings:
