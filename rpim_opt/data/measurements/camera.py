@@ -5,8 +5,9 @@ The pinhole has radial and tangential distortion; a board's points come from a t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -61,42 +62,22 @@ def pixels(
     return fx * u + cx, fy * v + cy
 
 
-def _on_the_flange(T: Any, point: Any) -> Any:
-    """Return a point of a board that stands in the cell in the camera's frame, T (4, 4) the camera in its frame."""
-    return T[:3, :3].T @ (point - T[:3, 3])
-
-
-def _beside_the_robot(T: Any, point: Any) -> Any:
-    """Return a point of a board that the robot carries in the frame of the camera, T (4, 4) the board in that."""
-    return T[:3, :3] @ point + T[:3, 3]
-
-
-Place = Callable[[Any, Any], Any]
-"""From T and a point (3, 1) on its board [m] to the point in the frame of the camera."""
-
-
-def _in_camera(place: Place, T: Any, values: Mapping[str, Any]) -> Any:
+def _in_camera(carried: bool, T: Any, values: Mapping[str, Any]) -> Any:
+    """Return a point in the camera's frame; T (4, 4) is the board that the robot carries, or else the camera."""
     x = values["target_x"] * (1 + values["board_stretch_x"])
     y = values["target_y"] * (1 + values["board_stretch_y"])
-    return place(T, ca.vertcat(x, y, values["target_z"]))
+    point = ca.vertcat(x, y, values["target_z"])
+    return T[:3, :3] @ point + T[:3, 3] if carried else T[:3, :3].T @ (point - T[:3, 3])
 
 
-def _pixels_of(place: Place) -> Callable[..., Any]:
-    def model(T: Any, **values: Any) -> Any:
-        intrinsics = {name: values[f"camera_{name}"] for name in INTRINSICS}
-        return ca.vertcat(*pixels(*ca.vertsplit(_in_camera(place, T, values)), **intrinsics))
-
-    return model
+def _pixels_of(carried: bool, T: Any, **values: Any) -> Any:
+    intrinsics = {name: values[f"camera_{name}"] for name in INTRINSICS}
+    return ca.vertcat(*pixels(*ca.vertsplit(_in_camera(carried, T, values)), **intrinsics))
 
 
-def _metres_of(place: Place) -> Callable[..., Any]:
+def _metres_of(carried: bool, T: Any, **values: Any) -> Any:
     """Return how far apart lines of sight through neighbouring pixels are at the point [m]: Z / f."""
-    return lambda T, **values: _in_camera(place, T, values)[2] / ca.sqrt(values["camera_fx"] * values["camera_fy"])
-
-
-def has_pixels(tables: Sequence[Columns]) -> bool:
-    """Return whether a table has columns u and v."""
-    return any({"u", "v"} <= {split(name)[0].strip().lower() for name in table} for table in tables)
+    return _in_camera(carried, T, values)[2] / ca.sqrt(values["camera_fx"] * values["camera_fy"])
 
 
 _WORDS = Words(
@@ -109,7 +90,7 @@ _WORDS = Words(
 )
 eye_in_hand = Measurement(
     "eye_in_hand",
-    model=_pixels_of(_on_the_flange),
+    model=partial(_pixels_of, False),
     columns={"u": "pixel", "v": "pixel"},
     noise={"pixel": "pixel"},
     parameters={f"camera_{name}": d for name, d in INTRINSICS.items()}
@@ -121,10 +102,10 @@ eye_in_hand = Measurement(
         TARGET, 'the target\'s points: target = "board.csv", or columns target_x_mm, target_y_mm, target_z_mm'
     ),
     words=_WORDS,
-    shown_by=has_pixels,
+    shown_by=lambda tables: any({"u", "v"} <= {split(name)[0].strip().lower() for name in table} for table in tables),
     registers=True,
     turning=True,
-    metres=_metres_of(_on_the_flange),
+    metres=partial(_metres_of, False),
 )
 """A point of a board that stands in the cell, seen by a camera on the flange: r = (u, v) - pixels(T^-1 p), T the camera
 in the board's frame, which is the instrument's."""
@@ -132,8 +113,8 @@ in the board's frame, which is the instrument's."""
 eye_to_hand = replace(
     eye_in_hand,
     name="eye_to_hand",
-    model=_pixels_of(_beside_the_robot),
-    metres=_metres_of(_beside_the_robot),
+    model=partial(_pixels_of, True),
+    metres=partial(_metres_of, True),
     words=_WORDS._replace(thing="a board", thing_at="The board", frame="in the frame of the camera"),
 )
 """A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the

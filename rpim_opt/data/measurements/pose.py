@@ -63,11 +63,12 @@ def turned(y: Array, e: Array) -> Array:
     rotation = scipy.spatial.transform.Rotation.from_rotvec(e[:, 3:]) * scipy.spatial.transform.Rotation.from_quat(
         y[:, [4, 5, 6, 3]]
     )
-    return np.hstack([y[:, :3] + e[:, :3], _w_first(rotation)])
+    return _posed(y[:, :3] + e[:, :3], rotation)
 
 
-def _w_first(rotation: scipy.spatial.transform.Rotation) -> Array:
-    return rotation.as_quat()[:, [3, 0, 1, 2]]
+def _posed(y: Array, rotation: scipy.spatial.transform.Rotation) -> Array:
+    """Return poses (N, 7) of positions, the first columns of y, and rotations."""
+    return np.hstack([y[:, :3], rotation.as_quat()[:, [3, 0, 1, 2]]])
 
 
 def unit_quaternions(y: Array) -> Array:
@@ -80,11 +81,6 @@ def unit_quaternions(y: Array) -> Array:
     return np.hstack([y[:, :3], y[:, 3:] / norm[:, None]])
 
 
-def from_angles(y: Array) -> Array:
-    """Return poses (N, 7) from roll, pitch, yaw (N, 6), R = Rz Ry Rx."""
-    return np.hstack([y[:, :3], _w_first(scipy.spatial.transform.Rotation.from_euler("xyz", y[:, 3:]))])
-
-
 def from_matrices(y: Array) -> Array:
     """Return poses (N, 7) from matrices, row by row (N, 12); refuse what is no rotation."""
     R = y[:, 3:].reshape(-1, 3, 3)
@@ -94,7 +90,7 @@ def from_matrices(y: Array) -> Array:
         row = int(wrong[0])
         found = f"a matrix that misses R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
-    return np.hstack([y[:, :3], _w_first(scipy.spatial.transform.Rotation.from_matrix(R))])
+    return _posed(y, scipy.spatial.transform.Rotation.from_matrix(R))
 
 
 _TURN = {"rx": "angle", "ry": "angle", "rz": "angle"}
@@ -108,7 +104,10 @@ pose = Measurement(
     noise={"position": "length", "orientation": "angle"},
     minus=lambda y, m: ca.vertcat(y[:3] - m[:3], rotation_between(y[3:], m[3:])),
     plus=turned,
-    forms=((XYZ | _TURN, from_angles), (XYZ | _MATRIX, from_matrices)),
+    forms=(
+        (XYZ | _TURN, lambda y: _posed(y, scipy.spatial.transform.Rotation.from_euler("xyz", y[:, 3:]))),
+        (XYZ | _MATRIX, from_matrices),
+    ),
     prepare=unit_quaternions,
     parts=(position,),
     registers=True,

@@ -20,11 +20,6 @@ def from_zenith(polar: Array) -> Array:
     return from_elevation(polar * [1, -1, 1] + [0, np.pi / 2, 0])
 
 
-def from_circle(polar: Array) -> Array:
-    """Return positions (N, 3) from a total station's horizontal circle, which counts clockwise, zenith and distance."""
-    return from_zenith(polar * [-1, 1, 1])
-
-
 _REST = {"distance": "length"}
 position = Measurement(
     "position",
@@ -34,7 +29,8 @@ position = Measurement(
     forms=(
         ({"azimuth": "angle", "elevation": "angle", **_REST}, from_elevation),
         ({"azimuth": "angle", "zenith": "angle", **_REST}, from_zenith),
-        ({"hz": "angle", "zenith": "angle", **_REST}, from_circle),
+        # a total station's horizontal circle counts clockwise
+        ({"hz": "angle", "zenith": "angle", **_REST}, lambda polar: from_zenith(polar * [-1, 1, 1])),
     ),
     registers=True,
 )

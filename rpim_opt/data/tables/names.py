@@ -114,9 +114,13 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     words = plain.split("_")
     kind = next((name for name, signs in KINDS.items() if len(words) > 1 and signs & set(words)), "")
     rest = "_".join([word for word in words if not any(word in signs for signs in KINDS.values())] or words)
-    number, why = _joint_in(path, joints)
-    if number:
-        return Reading(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
+    named = path[: max(len(path) - 1, 1)] if len(path) < 2 or path[-1] in VALUE | {"effort"} else []
+    for part in named:
+        number, why = ur_joint(part), "a joint of Universal Robots"
+        if part in joints:
+            number, why = joints.index(part) + 1, "a joint of the robot's file"
+        if number:
+            return Reading(f"tau{number}" if path[-1] == "effort" else f"q{number}", "", why, kind)
     for pattern, meaning, *reason in NAMES:
         match = re.fullmatch(pattern, rest)
         if match:
@@ -138,19 +142,6 @@ def endings(stem: str) -> Iterator[tuple[str, str]]:
     """
     for match in islice(re.finditer(r"[\s._/:\-]+", stem), MOST_PREFIXES):
         yield stem[: match.end()], stem[match.end() :]
-
-
-def _joint_in(path: Sequence[str], joints: Sequence[str]) -> tuple[int, str]:
-    """Return the number of the joint that a path names, and whose name it is; 0 where it names none."""
-    if len(path) > 1 and path[-1] not in VALUE | {"effort"}:
-        return 0, ""
-    for part in path[: max(len(path) - 1, 1)]:
-        if part in joints:
-            return joints.index(part) + 1, "a joint of the robot's file"
-        number = ur_joint(part)
-        if number:
-            return number, "a joint of Universal Robots"
-    return 0, ""
 
 
 def ur_joint(name: str) -> int:

@@ -138,9 +138,7 @@ def understand(
             meant = [each._replace(meaning=said, name=new, unit="") if each.name in turned else each for each in meant]
         kept, notes = range(len(next(iter(columns.values()), ()))), []
         if not targets:
-            kept, notes = _rows_with_values(columns, robot, kind)
-            columns, more = _labelled({name: [cells[i] for i in kept] for name, cells in columns.items()})
-            notes += more
+            kept, columns, notes = _rows_with_values(columns, robot, kind)
     except InputError as error:
         raise error.within(path) from None
     for each in {dimension_of(m.unit): m for m in meant if "unit in the header" in m.why and m.unit}.values():
@@ -440,8 +438,10 @@ def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
     return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
 
 
-def _rows_with_values(columns: Columns, robot: Robot, kind: Measurement) -> tuple[Sequence[int], list[str]]:
-    """Return the rows that have measured and joint values, and which were left out."""
+def _rows_with_values(
+    columns: Columns, robot: Robot, kind: Measurement
+) -> tuple[Sequence[int], dict[str, Sequence[Any]], list[str]]:
+    """Return the rows that have measured and joint values, their columns with unique labels, and what was changed."""
     count = len(next(iter(columns.values()), ()))
     labels = columns.get("label", range(1, count + 1))
     out: set[int] = set()
@@ -455,21 +455,17 @@ def _rows_with_values(columns: Columns, robot: Robot, kind: Measurement) -> tupl
     kept = [i for i in range(count) if i not in out]
     if columns and not kept:
         raise InputError("the table", "no row with values", "at least one")
-    return kept, notes
-
-
-def _labelled(columns: dict[str, Sequence[Any]]) -> tuple[dict[str, Sequence[Any]], list[str]]:
-    """Return the columns with unique labels, of point and reflector where a point is there with several."""
-    labels = [str(cell).strip() for cell in columns.get("label", ())]
-    if _unique(labels):
-        return columns, []
-    if "marker" in columns:
-        both = [f"{label}/{marker}" for label, marker in zip(labels, columns["marker"], strict=True)]
-        if _unique(both):
-            return {"configuration": labels, **columns, "label": both}, ["labels are those of point and reflector."]
-    again = next((label for label in labels if labels.count(label) > 1), "")
-    others = {name: cells for name, cells in columns.items() if name != "label"}
-    return others, [f"labels are not unique ('{again}'): rows are numbered."]
+    whole = {name: [cells[i] for i in kept] for name, cells in columns.items()}
+    own = [str(cell).strip() for cell in whole.get("label", ())]
+    both = [f"{label}/{marker}" for label, marker in zip(own, whole.get("marker", ()), strict=False)]
+    if both and not _unique(own) and _unique(both):
+        notes.append("labels are those of point and reflector.")
+        whole = {"configuration": own, **whole, "label": both}
+    elif not _unique(own):
+        again = next((label for label in own if own.count(label) > 1), "")
+        notes.append(f"labels are not unique ('{again}'): rows are numbered.")
+        del whole["label"]
+    return kept, whole, notes
 
 
 def _unique(labels: Sequence[str]) -> bool:

@@ -131,14 +131,15 @@ def read_staubli(text: str) -> Rows:
     return _rows([(f"{array}[{key}]" if several else key, values) for array, key, values in found])
 
 
-def _has_abb(text: str) -> bool:
-    return any(pattern.search(text) for pattern in (ABB_JOINTS, ABB_POSES))
-
-
 FORMATS = (
     TableFormat("FANUC program", (".ls",), lambda text: FANUC.search(text) is not None, read_fanuc),
     TableFormat("KUKA data list", (".dat", ".src"), lambda text: KUKA.search(text) is not None, read_kuka),
-    TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), _has_abb, read_abb),
+    TableFormat(
+        "RAPID module",
+        (".mod", ".modx", ".prg", ".sys"),
+        lambda text: bool(ABB_JOINTS.search(text) or ABB_POSES.search(text)),
+        read_abb,
+    ),
     TableFormat(
         "URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)) is not None, read_urscript
     ),
