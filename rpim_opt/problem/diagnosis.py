@@ -537,9 +537,11 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
     for unit, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        decimals = decimals_of(_all_q(problem.data)[:, turning] / size)
+        angles = _all_q(problem.data)[:, turning] / size
+        decimals = decimals_of(angles)
         if decimals is not None:
-            step = 10.0**-decimals
+            digits = (angles * 10.0**decimals).round().astype(int)
+            step = float(np.gcd.reduce(digits, axis=None)) / 10.0**decimals  # half degrees are rounded as well
             remedy = "export them with more decimals"
             found.append((f"joint values are rounded to {step:g} {unit}", size * step / np.sqrt(12) * arm, remedy))
     for what, made, remedy in found:

@@ -233,6 +233,11 @@ def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys
     assert "computed from it" in capsys.readouterr().out
 
 
+def test_joints_rounded_to_half_degrees_are_named() -> None:
+    wrong = joints(lambda q: np.radians((2 * np.degrees(q)).round() / 2))(simulated_arm("ur5e"))
+    assert "joint values are rounded to 0.5 deg" in likely_causes(ro.calibrate(wrong))[-1]
+
+
 @pytest.mark.parametrize("rows", [np.arange(COUNT) % 3 == 0, np.random.default_rng(3).random(COUNT) < 0.5])
 def test_rows_of_reflectors_that_no_column_names_are_told_apart(rows: np.ndarray) -> None:
     """However they are spread over the table; by how far the reflectors are apart and the rows of the fewer."""
