@@ -18,7 +18,6 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
 from rpim_opt.calibration.verdict import Verdict, rms
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import Earlier
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.robot.extensions import EXPECTED
@@ -144,33 +143,25 @@ def selector(result: Outcome) -> str:
 
 def weight_lines(result: Outcome) -> list[str]:
     """Say the weight and where it came from, or the hyperparameters in its place: a few sentences."""
-    if result.record.earlier:
-        return [f"Formulation '{result.formulation.name}'.", _carried_on(result.record.earlier[-1])]
-    if result.learned is None:
-        return [_one_weight(result)]
-    names = result.problem.parameters.free.names
-    return [f"Formulation '{result.formulation.name}'.", *learned_lines(result.learned, names, result.z)]
-
-
-def _carried_on(last: Earlier) -> str:
-    """Say which calibration's posterior the prior is."""
-    text = f"Prior: the posterior of '{last.title}', {last.rows} rows, made {last.made or 'just now'}"
-    text += f" (digest {last.digest[:12]})"
-    if last.inflate != 1:
-        text += f", its standard deviations times {last.inflate:g}"
-    if last.let_go:
-        text += f", without {joined(last.let_go)}"
-    return f"{text}."
-
-
-def _one_weight(result: Outcome) -> str:
     name = result.formulation.name
+    if result.record.earlier:
+        last = result.record.earlier[-1]
+        text = f"Prior: the posterior of '{last.title}', {last.rows} rows, made {last.made or 'just now'}"
+        text += f" (digest {last.digest[:12]})"
+        if last.inflate != 1:
+            text += f", its standard deviations times {last.inflate:g}"
+        if last.let_go:
+            text += f", without {joined(last.let_go)}"
+        return [f"Formulation '{name}'.", f"{text}."]
+    if result.learned is not None:
+        names = result.problem.parameters.free.names
+        return [f"Formulation '{name}'.", *learned_lines(result.learned, names, result.z)]
     if result.formulation.penalty is None:
-        return f"Formulation '{name}' has no penalty and needs no weight."
+        return [f"Formulation '{name}' has no penalty and needs no weight."]
     if result.selection is None:
-        return f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."
+        return [f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."]
     rule = ": ".join(filter(None, [selector(result), result.selection.note]))
-    return f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."
+    return [f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."]
 
 
 def remarks(result: Outcome) -> list[str]:
