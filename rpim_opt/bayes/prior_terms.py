@@ -339,15 +339,18 @@ class Result(Protocol):
 
     @property
     def problem(self) -> Source:
-        """What was asked."""
+        """What was calibrated."""
+        ...
 
     @property
     def x(self) -> Array:
         """Deviations (n,) [SI]."""
+        ...
 
     @property
     def program(self) -> Program:
         """The convex program at the solution."""
+        ...
 
     @property
     def learned(self) -> Any:
@@ -356,6 +359,7 @@ class Result(Protocol):
     @cached_property
     def flagged(self) -> Sequence[Any]:
         """Outlying rows, each with a ``label``."""
+        ...
 
     @cached_property
     def spread(self) -> Any:

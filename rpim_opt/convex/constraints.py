@@ -394,7 +394,7 @@ class Parsed:
 
     def names(self, parameters: Parameters) -> list[str]:
         """Return the identified parameters that it speaks of."""
-        used = self._sums(given(None, parameters))[0].any(axis=(0, 1))
+        used = np.any(self._sums(given(None, parameters))[0], axis=(0, 1)).tolist()
         return [name for name, own in zip(parameters.names, used, strict=True) if own]
 
     def require_near(self, parameters: Parameters) -> None:

@@ -146,8 +146,9 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
 
 def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
     """Return whether two expressions or constraints are the same but for paired variables, by ``id`` both ways."""
-    if isinstance(one, cp.Expression | cp.Constraint):
-        if type(one) is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
+    kind = type(one)
+    if issubclass(kind, cp.Expression | cp.Constraint):
+        if kind is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
             return False
         if isinstance(one, cp.Variable):
             mine, its = pairs.setdefault(id(one), id(other)), pairs.setdefault(id(other), id(one))
@@ -155,8 +156,8 @@ def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
         if isinstance(one, cp.Constant):
             return alike(_numbers(one), _numbers(other), pairs)
         own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
-        data = [[d for d in e.get_data() or [] if not (isinstance(d, int) and d in own)] for e in (one, other)]
-        return alike(*data, pairs) and alike(one.args, other.args, pairs)
+        mine, its = ([d for d in e.get_data() or [] if not (isinstance(d, int) and d in own)] for e in (one, other))
+        return alike(mine, its, pairs) and alike(one.args, other.args, pairs)
     if isinstance(one, dict):
         one, other = list(one.items()), list(other.items())
     if isinstance(one, list | tuple):

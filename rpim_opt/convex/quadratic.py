@@ -120,6 +120,7 @@ def _completed(H: Any, g: Array, at_zero: float) -> Quadratic | None:
     """Complete the square of 1/2 v'H v + g'v + at_zero; None where it has no minimum, or is too large to factor."""
     H = scipy.sparse.coo_array(H)
     diagonal = not np.any(H.data[H.row != H.col])
+    vectors: Any = None
     if diagonal:
         values, slope = np.bincount(H.row, H.data, minlength=len(g)) / 2, g
     elif len(g) > DENSE:

@@ -117,6 +117,7 @@ def covariances(
             ("u95", dimension): COVERAGE,
         }
         own = next((columns[key] / factor for key, factor in sources.items() if key in columns), None)
+        common = ""
         if own is None:
             common = next((key for key, of in kind.noise.items() if of == dimension), "")
             own = declared.get(name, declared.get(common))

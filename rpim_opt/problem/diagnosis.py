@@ -663,9 +663,8 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
         return
     flange = forward_kinematics(robot, points.q)
     for count in (2, 3):
-        named, marker = points, points.marker
+        named, marker, fit = points, points.marker, placed(robot, points)
         for _ in range(MOST_ROUNDS):
-            fit = placed(robot, named)
             frames = fit.base @ flange
             seen = np.einsum("nij,ni->nj", frames[:, :3, :3], points.y - frames[:, :3, 3])
             tools, before = fit.tools, marker
@@ -676,6 +675,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
             if named is not points and (marker == before).all():
                 break
             named = replace(points, marker=marker, tools=tools)
+            fit = placed(robot, named)
         sizes = np.bincount(marker, minlength=count)
         if sizes.min() >= FEWEST // 2 and misfit(robot, named) < FITS * whole:
             far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()

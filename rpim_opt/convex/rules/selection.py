@@ -102,14 +102,14 @@ def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
     def chosen(program: Program, *given: Any, **options: Any) -> Selection:
         if not program.separable or program.formulation.penalty is None:
             return rule(program, *given, **options)
-        weight = 1.0
-        for _ in range(ROUNDS):
+        weight, rounds = 1.0, 0
+        while True:
             z = program.solve(weight).z
             selection = rule(program.on_squares(program.trusted(z)), *given, **options)
-            if abs(np.log(max(selection.weight, SMALLEST) / weight)) < SETTLED:
-                break
+            rounds += 1
+            if abs(np.log(max(selection.weight, SMALLEST) / weight)) < SETTLED or rounds == ROUNDS:
+                return selection
             weight = max(selection.weight, SMALLEST)
-        return selection
 
     return chosen
 

@@ -206,6 +206,7 @@ def _clarabel(P: Any, q: Array, A: Any, b: Array, cones: list[Any], attempts: Se
 
     clarabel = import_module("clarabel")  # a compiled module, without types
     program = sparse.csc_matrix(P), q, sparse.csc_matrix(A), b, cones
+    found: Any = None
     for attempt in attempts or ATTEMPTS:
         settings = clarabel.DefaultSettings()
         settings.verbose, settings.max_threads = False, 1

@@ -455,7 +455,7 @@ def _rows_with_values(
     kept = [i for i in range(count) if i not in out]
     if columns and not kept:
         raise InputError("the table", "no row with values", "at least one")
-    whole = {name: [cells[i] for i in kept] for name, cells in columns.items()}
+    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in kept] for name, cells in columns.items()}
     own = [str(cell).strip() for cell in whole.get("label", ())]
     both = [f"{label}/{marker}" for label, marker in zip(own, whole.get("marker", ()), strict=False)]
     if both and not _unique(own) and _unique(both):
