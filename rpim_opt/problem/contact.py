@@ -216,7 +216,15 @@ class Touches:
             growth = np.einsum("ki,kin->n", away, jacobian[every]) / len(every) / spread**2
             slopes[every] += left[every][:, :, None] * growth
         for tie in self.ties:
-            left[tie.equations] = _off(tie, where)
+            first, second = (where[end] for end in tie.ends)
+            apart = second.centre - first.centre
+            if tie.kind == "known_square":
+                off: Array | float = -np.arcsin(np.clip(first.normal @ second.normal, -1, 1))
+            elif tie.kind == "known_parallel":
+                off = -first.across @ second.normal * np.copysign(1.0, first.normal @ second.normal)
+            else:
+                off = tie.value - float(abs(first.normal @ apart) if first.planar else np.linalg.norm(apart))
+            left[tie.equations] = off
             slopes[tie.equations] = sum(G @ jacobian[index.ravel()] for index, G in self.through(tie, where))
         return left, slopes
 
@@ -262,18 +270,6 @@ class Touches:
             for index, G in self.through(tie, where):
                 found[tie.equations[:, None], index.ravel()] = G
         return found.tocsr()[self.kept(where)]
-
-
-def _off(tie: Tie, where: Things) -> Array:
-    """Return by how much what a drawing states differs from where things are (e,)."""
-    first, second = (where[end] for end in tie.ends)
-    if tie.kind == "known_square":
-        return -np.arcsin(np.clip(first.normal @ second.normal, -1, 1))[None]
-    if tie.kind == "known_parallel":
-        return -first.across @ second.normal * np.copysign(1.0, first.normal @ second.normal)
-    apart = second.centre - first.centre
-    distance = abs(first.normal @ apart) if first.planar else np.linalg.norm(apart)
-    return np.array([tie.value - float(distance)])
 
 
 def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
@@ -346,7 +342,15 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Thing
             touch[first] = V
     left = touch.copy()
     for thing, index in zip(where, touches.rows, strict=True):
-        left[index[:, 0]] = _left(thing, touch[index[:, 0]])
+        V = touch[index[:, 0]]
+        K = len(V)
+        if K > 1:  # what touches are off the thing that they put in its place, of their own
+            through = thing.slopes(np.eye(3 * K).reshape(K, 3, 3 * K)).reshape(K, 3, K, 3)
+            own = np.einsum("aibj,bjk,albk->ail", through, V, through)
+            # directions that a touch does not show have no error: any positive variance serves
+            diagonal = np.einsum("kii->ki", own)
+            diagonal += np.where(diagonal > 0, 0.0, V.max())
+            left[index[:, 0]] = own
     ties = {}
     for tie in touches.ties:
         parts = [(G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, where)]
@@ -361,17 +365,4 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Thing
             if equation in ties:
                 rows[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + ties[equation]
         found.append(rows)
-    return found
-
-
-def _left(thing: Thing, V: Array) -> Array:
-    """Return the covariances (K, 3, 3) of what touches are off the thing that they put in its place, of their own."""
-    K = len(V)
-    if K == 1:
-        return V
-    through = thing.slopes(np.eye(3 * K).reshape(K, 3, 3 * K)).reshape(K, 3, K, 3)
-    found = np.einsum("aibj,bjk,albk->ail", through, V, through)
-    own = np.einsum("kii->ki", found)
-    # directions that a touch does not show have no error: any positive variance serves
-    own += np.where(own > 0, 0.0, V.max())
     return found

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from scipy.special import fdtrc
@@ -18,6 +18,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, combination, observe
+from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.misreadings import better_reading, coupling, misfit, placed, signs
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
@@ -290,32 +291,25 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     names = problem.parameters.free.names
     own = dict(zip(fitted.parameters.free.names, x, strict=True))
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
-    checks: list[Iterator[str]] = [
-        _ranges(problem), _same_values(data), copied_rows(data), shared_rows(data, validation),
-        _mistakes(problem, whole, np.array([own.get(name, 0.0) for name in names])),
-    ]  # fmt: skip
+    warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation), *rows_without_values(problem)]
+    better = better_reading(problem)
+    if better is not None:
+        warnings.append(better.sentence)
+    else:
+        warnings += exchanged_rows(problem)
+        there = np.array([own.get(name, 0.0) for name in names])
+        warnings += list(moved_far(problem)) or moved(whole, there)
     return Inspection(
         problem=problem,
         residual=residual,
         standing_out=tuple(far),
         repeated=repeated,
         repeatability=repeatability,
-        warnings=tuple(text for check in checks for text in check),
+        warnings=tuple(warnings),
         proposals=tuple(proposals),
         observability=observe(whole),
         contact=tuple(contact_sentences(problem)),
     )
-
-
-def _mistakes(problem: CalibrationProblem, fitted: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say what the data were mistaken for: another reading of all of them, or of some rows."""
-    yield from rows_without_values(problem)
-    better = better_reading(problem)
-    if better is not None:
-        yield better.sentence
-        return
-    yield from exchanged_rows(problem)
-    yield from list(moved_far(problem)) or moved(fitted, x)
 
 
 # What is said of a table
@@ -341,20 +335,8 @@ def _repeated(data: Dataset) -> tuple[tuple[tuple[str, ...], ...], float | None]
     return tuple(groups), float(np.sqrt(squares / freedom)) if freedom else None
 
 
-def _same_values(data: Dataset) -> Iterator[str]:
-    """Say which rows have the measured values of another configuration."""
-    for block in data.blocks:
-        if block.y.shape[1] < 3:
-            continue
-        _, first, which = np.unique(block.y, axis=0, return_index=True, return_inverse=True)
-        for i, k in enumerate(which):
-            if not np.allclose(block.q[i], block.q[first[k]]):
-                pair = f"{data.label[block.row[first[k]]]} and {data.label[block.row[i]]}"
-                yield f"rows {pair} have the same measured values in different configurations: copied?"
-
-
 def _ranges(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which joints leave their limits or hardly move, and which units may have been exchanged."""
+    """Say which joints leave their limits or hardly move, and which units or rows may be mistaken."""
     robot = problem.robot
     q = _all_q(problem.data)
     for i, dimension in enumerate(robot.joint_dimensions):
@@ -382,6 +364,15 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
             yield f"{sizes}: millimetres given as metres?"
         elif size < reach / 200:
             yield f"{sizes}: metres given as millimetres?"
+    for block in problem.data.blocks:
+        if block.y.shape[1] < 3:
+            continue
+        label = [problem.data.label[row] for row in block.row]
+        _, first, which = np.unique(block.y, axis=0, return_index=True, return_inverse=True)
+        for i, k in enumerate(first[which]):
+            if not np.allclose(block.q[i], block.q[k]):
+                both = f"rows {label[k]} and {label[i]}"
+                yield f"{both} have the same measured values in different configurations: copied?"
 
 
 def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
@@ -529,7 +520,12 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
         if len(block.y) < FEWEST:  # lengths of a drawing are round
             continue
         lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
-        unit = _rounded_to(1e3 * block.y[:, lengths])
+        values = 1e3 * block.y[:, lengths]
+        exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
+        digits = [*(np.full(values.shape, each) for each in (2, 1, 0)), exponents - 2, exponents - 3]
+        units = (10.0**each for each in digits)  # 100, 10 or 1 for all, or the last of 3 or 4 digits
+        exact = (unit for unit in units if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < 1e-6)
+        unit = next(exact, np.zeros(values.shape))
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
         remedy = "export more decimals, or state that as their noise"
         found.append((f"measured values are rounded to {unit.max(initial=0.0):g} mm", made, remedy))
@@ -600,19 +596,6 @@ def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
             unsigned += [*("xyz" if y.min() >= 0 else "")]
         if unsigned and len(q) >= 2 * FEWEST:
             yield f"no value of column {joined(unsigned)} is negative: were signs lost?"
-
-
-def _rounded_to(values: Array) -> Array:
-    """Return the units (N, c) that values are rounded to: 100, 10 or 1 for all, or their last of 3 or 4 digits."""
-    exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
-    for unit in (
-        *(np.full(values.shape, each) for each in (100.0, 10.0, 1.0)),
-        10 ** (exponents - 2),
-        10 ** (exponents - 3),
-    ):
-        if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < 1e-6:
-            return unit
-    return np.zeros(values.shape)
 
 
 def decimals_of(values: Array) -> int | None:
@@ -710,24 +693,13 @@ def _places(count: int) -> list[int]:
 # What residuals say
 
 
-class _Added(NamedTuple):
-    """Which of several additions to a linearization explains its residual, by which coefficients (c,), and the rest."""
-
-    number: int
-    coefficients: Array
-    left: float  # part of the residual's norm
-
-
-def _added(problem: CalibrationProblem, x: Array, additions: Callable[[Array], Sequence[Array]]) -> _Added | None:
-    """Return the columns (m, c) that explain the residual at x (n,) best, of those that follow from A (m, n) there.
+def _added(model: LinearModel, x: Array, columns: Sequence[Array]) -> tuple[int, Array, float] | None:
+    """Return which columns (m, c) explain a residual at x (n,) best, by which coefficients (c,), and the rest of it.
 
     Beside the parameters with their prior they must explain half of the sum of squares, more than chance does once in a
-    million (F test, all additions counted). None where none does, and of more than `MOST_EQUATIONS` equations.
+    million (F test, all columns counted): None where none does. The rest is a part of the residual's norm.
     """
-    model = problem.linearize(x)
-    if len(model.b) > MOST_EQUATIONS:
-        return None
-    r = model.b - model.A @ (x / problem.parameters.free.scale)
+    r = model.b - model.A @ (x / model.parameters.scale)
     whole = float(r @ r)
     own = np.linalg.qr(np.vstack([model.A, np.eye(len(x))]))[0]
 
@@ -736,7 +708,6 @@ def _added(problem: CalibrationProblem, x: Array, additions: Callable[[Array], S
         return G - own @ (own.T @ G)
 
     rest = without(r[:, None])[:, 0]
-    columns = additions(model.A)
     gains, steps = [], []
     for each in columns:
         G = without(each)
@@ -751,7 +722,7 @@ def _added(problem: CalibrationProblem, x: Array, additions: Callable[[Array], S
     left = max(whole - gains[best], 1e-300)
     if float(fdtrc(c, spare[best], gains[best] / c / (left / spare[best]))) * len(gains) >= RARE:
         return None
-    return _Added(best, steps[best], float(np.sqrt(left / whole)))
+    return best, steps[best], float(np.sqrt(left / whole))
 
 
 def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
@@ -760,6 +731,8 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, or that
     of the scale or offset of distances, of positions by the base's place along them and along their directions.
     """
+    if len(problem.owners) > MOST_EQUATIONS:
+        return
     free = problem.parameters.free
     q = problem.joint_values[problem.owners]
     zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(problem.robot.joint_types, 1)]
@@ -772,25 +745,23 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
             y[block.row] = block.y[:, :3]
         elif block.measurement.name in ("cable", "distance"):
             lengths[block.row] = np.column_stack([block.y, np.ones(len(block.y))])
-    ways = [y, y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)] if len(base) == 3 else []
-
-    def columns(A: Array) -> list[Array]:
-        slopes = A / free.scale
-        places = [free.names.index(zeros[i]) for i, _ in pairs]
-        gears = [slopes[:, [k]] * q[:, [j]] for k, (_, j) in zip(places, pairs, strict=True)]
-        along = lengths[problem.owners]
-        if lengths.any():
-            along *= (np.linalg.norm(A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1))[:, None]
-        for k, way in enumerate(ways):
+    model = problem.linearize(x)
+    slopes = model.A / free.scale
+    gears = [slopes[:, [free.names.index(zeros[i])]] * q[:, [j]] for i, j in pairs]
+    along = lengths[problem.owners]
+    if lengths.any():
+        unit = np.linalg.norm(model.A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1)
+        along *= unit[:, None]
+    if len(base) == 3:
+        for k, way in enumerate((y, y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9))):
             along[:, k] += np.sum(slopes[:, base] * way[problem.owners], axis=1)
-        return [*gears, along[:, [0]], along[:, [1]]]
-
-    found = _added(problem, x, columns)
-    if found is None or abs(factor := found.coefficients[0]) > SMALL:
+    found = _added(model, x, [*gears, along[:, [0]], along[:, [1]]])
+    if found is None or abs(factor := found[1][0]) > SMALL:
         return
-    left = f"that leaves {100 * found.left:.0f} % of the residuals"
-    if found.number < len(pairs):
-        i, j = pairs[found.number]
+    number, _, rest = found
+    left = f"that leaves {100 * rest:.0f} % of the residuals"
+    if number < len(pairs):
+        i, j = pairs[number]
         to_model = problem.robot.joint_map.copy()
         to_model[i] += factor * problem.robot.joint_map[j]
         what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
@@ -799,7 +770,7 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
             part = sign[i] * factor * sign[j]
             what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
         yield f"{what}: {left}; {coupling(to_model)}."
-    elif found.number == len(pairs):
+    elif number == len(pairs):
         yield f"measured lengths are {100 * factor:+.2g} % too long: {left}; check the scale of the instrument."
     else:
         far = three_digits(1e3 * factor)
@@ -814,35 +785,10 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """
     free = problem.parameters.free
     data = problem.data
-    parts, fixtures = _movable(problem)
-    of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
-    if not any(of[what] for what in ("base", *fixtures)) or len(data) < 2 * FEWEST:
-        return
-    tried = [(k, what) for k in _places(len(data)) for what, some in of.items() if some]
-    found = _added(problem, x, lambda A: [A[:, of[what]] * (problem.owners >= k)[:, None] for k, what in tried])
-    if found is not None:
-        place, what = tried[found.number]
-        some = of[what]
-        equations = Equations.of(data)
-        after = equations.length & (equations.row >= place)
-        change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * found.coefficients)
-        far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
-        causes = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
-        causes |= dict.fromkeys(fixtures, "did it, or the robot's foot, move")
-        yield (
-            f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
-            f"them, and fit a {what} that moved (that leaves {100 * found.left:.0f} % of the residuals): "
-            f"{causes.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
-        )
-
-
-def _movable(problem: CalibrationProblem) -> tuple[dict[str, set[str]], set[str]]:
-    """Return the parameters of what may move while rows are measured, and which of that are fixtures (anchors)."""
-    blocks = problem.data.blocks
-    markers = {marker for block in blocks for marker in block.markers}
+    markers = {marker for block in data.blocks for marker in block.markers}
     parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
     fixtures = set()
-    for block in blocks:
+    for block in data.blocks:
         names = list(block.measurement.parameters)
         if names:
             what = names[0].split("_")[0]
@@ -850,7 +796,28 @@ def _movable(problem: CalibrationProblem) -> tuple[dict[str, set[str]], set[str]
             parts.setdefault(what, set()).update(of_fixture(name, block.fixture) for name in names)
     for i, kind in enumerate(problem.robot.joint_types, start=1):
         parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
-    return parts, fixtures
+    of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
+    unfit = len(data) < 2 * FEWEST or len(problem.owners) > MOST_EQUATIONS
+    if unfit or not any(of[what] for what in ("base", *fixtures)):
+        return
+    tried = [(k, what) for k in _places(len(data)) for what, some in of.items() if some]
+    model = problem.linearize(x)
+    found = _added(model, x, [model.A[:, of[what]] * (problem.owners >= k)[:, None] for k, what in tried])
+    if found is not None:
+        number, coefficients, rest = found
+        place, what = tried[number]
+        some = of[what]
+        equations = Equations.of(data)
+        after = equations.length & (equations.row >= place)
+        change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * coefficients)
+        far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
+        causes = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
+        causes |= dict.fromkeys(fixtures, "did it, or the robot's foot, move")
+        yield (
+            f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
+            f"them, and fit a {what} that moved (that leaves {100 * rest:.0f} % of the residuals): "
+            f"{causes.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
+        )
 
 
 # What touches say

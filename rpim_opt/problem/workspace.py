@@ -211,35 +211,32 @@ class Target(NamedTuple):
         A configuration that does not get there is drawn again, from a share of the ranges; rows do not depend on each
         other. What processors differ by in rounding grows 100 times at worst, to a thousandth of what a table prints.
         """
-        q = np.empty((count, self.robot.dof))
+        low, high = np.array([[-np.inf], [np.inf]]) if self.within is None else self.within.T
+        least, most = (self.robot.limits if self.within is None else self.within).T
+        found = np.empty((count, self.robot.dof))
         missing = np.ones(count, dtype=bool)
         nearest = np.full(count, np.inf)
         for draw in range(DRAWS):
             rows = np.flatnonzero(missing)
             # drawn for all rows, also those that are there: a row's draws do not depend on another row's luck
-            q[rows] = random_candidates(self.robot, count, rng, share)[rows]
-            q[rows], missing[rows] = self._led(q[rows], rows)
-            nearest[rows] = np.minimum(nearest[rows], np.linalg.norm(self.away(q[rows], rows), axis=1))
+            q = random_candidates(self.robot, count, rng, share)[rows]
+            there = np.zeros(len(q), dtype=bool)
+            for _ in range(40):  # some dozen long steps until the target is near, then a few to rounding
+                way = np.flatnonzero(~there)
+                q[way] = np.clip(q[way] + self._step(q[way], rows[way]), low, high)
+                there[way] = np.linalg.norm(self.away(q[way], rows[way]), axis=1) < THERE
+                if there.all():
+                    break
+            # a last step for all: rounding is then all that is left, the same on every processor
+            q = q + self._step(q, rows)
+            found[rows] = q
+            missing[rows] = ~there | np.any((q < least) | (q > most), axis=1)
+            nearest[rows] = np.minimum(nearest[rows], np.linalg.norm(self.away(q, rows), axis=1))
             if not missing.any():
-                return q, None
+                return found, None
             if draw >= FIRST and (nearest > FAR).any():
                 break
-        return q, int(np.argmax(nearest * missing))
-
-    def _led(self, q: Array, rows: np.ndarray) -> tuple[Array, np.ndarray]:
-        """Return joint values led from q (M, dof), and which of them (M,) are not there or beyond the limits."""
-        low, high = np.array([[-np.inf], [np.inf]]) if self.within is None else self.within.T
-        there = np.zeros(len(q), dtype=bool)
-        for _ in range(40):  # some dozen long steps until the target is near, then a few to rounding
-            way = np.flatnonzero(~there)
-            q[way] = np.clip(q[way] + self._step(q[way], rows[way]), low, high)
-            there[way] = np.linalg.norm(self.away(q[way], rows[way]), axis=1) < THERE
-            if there.all():
-                break
-        # a last step for all: rounding is then all that is left, the same on every processor
-        q = q + self._step(q, rows)
-        low, high = (self.robot.limits if self.within is None else self.within).T
-        return q, ~there | np.any((q < low) | (q > high), axis=1)
+        return found, int(np.argmax(nearest * missing))
 
     def _step(self, q: Array, rows: np.ndarray) -> Array:
         """Return every row's step (M, dof), no longer than `LONGEST` ranges."""
@@ -339,6 +336,9 @@ def postures_in_sight(
     tool = numeric_frame([at[tool_prefix(block.markers[0]) + c] for c in FRAME])
     camera = {name: at[of_fixture(f"camera_{name}", block.fixture)] for name in INTRINSICS}
     points = np.asarray(points, dtype=float)
+    normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
+    normal = normal * np.copysign(1.0, normal[np.argmax(np.abs(normal))])
+    size = np.array(image)
     rng = np.random.default_rng(seed)
     found = np.zeros((0, problem.robot.dof))
     for _ in range(TIMES):
@@ -346,23 +346,17 @@ def postures_in_sight(
         T: Array = base @ forward_kinematics(problem.robot, q) @ tool
         if block.measurement is eye_in_hand:
             T = np.asarray(np.linalg.inv(T), dtype=float)
-        found = np.concatenate([found, q[_in_sight(T, points, camera, np.array(image))]])
+        there = transformed(T[:, None], points)
+        before = (there[:, :, 2] > 0).all(axis=1)
+        sight = there.mean(axis=1)
+        leaning = np.einsum("nij,j,ni->n", T[:, :3, :3], normal, sight)
+        there[~before] = [0.0, 0.0, 1.0]
+        uv = np.stack(pixels(*np.moveaxis(there, 2, 0), **camera), axis=2)
+        inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(axis=(1, 2))
+        large = np.ptp(uv, axis=1).max(axis=1) > LARGE * size[0]
+        upright = leaning > UPRIGHT * np.linalg.norm(sight, axis=1)
+        found = np.concatenate([found, q[before & inside & large & upright]])
         if len(found) >= count:
             return found[:count]
     found_text = f"{len(found)} of {count} views in which the board is in sight"
     raise InputError("postures_in_sight", found_text, "frames, a share and an image with which it is more often")
-
-
-def _in_sight(T: Array, points: Array, camera: dict[str, float], image: Array) -> np.ndarray:
-    """Return which poses (N, 4, 4) of the board in the camera's frame show all of it."""
-    there = transformed(T[:, None], points)
-    before = (there[:, :, 2] > 0).all(axis=1)
-    sight = there.mean(axis=1)
-    normal = np.linalg.svd(points - points.mean(axis=0))[2][2]
-    normal = normal * np.copysign(1.0, normal[np.argmax(np.abs(normal))])
-    leaning = np.einsum("nij,j,ni->n", T[:, :3, :3], normal, sight)
-    there[~before] = [0.0, 0.0, 1.0]
-    uv = np.stack(pixels(*np.moveaxis(there, 2, 0), **camera), axis=2)
-    inside = ((uv > MARGIN * image) & (uv < (1 - MARGIN) * image)).all(axis=(1, 2))
-    large = np.ptp(uv, axis=1).max(axis=1) > LARGE * image[0]
-    return before & inside & large & (leaning > UPRIGHT * np.linalg.norm(sight, axis=1))
