@@ -632,16 +632,28 @@ class CalibrationProblem(RobotModel):
         ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
         they are taken [SI], None for nominal.
         """
-        found = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
+        row = self._equations.row
+        number = self.data.configuration[row]
+        order = np.lexsort((row, number))
+        _, first, count = np.unique(number[order], return_index=True, return_counts=True)
+        groups = [order[first[count == k][:, None] + np.arange(k)] for k in np.unique(count)]
+        found = self._stacked(groups, joints, at)
         if self.touches is None:
             return found
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, found, self.touched, stop[self._equations.row])
+        return contrasted(self.touches, found, self.touched, stop[row])
 
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
         """Return groups of equations (N, k) with what divides their noise; arguments as for `stacks`."""
         slopes = self.joint_slopes(at) if joints else None
-        shifts = self._shifts(at)
+        shifts = None
+        seen = [block.measurement.metres is not None for block in self.data.blocks]
+        if any(seen):  # a camera or a board that the robot holds elsewhere shifts all points of a view together
+            places = {
+                name: SHIFTED.index(own_name(name)) for name in self.parameters.names if own_name(name) in SHIFTED
+            }
+            camera = np.repeat(seen, [index.size for index in equation_numbers(self.data)])
+            shifts = self._slopes_by(places, len(SHIFTED), at) * camera[:, None]
         return [self._equations.stack(index, slopes, shifts) for index in groups]
 
     def covariances(self, reading: bool = True) -> list[Array]:
@@ -686,19 +698,6 @@ class CalibrationProblem(RobotModel):
                     joints[f"{name}.theta{i + 1}"] = i
         # the same joint of several robots: a row has slopes by those of its own robot alone
         return self._slopes_by(joints, max(len(robot.mdh) for robot in self.arms.values()), at)
-
-    def _shifts(self, at: Array | None) -> Array | None:
-        """Return the slopes (m, 3) of what cameras see by where the robot is; None where no row is a camera's.
-
-        Zero for other rows, whose own lengths are shifted. A camera or a board that the robot holds elsewhere shifts
-        all points of a view together.
-        """
-        seen = [block.measurement.metres is not None for block in self.data.blocks]
-        if not any(seen):
-            return None
-        columns = {name: SHIFTED.index(own_name(name)) for name in self.parameters.names if own_name(name) in SHIFTED}
-        camera = np.repeat(seen, [index.size for index in equation_numbers(self.data)])
-        return self._slopes_by(columns, len(SHIFTED), at) * camera[:, None]
 
 
 def error_dimensions(block: Block) -> list[str]:

@@ -172,11 +172,39 @@ class _Parameters:
 def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], list[ca.SX]]:
     """Return deviations, nominal values and the row; residual, modelled values, and metres of a residual of one."""
     p = _Parameters(of)
-    stated = of.loads.symbols(len(of.joint_types), len(of.markers))
+    points = len(of.markers)
+    stated = of.loads.symbols(len(of.joint_types), points)
     session = ca.SX.sym("session", len(of.sessions))
     y = ca.SX.sym("y", len(measurement.columns))
-    transforms = [_reflector(of, measurement, p, stated, session, point) for point in range(len(of.markers))]
-    own = _keywords(of, measurement, p, stated)
+    # every point's reflector in the frame that measures
+    transforms = []
+    for point, marker in enumerate(of.markers):
+        posture = of.loads.posture(of.joint_types, p.start, stated, point)
+        factors = []
+        if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
+            factors += p.frame("base_")
+        if of.sessions:
+            factors += p.chosen(of.sessions, session)
+        flange = chain(of.joint_types, posture, p.value, of.terms)
+        temperature = posture.columns.get("temperature")
+        if temperature is not None:  # all lengths have grown: the flange is as far again from the base
+            growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
+            factors.append(translation(*ca.vertsplit(growth * product(flange)[:3, 3])))
+        transforms.append(product([*factors, *flange, *p.frame(tool_prefix(marker))]))
+    # frames, parameters and columns that the model takes by name
+    own: dict[str, Symbol] = {name: product(p.frame(of_fixture(name + "_", of.fixture))) for name in measurement.frames}
+    in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
+    for name in measurement.parameters:
+        if not name.startswith(in_frames):
+            own[name] = p.value(of_fixture(name, of.fixture))
+    known = of.loads.named(stated) | {"q": ca.reshape(stated["q"], -1, points)}
+    if "torque" in stated:
+        known["torque"] = ca.reshape(stated["torque"], -1, points)
+    for name in measurement.sees:
+        if name not in known:
+            where = f"measurement {measurement.name}"
+            raise InputError(where, f"data without '{name}', on which it depends", "data that state it in every row")
+        own[name] = known[name]
     modelled = ca.densify(measurement.model(*transforms, **own))
     residual = ca.densify(measurement.minus(y if measurement.columns else 0, modelled))
     if residual.numel() != len(measurement.components):
@@ -186,43 +214,6 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     if measurement.metres is not None:
         metres = measurement.metres(*transforms, **own)
     return [p.x, p.nominal, ca.vertcat(*stated.values(), session, y)], [residual, modelled, ca.densify(metres)]
-
-
-def _reflector(
-    of: Structure, measurement: Measurement, p: _Parameters, stated: Stated, session: ca.SX, point: int
-) -> ca.SX:
-    """Return the transform of a point's reflector in the frame that measures."""
-    posture = of.loads.posture(of.joint_types, p.start, stated, point)
-    factors = []
-    if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
-        factors += p.frame("base_")
-    if of.sessions:
-        factors += p.chosen(of.sessions, session)
-    flange = chain(of.joint_types, posture, p.value, of.terms)
-    temperature = posture.columns.get("temperature")
-    if temperature is not None:  # all lengths have grown: the flange is as far again from the base
-        growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
-        factors.append(translation(*ca.vertsplit(growth * product(flange)[:3, 3])))
-    return product([*factors, *flange, *p.frame(tool_prefix(of.markers[point]))])
-
-
-def _keywords(of: Structure, measurement: Measurement, p: _Parameters, stated: Stated) -> dict[str, Symbol]:
-    """Return the frames, parameters and columns that a measurement's model takes by name."""
-    own: dict[str, Symbol] = {name: product(p.frame(of_fixture(name + "_", of.fixture))) for name in measurement.frames}
-    in_frames = tuple(f"{prefix}_" for prefix in measurement.frames)
-    for name in measurement.parameters:
-        if not name.startswith(in_frames):
-            own[name] = p.value(of_fixture(name, of.fixture))
-    points = len(of.markers)
-    known = of.loads.named(stated) | {"q": ca.reshape(stated["q"], -1, points)}
-    if "torque" in stated:
-        known["torque"] = ca.reshape(stated["torque"], -1, points)
-    for name in measurement.sees:
-        if name not in known:
-            where = f"measurement {measurement.name}"
-            raise InputError(where, f"data without '{name}', on which it depends", "data that state it in every row")
-        own[name] = known[name]
-    return own
 
 
 Stated = Mapping[str, ca.SX]
