@@ -142,3 +142,9 @@ class Equations(NamedTuple):
             G = shifts[index]
             unit = G @ G.transpose(0, 2, 1) + length[:, :, None] * np.eye(index.shape[1])
         return Stack(index, V, length, self.angle[index], joint, unit)
+
+    def grouped(self, number: np.ndarray) -> list[np.ndarray]:
+        """Return the equations (N, k) of every k that groups have, by the number (m,) of their group, row by row."""
+        order = np.lexsort((self.row, number))
+        _, first, count = np.unique(number[order], return_index=True, return_counts=True)
+        return [order[first[count == k][:, None] + np.arange(k)] for k in np.unique(count)]

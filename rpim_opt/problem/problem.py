@@ -632,16 +632,11 @@ class CalibrationProblem(RobotModel):
         ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
         they are taken [SI], None for nominal.
         """
-        row = self._equations.row
-        number = self.data.configuration[row]
-        order = np.lexsort((row, number))
-        _, first, count = np.unique(number[order], return_index=True, return_counts=True)
-        groups = [order[first[count == k][:, None] + np.arange(k)] for k in np.unique(count)]
-        found = self._stacked(groups, joints, at)
+        found = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
         if self.touches is None:
             return found
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, found, self.touched, stop[row])
+        return contrasted(self.touches, found, self.touched, stop[self._equations.row])
 
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
         """Return groups of equations (N, k) with what divides their noise; arguments as for `stacks`."""
