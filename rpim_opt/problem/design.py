@@ -19,7 +19,6 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import Parameters
 
 CRITERIA = ("D", "A", "V")
 ANYWHERE = 1.0
@@ -270,17 +269,12 @@ def _relaxed(A: Array, count: int, criterion: str, C: Array, progress: Callable[
             break
         if k % 200 == 0:
             progress(f"relaxing over {len(A)} candidates: within {100 * off:.2f} %")
-        w = _filled(w * np.maximum(gain, 1e-300) ** power, count)
+        # min(1, mu v) with mu such that the sum is count
+        v = w * np.maximum(gain, 1e-300) ** power
+        order = np.argsort(-v)
+        mu = (count - np.arange(count)) / np.cumsum(v[order][::-1])[::-1][:count]  # if so many weights are 1
+        w = np.minimum(1.0, mu[np.argmax(mu * v[order[:count]] <= 1)] * v)
     return w, bound
-
-
-def _filled(v: Array, count: int) -> Array:
-    """min(1, mu v) with mu such that the sum is count."""
-    order = np.argsort(-v)
-    tail = np.cumsum(v[order][::-1])[::-1]
-    ones = np.arange(count)  # that many weights at 1
-    mu = (count - ones) / tail[:count]
-    return np.minimum(1.0, mu[np.argmax(mu * v[order[:count]] <= 1)] * v)
 
 
 def _exchanged(A: Array, chosen: np.ndarray, criterion: str, C: Array) -> np.ndarray:
@@ -418,45 +412,25 @@ def observe(problem: Source) -> Observability:
         U = reduced_rows(part.jacobian(x) * units, U)
     raw = np.linalg.svd(U, compute_uv=False)
     tiny = 1e-15 * raw[0]  # rounding, another on every processor
-    redundant, base = _combinations(A, rank, free, blind)
-    return Observability(
-        names=free.names,
-        singular_values=s,
-        rank=rank,
-        configurations=configurations,
-        unidentifiable=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
-        redundant=redundant,
-        base=base,
-        condition=float(s[0] / s[rank - 1]),
-        raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > tiny else float("inf"),
-    )
-
-
-def _combinations(
-    A: Array, rank: int, free: Parameters, blind: np.ndarray
-) -> tuple[tuple[dict[str, float], ...], tuple[dict[str, float], ...]]:
-    """Return a sparse basis of the null space, in the order of the parameters, and the base parameters.
-
-    Column rest[j] = sum_i W_ij column pivot[i]. Independent columns are each time the first that is about as long as
-    any, less those before it: redundant columns are often parallel and of one length, and without a margin rounding
-    would choose between them.
-    """
+    # Independent columns are each time the first that is about as long as any, less those before it: redundant columns
+    # are often parallel and of one length, and without a margin rounding would choose between them.
     left = A.copy()
     pivot: list[int] = []
     for _ in range(rank):
-        length = np.linalg.norm(left, axis=0)
-        length[pivot] = 0.0
-        pivot.append(int(np.argmax(length >= (1 - TIE) * length.max())))
-        direction = left[:, pivot[-1]] / length[pivot[-1]]
+        size = np.linalg.norm(left, axis=0)
+        size[pivot] = 0.0
+        pivot.append(int(np.argmax(size >= (1 - TIE) * size.max())))
+        direction = left[:, pivot[-1]] / size[pivot[-1]]
         left -= np.outer(direction, direction @ left)
-    rest = np.setdiff1d(np.arange(A.shape[1]), pivot)
+    # column rest[j] = sum_i W_ij column pivot[i]
+    rest = np.setdiff1d(np.arange(len(x)), pivot)
     Q, R = np.linalg.qr(A[:, pivot])
     W = np.linalg.solve(R, Q.T @ A[:, rest])
     W = np.where(np.abs(W) > 1e-6, W, 0.0)
-    nulls = []
+    nulls = []  # a sparse basis of the null space, in the order of the parameters
     for j, dependent in enumerate(rest):
         if not blind[dependent]:
-            null = np.zeros(len(free))
+            null = np.zeros(len(x))
             null[dependent] = 1.0
             null[pivot] = -W[:, j]
             null *= free.scale
@@ -467,9 +441,19 @@ def _combinations(
     base = []
     for i in np.argsort(pivot):
         sums = W[i] * free.scale[pivot[i]] / free.scale[rest]
-        base.append({free.names[pivot[i]]: 1.0} | {free.names[k]: float(v) for k, v in zip(rest, sums, strict=True)
-                                                   if abs(v) > FAINT})  # fmt: skip
-    return tuple({free.names[k]: float(null[k]) for k in np.flatnonzero(null)} for null in nulls), tuple(base)
+        added = {free.names[k]: float(v) for k, v in zip(rest, sums, strict=True) if abs(v) > FAINT}
+        base.append({free.names[pivot[i]]: 1.0} | added)
+    return Observability(
+        names=free.names,
+        singular_values=s,
+        rank=rank,
+        configurations=configurations,
+        unidentifiable=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
+        redundant=tuple({free.names[k]: float(null[k]) for k in np.flatnonzero(null)} for null in nulls),
+        base=tuple(base),
+        condition=float(s[0] / s[rank - 1]),
+        raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > tiny else float("inf"),
+    )
 
 
 def combination(terms: dict[str, float]) -> str:

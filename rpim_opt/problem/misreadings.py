@@ -230,21 +230,21 @@ def _of_positions() -> Iterator[Reading]:
         for axis, of_axis in zip("xyz", np.eye(3), strict=True):
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
+
+    def from_angles(points: Points) -> Points:
+        azimuth, elevation = np.radians(points.y[:, :2].T / 1e-3)  # degrees were read as millimetres
+        flat = np.cos(elevation)
+        directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
+        return replace(points, y=points.y[:, [2]] * directions)
+
     remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
-    yield Reading("columns x, y, z that are azimuth, elevation and distance", remedy, _from_angles)
+    yield Reading("columns x, y, z that are azimuth, elevation and distance", remedy, from_angles)
     remedy = "change the sign of one coordinate, or exchange two"
     yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
 
 
 def _scaled(what: str, remedy: str, factors: Array | float) -> Reading:
     return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
-
-
-def _from_angles(points: Points) -> Points:
-    azimuth, elevation = np.radians(points.y[:, :2].T / 1e-3)  # degrees were read as millimetres
-    flat = np.cos(elevation)
-    directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-    return replace(points, y=points.y[:, [2]] * directions)
 
 
 def _of_poses() -> Iterator[Reading]:
@@ -416,8 +416,33 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
             if not left < BETTER * stated:
                 chain, left = _best(robot, points, list(readings(robot)))
     if not left < BETTER * stated or (left > LEFT and not points.seen):
-        return None if points.seen else _sibling(robot, points)
-    return _compared(robot, chain, points, stated, left)
+        # a ready robot of nearly the same drawing, a UR10 for a UR10e
+        own = misfit(robot, points)
+        for each in [] if points.seen else _other_robots(robot):
+            if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
+                left = misfit(each.robot, points)
+                if left < SIBLING_BETTER * own:
+                    return Better(each.what, each.remedy, own * points.extent, left * points.extent)
+        return None
+    # each mistake with what fits as well in its place: some are the same but for base and tool
+    same = []
+    changed = points
+    for i, each in enumerate(chain):
+        behind = chain[i + 1 :]
+        alike = [each]
+        for other in each.others:
+            tried = other.change(changed)
+            as_many = len(tried.row) == len(each.change(changed).row)  # the mistakes behind it are of so many rows
+            if behind and as_many:
+                whole = reduce(lambda now, mistake: mistake.change(now), behind, tried)
+                as_many = bool(misfits(robot, [whole])[0] <= SAME * left)
+            if as_many or not behind:
+                alike.append(other)
+        same.append(alike)
+        changed = each.change(changed)
+    what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
+    remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
+    return Better(what, remedy, stated * points.extent, left * changed.extent)
 
 
 @dataclass(frozen=True, eq=False)
@@ -488,17 +513,6 @@ def _better_lengths(problem: CalibrationProblem) -> Better | None:
     return Better(what, remedy, stated * float(np.ptp(y)), best * extent)
 
 
-def _sibling(robot: Robot, points: Points) -> Better | None:
-    """Return a ready robot of nearly the same drawing that fits better than the one that is stated, a UR10 a UR10e."""
-    own = misfit(robot, points)
-    for each in _other_robots(robot):
-        if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
-            left = misfit(each.robot, points)
-            if left < SIBLING_BETTER * own:
-                return Better(each.what, each.remedy, own * points.extent, left * points.extent)
-    return None
-
-
 def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
     chain: list[Reading] = []
@@ -523,28 +537,6 @@ def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading
         chain = chain[:1]
         best = float(_tried(robot, points, chain)[0])
     return chain, best
-
-
-def _compared(robot: Robot, chain: list[Reading], points: Points, stated: float, left: float) -> Better:
-    """Return mistakes in words, each with what fits as well in its place: some are the same but for base and tool."""
-    same = []
-    changed = points
-    for i, each in enumerate(chain):
-        behind = chain[i + 1 :]
-        alike = [each]
-        for other in each.others:
-            tried = other.change(changed)
-            as_many = len(tried.row) == len(each.change(changed).row)  # the mistakes behind it are of so many rows
-            if behind and as_many:
-                whole = reduce(lambda now, mistake: mistake.change(now), behind, tried)
-                as_many = bool(misfits(robot, [whole])[0] <= SAME * left)
-            if as_many or not behind:
-                alike.append(other)
-        same.append(alike)
-        changed = each.change(changed)
-    what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
-    remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
-    return Better(what, remedy, stated * points.extent, left * changed.extent)
 
 
 def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[list[Reading], float]:

@@ -72,7 +72,12 @@ def view_pose(points: Array, xy: Array) -> Array:
         H = _linear(local[:, :2], xy)  # its columns are two axes of the board and its origin, before the camera
         H = H / np.copysign(np.sqrt(np.linalg.norm(H[:, 0]) * np.linalg.norm(H[:, 1])), H[2, 2])
         first = rigid(proper(np.column_stack([H[:, 0], H[:, 1], np.cross(H[:, 0], H[:, 1])])), H[:, 2])
-        starts = [first, _mirrored(first)]
+        # the pose whose normal leans to the other side of the line of sight looks much alike from far away: half a turn
+        # about the line of sight, and half a turn about the board's normal
+        sight = first[:3, 3] / np.linalg.norm(first[:3, 3])
+        turn = np.diag([-1.0, -1.0, 1.0])
+        to = scipy.spatial.transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
+        starts = [first, rigid(to.T @ turn @ to @ first[:3, :3] @ turn, first[:3, 3])]
     else:
         P = _linear(local, xy)
         P *= np.sign(np.linalg.det(P[:, :3]))
@@ -116,15 +121,6 @@ def _linear(points: Array, xy: Array) -> Array:
     A = np.concatenate([np.hstack([X, zero, -x[:, :1] * X]), np.hstack([zero, X, -x[:, 1:2] * X])])
     P = np.linalg.svd(A)[2][-1].reshape(3, -1)
     return np.asarray(np.linalg.solve(V, P @ U), dtype=float)
-
-
-def _mirrored(T: Array) -> Array:
-    """Return the pose whose normal leans to the other side of the line of sight: it looks much alike from far away."""
-    sight = T[:3, 3] / np.linalg.norm(T[:3, 3])
-    turn = np.diag([-1.0, -1.0, 1.0])
-    to = scipy.spatial.transform.Rotation.align_vectors([[0, 0, 1]], [sight])[0].as_matrix()
-    half = to.T @ turn @ to  # half a turn about the line of sight
-    return rigid(half @ T[:3, :3] @ turn, T[:3, 3])  # and half a turn about the board's normal
 
 
 def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:

@@ -140,13 +140,16 @@ def certified_hand_eye(
     deviations = np.stack([np.broadcast_to(np.asarray(each, dtype=float), len(flange)) for each in sigma], axis=1)
     if not (np.isfinite(deviations).all() and (deviations > 0).all()):
         raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
-    loops = _loops(flange, measured, turned, deviations, np.asarray(expected, dtype=float)[:3], spread)
+    loops = _loops(flange, measured, turned, deviations, np.asarray(expected, dtype=float)[:3], spread, loss)
     candidates = []
     if turned.all():
         with suppress(InputError):
             Z, X = hand_eye(flange, measured)
             candidates.append(np.stack([Z[:3, :3], X[:3, :3].T]))
-    solved = _solve(loops, loss, candidates)
+    if loss == "truncated":
+        solved = _truncated(loops, candidates)
+    else:
+        solved = loops.weighted(np.ones(len(flange)), candidates)
     best = solved.smallest
     first, *last = best.rotations
     t, u = solved.v[:LINEAR].reshape(2, 3)
@@ -221,7 +224,8 @@ class _Loops:
     """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first.
 
     ``first`` and ``second`` (N, 3, 3) are orientations B_i = Z A_i X up to errors of ``sigma`` (N,) [rad], where
-    ``turned`` (N,) says that they were measured: A_i'A_j and B_i'B_j turn by the same angle.
+    ``turned`` (N,) says that they were measured: A_i'A_j and B_i'B_j turn by the same angle. ``beyond`` (N,) are the
+    c^2 of the loss min(r^2, c^2), infinite for the sum of squares.
     """
 
     rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
@@ -231,6 +235,7 @@ class _Loops:
     second: Array
     sigma: Array
     turned: np.ndarray
+    beyond: Array
 
     def triangle(self, weights: Array) -> Array:
         """Return T (n, n), upper, with |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2."""
@@ -238,177 +243,20 @@ class _Loops:
         rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
         return np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
 
-    def squares(self, v: Array) -> Array:
-        """Return |J_i v|^2 (N,)."""
-        return np.asarray(np.sum((self.rows @ v) ** 2, axis=1))
-
-    def completed(self, triangle: Array, x: Array) -> Array:
-        """Return v (n,) with the translations that are best for x."""
+    def at(self, triangle: Array, rotations: Array) -> tuple[Array, Array]:
+        """Return v (n,) of rotations (k, 3, 3) with the translations that are best for them, and |J_i v|^2 (N,)."""
+        x = lifted(rotations)
         T = triangle[:LINEAR]
-        y = solve_triangular(T[:, :LINEAR], -T[:, LINEAR:] @ x)
-        return np.concatenate([np.asarray(y, dtype=float), x])
-
-
-def _loops(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float) -> _Loops:
-    """Return the loops ``measured = base flange tool`` of flanges A and measured poses B with their positions y.
-
-    ::
-
-        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
-        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
-
-    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
-    """
-    N = len(flange)
-    eye = np.eye(3)
-    A = flange[:, :3, :3]
-    B = measured[:, :3, :3]
-    one = LINEAR
-    of_base = slice(LINEAR + 1, LINEAR + 10)
-    J = np.zeros((N, 12, LINEAR + 1 + 9 * (1 + turned.any())))
-    J[:, :3, :3] = -A
-    J[:, :3, 3:6] = -eye
-    J[:, :3, one] = -flange[:, :3, 3]
-    J[:, :3, of_base] = np.einsum("nb,ac->nabc", measured[:, :3, 3], eye).reshape(N, 3, 9)
-    if turned.any():
-        J[:, 3:, of_base] = -np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
-        J[:, 3:, of_base.stop :] = np.einsum("nai,bj->nabij", B, eye).reshape(N, 9, 9)
-    J[:, :3] /= sigma[:, 0, None, None]
-    J[:, 3:] *= (turned / (np.sqrt(2) * sigma[:, 1]))[:, None, None]
-    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2))))
-    prior = np.zeros((3, J.shape[2]))
-    prior[:, :3] = certainty * eye
-    prior[:, one] = -certainty * expected
-    return _Loops(J, prior, np.where(turned, 6, 3), A, B, sigma[:, 1], turned)
-
-
-# --- which measurements can agree ---------------------------------------------------------------------------------
-
-
-def _compatible(loops: _Loops, beyond: Array) -> np.ndarray:
-    """Return which two measurements (N, N) can both have squared residuals up to these (N,), for some frames.
-
-    ::
-
-        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
-
-    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
-    """
-    N = len(beyond)
-    if N > MOST_PAIRED:
-        return np.ones((N, N), dtype=bool)
-    angles = []
-    rough = np.zeros(N)
-    for given in (loops.first, loops.second):
-        rotations = proper(given)
-        rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
-        flat = rotations.reshape(-1, 9)
-        angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
-    chord = loops.sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
-    off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
-    known = np.outer(loops.turned, loops.turned)
-    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~known
-
-
-def _core(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
-
-    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
-    ICRA, find outliers so).
-    """
-    left = np.ones(len(pairs), dtype=bool)
-    while True:
-        kept = left & (np.sum(pairs[:, left], axis=1) >= count)
-        if np.array_equal(kept, left):
-            return left
-        left = kept
-
-
-def _likeliest(pairs: np.ndarray) -> np.ndarray:
-    """Return the core (N,) of the largest count that leaves any."""
-    counts = range(len(pairs) + 2)
-    return _core(pairs, bisect_left(counts, True, key=lambda count: not _core(pairs, count).any()) - 1)
-
-
-def _alone(loops: _Loops, squares: Array, agreeing: np.ndarray, beyond: Array) -> bool:
-    """Return whether no other measurements than the agreeing (N,) can be as many that agree with something else.
-
-    They cannot if fewer are left over than would have to, or if no other is in a core of that size. One whose square
-    (N,) a good one may have is no other.
-    """
-    count = int(np.sum(agreeing))
-    if count >= len(agreeing) // 2 + 2:
-        return True
-    strange = ~agreeing & (squares > chdtri(loops.equations, SURPRISE))
-    return count > 1 and not (_core(_compatible(loops, beyond), count) & strange).any()
-
-
-# --- losses -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """Where a loss of closed loops is least."""
-
-    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
-    smallest: Smallest  # of the last weighted problem
-    weights: Array  # (N,) that the loss gives the measurements; one for a square
-    squares: Array  # (N,) squared residuals
-    cost: float  # the loss, summed, and what is expected of translations
-    settled: bool = True  # whether the weights are those of the residuals
-    alone: bool = True  # whether no other measurements than those of full weight can be as many that agree
-
-
-def _solve(loops: _Loops, loss: str, candidates: Sequence[Array] = ()) -> _Solved:
-    """Return the least of a loss of r = |J_i v|, global where it is the sum of squares and the bound meets it.
-
-    ::
-
-        squares    r^2
-        truncated  min(r^2, c^2)        c^2 a quantile of chi-squared
-
-    The truncated loss begins with the largest core of measurements that turn alike, and if not all of that agree, with
-    all of them and parts of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
-    """
-    every = np.ones(len(loops.rows), dtype=bool)
-    if loss == "squares":
-        return _Solver(loops, np.full(len(every), np.inf)).weighted(every.astype(float), candidates)
-    beyond = chdtri(loops.equations, 1 - QUANTILE)
-    solver = _Solver(loops, beyond)
-    pairs = _compatible(loops, beyond)
-    first = _likeliest(pairs)
-    found = [solver.graduated(first), *filter(None, map(solver.begun, candidates))]
-    if not np.array_equal(found[0].weights > 0, first):
-        found.append(solver.graduated(every))
-    most = max(each.weights.sum() for each in found)
-    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
-        members = np.flatnonzero(first)
-        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
-        parts = [_likeliest(some) for some in around]
-        if len(members) <= FEW:  # turning alike, one may be wrong all the same
-            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
-        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
-        found += [solver.graduated(part) for part in distinct if part.sum() >= FEWEST]
-    least = min(each.cost for each in found)
-    best = next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
-    return replace(best, alone=_alone(loops, best.squares, best.weights > 0, beyond))
-
-
-@dataclass(frozen=True, eq=False)
-class _Solver:
-    """Weighted sums of squares of loops, and the truncated loss by them; ``beyond`` (N,) are the c^2."""
-
-    loops: _Loops
-    beyond: Array
+        v = np.concatenate([solve_triangular(T[:, :LINEAR], -T[:, LINEAR:] @ x), x])
+        return v, np.sum((self.rows @ v) ** 2, axis=1)
 
     def weighted(self, weights: Array, candidates: Sequence[Array] = (), near: Array | None = None) -> _Solved:
         """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps from rotations."""
-        triangle = self.loops.triangle(weights)
+        triangle = self.triangle(weights)
         L = triangle[LINEAR:, LINEAR:]  # |L x|^2 is the least over translations (a Schur complement)
         best = smallest(L, candidates) if near is None else nearest(L, near)
-        v = self.loops.completed(triangle, lifted(best.rotations))
-        squares = self.loops.squares(v)
-        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.loops.prior @ v) ** 2))
+        v, squares = self.at(triangle, best.rotations)
+        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
         return _Solved(v, best, weights, squares, cost)
 
     def repeated(self, solved: _Solved) -> _Solved:
@@ -442,11 +290,139 @@ class _Solver:
             mu *= 1.6
         return self.repeated(solved)
 
-    def begun(self, rotations: Array) -> _Solved | None:
-        """Return the least of the truncated loss near rotations; None where fewer than three measurements are near."""
-        triangle = self.loops.triangle(np.ones(len(self.beyond)))
-        squares = self.loops.squares(self.loops.completed(triangle, lifted(rotations)))
-        weights = (squares <= self.beyond).astype(float)
-        if weights.sum() < FEWEST:
-            return None
-        return self.repeated(self.weighted(weights, [rotations]))
+
+def _loops(
+    flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float, loss: str
+) -> _Loops:
+    """Return the loops ``measured = base flange tool`` of flanges A and measured poses B with their positions y.
+
+    ::
+
+        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
+        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
+
+    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
+    """
+    N = len(flange)
+    eye = np.eye(3)
+    A = flange[:, :3, :3]
+    B = measured[:, :3, :3]
+    one = LINEAR
+    of_base = slice(LINEAR + 1, LINEAR + 10)
+    J = np.zeros((N, 12, LINEAR + 1 + 9 * (1 + turned.any())))
+    J[:, :3, :3] = -A
+    J[:, :3, 3:6] = -eye
+    J[:, :3, one] = -flange[:, :3, 3]
+    J[:, :3, of_base] = np.einsum("nb,ac->nabc", measured[:, :3, 3], eye).reshape(N, 3, 9)
+    if turned.any():
+        J[:, 3:, of_base] = -np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
+        J[:, 3:, of_base.stop :] = np.einsum("nai,bj->nabij", B, eye).reshape(N, 9, 9)
+    J[:, :3] /= sigma[:, 0, None, None]
+    J[:, 3:] *= (turned / (np.sqrt(2) * sigma[:, 1]))[:, None, None]
+    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2))))
+    prior = np.zeros((3, J.shape[2]))
+    prior[:, :3] = certainty * eye
+    prior[:, one] = -certainty * expected
+    equations = np.where(turned, 6, 3)
+    beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
+    return _Loops(J, prior, equations, A, B, sigma[:, 1], turned, beyond)
+
+
+# --- which measurements can agree ---------------------------------------------------------------------------------
+
+
+def _compatible(loops: _Loops) -> np.ndarray:
+    """Return which two measurements (N, N) can both have squared residuals up to c^2, for some frames.
+
+    ::
+
+        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
+
+    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
+    """
+    N = len(loops.beyond)
+    if N > MOST_PAIRED:
+        return np.ones((N, N), dtype=bool)
+    angles = []
+    rough = np.zeros(N)
+    for given in (loops.first, loops.second):
+        rotations = proper(given)
+        rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
+        flat = rotations.reshape(-1, 9)
+        angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
+    chord = loops.sigma * np.sqrt(loops.beyond) / 2 + rough / np.sqrt(8)
+    off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
+    known = np.outer(loops.turned, loops.turned)
+    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~known
+
+
+def _core(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
+
+    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
+    ICRA, find outliers so).
+    """
+    left = np.ones(len(pairs), dtype=bool)
+    while True:
+        kept = left & (np.sum(pairs[:, left], axis=1) >= count)
+        if np.array_equal(kept, left):
+            return left
+        left = kept
+
+
+def _likeliest(pairs: np.ndarray) -> np.ndarray:
+    """Return the core (N,) of the largest count that leaves any."""
+    counts = range(len(pairs) + 2)
+    return _core(pairs, bisect_left(counts, True, key=lambda count: not _core(pairs, count).any()) - 1)
+
+
+# --- losses -------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Solved:
+    """Where a loss of closed loops is least."""
+
+    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
+    smallest: Smallest  # of the last weighted problem
+    weights: Array  # (N,) that the loss gives the measurements; one for a square
+    squares: Array  # (N,) squared residuals
+    cost: float  # the loss, summed, and what is expected of translations
+    settled: bool = True  # whether the weights are those of the residuals
+    alone: bool = True  # whether no other measurements than those of full weight can be as many that agree
+
+
+def _truncated(loops: _Loops, candidates: Sequence[Array]) -> _Solved:
+    """Return the least of the truncated loss min(r^2, c^2) of r = |J_i v|, c^2 being a quantile of chi-squared.
+
+    It begins with the largest core of measurements that turn alike, and if not all of that agree, with all of them and
+    parts of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
+    """
+    every = np.ones(len(loops.rows), dtype=bool)
+    pairs = _compatible(loops)
+    first = _likeliest(pairs)
+    found = [loops.graduated(first)]
+    for rotations in candidates:
+        near = loops.at(loops.triangle(every), rotations)[1] <= loops.beyond
+        if near.sum() >= FEWEST:
+            found.append(loops.repeated(loops.weighted(near.astype(float), [rotations])))
+    if not np.array_equal(found[0].weights > 0, first):
+        found.append(loops.graduated(every))
+    most = max(each.weights.sum() for each in found)
+    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
+        members = np.flatnonzero(first)
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
+        parts = [_likeliest(some) for some in around]
+        if len(members) <= FEW:  # turning alike, one may be wrong all the same
+            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
+        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
+        found += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
+    least = min(each.cost for each in found)
+    best = next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
+    # as many others cannot agree if fewer are left over, or none is in a core of that size but what a good one may be
+    agreeing = best.weights > 0
+    count = int(np.sum(agreeing))
+    if count >= len(agreeing) // 2 + 2:
+        return best
+    strange = ~agreeing & (best.squares > chdtri(loops.equations, SURPRISE))
+    return replace(best, alone=count > 1 and not (_core(pairs, count) & strange).any())

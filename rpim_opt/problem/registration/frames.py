@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +17,6 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source, in_parts
-from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
 from rpim_opt.problem.registration.certified import certified_hand_eye
@@ -53,48 +52,6 @@ class Located(NamedTuple):
     how: str
 
 
-class _Rows(NamedTuple):
-    """Rows of positions and poses."""
-
-    q: Array  # (N, dof) of the controller
-    flange: Array  # (N, 4, 4) of the nominal robot
-    measured: Array  # (N, 4, 4); rotations of positions are NaN
-    marker: np.ndarray  # (N,) names
-    variance: Array  # (N, 2) of the instrument's position [m^2] and orientation [rad^2]
-
-    @property
-    def turned(self) -> np.ndarray:
-        return ~np.isnan(self.measured[:, 0, 0])
-
-    @property
-    def sigma(self) -> Array:
-        """Standard deviations (N, 2) of the instrument and of the nominal robot together."""
-        return np.sqrt(self.variance + NOMINAL_ERROR**2)
-
-    def take(self, index: np.ndarray) -> _Rows:
-        return _Rows(*(each[index] for each in self))
-
-    @classmethod
-    def of(cls, robot: Robot, data: Dataset, most: int) -> _Rows | None:
-        """Return positions and poses, of each block no more than so many rows, evenly spread; None for none."""
-        parts = []
-        for block in data.blocks:
-            if block.measurement.name not in ("position", "pose"):
-                continue
-            count = len(block.row)
-            rows = np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int))
-            some = block.take(rows, rows)
-            T = rigid(np.full((3, 3), np.nan), some.y[:, :3])
-            variance = np.zeros((len(rows), 2))
-            variance[:, 0] = np.trace(some.covariance[:, :3, :3], axis1=1, axis2=2) / 3
-            if block.measurement.name == "pose":
-                T = transforms(some.y)
-                variance[:, 1] = np.trace(some.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
-            q = some.q[:, 0]
-            parts.append((q, forward_kinematics(robot, q), T, np.full(len(rows), block.markers[0]), variance))
-        return cls(*map(np.concatenate, zip(*parts, strict=True))) if parts else None
-
-
 def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
 
@@ -102,61 +59,67 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
     follow. Where it does not determine the rotations, all positions are fitted with reflectors near where they are
     stated.
     """
-    rows = _Rows.of(robot, data, ENOUGH)
-    if rows is None:
+    parts = []
+    for block in data.blocks:
+        if block.measurement.name not in ("position", "pose"):
+            continue
+        count = len(block.row)
+        rows = np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
+        some = block.take(rows, rows)
+        T = rigid(np.full((3, 3), np.nan), some.y[:, :3])
+        variance = np.zeros((len(rows), 2))
+        variance[:, 0] = np.trace(some.covariance[:, :3, :3], axis1=1, axis2=2) / 3
+        if block.measurement.name == "pose":
+            T = transforms(some.y)
+            variance[:, 1] = np.trace(some.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
+        parts.append((some.q[:, 0], T, np.full(len(rows), block.markers[0]), variance))
+    if not parts:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
-    places = {marker: np.asarray(place, dtype=float).copy() for marker, place in tools.items()}
-    count = Counter(rows.marker[rows.turned].tolist() or rows.marker.tolist())
-    marker = count.most_common(1)[0][0]
-    own = rows.take(rows.marker == marker)
+    q, measured, marker, variance = (np.concatenate(each) for each in zip(*parts, strict=True))
+    flange = forward_kinematics(robot, q)
+    y = measured[:, :3, 3]
+    turned = ~np.isnan(measured[:, 0, 0])
+    sigma = np.sqrt(variance + NOMINAL_ERROR**2)  # of the instrument and of the nominal robot together
+    places = {name: np.array(place, dtype=float) for name, place in tools.items()}
+    count = Counter(marker[turned].tolist() or marker.tolist())
+    first = count.most_common(1)[0][0]
+    own = marker == first
     try:
-        sigma = own.sigma[:, 0], own.sigma[:, 1]
-        start = certified_hand_eye(own.flange, own.measured, sigma=sigma, expected=places[marker], spread=TOOL_ERROR)
+        deviations = (sigma[own, 0], sigma[own, 1])
+        start = certified_hand_eye(
+            flange[own], measured[own], sigma=deviations, expected=places[first], spread=TOOL_ERROR
+        )
         if start.uncertainty > FREE or (len(count) > 1 and not start.certified):
             raise InputError("the data", start.reason, "turns about two axes")
     except InputError as error:
-        base, found = _fitted(robot, rows, places)
-        return Located(base, found, f"by registration of positions: {error.found}")
-    places[marker][:3] = start.tool[:3, 3]
-    for other in places.keys() - {marker}:  # where their positions are least off, seen from the base
-        own = rows.take(rows.marker == other)
-        back: Any = np.linalg.inv(start.base @ own.flange)
-        there = transformed(back, own.measured[:, :3, 3])
-        precision = own.sigma[:, 0] ** -2
-        total = places[other][:3] * TOOL_ERROR**-2 + precision @ there
-        places[other][:3] = total / (TOOL_ERROR**-2 + precision.sum())
-    _turn(places, start.base, rows)
-    verdict = "certified" if start.certified else "not certified"
-    return Located(frame_numbers(start.base), places, f"{verdict}: {start.reason}")
-
-
-def _turn(tools: dict[str, Array], base: Array, rows: _Rows) -> None:
-    """Give reflectors (6,) the orientations that poses show from a base (4, 4)."""
-    posed_rows = rows.take(rows.turned)
-    for marker in np.unique(posed_rows.marker).tolist():
-        own = posed_rows.take(posed_rows.marker == marker)
-        turned = (base @ own.flange)[:, :3, :3].transpose(0, 2, 1) @ own.measured[:, :3, :3]
-        tools[marker] = frame_numbers(rigid(proper(turned.sum(axis=0)), np.asarray(tools[marker][:3])))
-
-
-def _fitted(robot: Robot, rows: _Rows, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array]]:
-    """Return base (6,) and reflectors (6,) that fit positions of the nominal robot.
-
-    Reflectors are where they are stated up to `TOOL_ERROR`, and turned as poses show.
-    """
-    markers = list(tools)
-    marker = np.array([markers.index(name) for name in rows.marker.tolist()])
-    places = np.array([tools[name][:3] for name in markers])
-    y = rows.measured[:, :3, 3]
-    # refuses points on a line
-    register(transformed(rows.flange, places[marker]), y)
-    q = rows.q @ robot.joint_map.T
-    spread = np.full(len(places), TOOL_ERROR)
-    given = Candidates(q[None], y[None], marker[None], np.zeros((1, len(robot.mdh))), places[None], places, spread)
-    fit = fit_arms(robot, given, steps=12)
-    found = {name: np.array([*place, *tools[name][3:]]) for name, place in zip(markers, fit.tools[0], strict=True)}
-    _turn(found, fit.base[0], rows)
-    return frame_numbers(fit.base[0]), found
+        how = f"by registration of positions: {error.found}"
+        names = list(places)
+        number = np.array([names.index(name) for name in marker.tolist()])
+        stated = np.array([place[:3] for place in places.values()])
+        # refuses points on a line
+        register(transformed(flange, stated[number]), y)
+        spread = np.full(len(stated), TOOL_ERROR)
+        zero = np.zeros((1, len(robot.mdh)))
+        q = q @ robot.joint_map.T
+        fit = fit_arms(robot, Candidates(q[None], y[None], number[None], zero, stated[None], stated, spread), steps=12)
+        base = fit.base[0]
+        for place, fitted in zip(places.values(), fit.tools[0], strict=True):
+            place[:3] = fitted
+    else:
+        how = f"{'certified' if start.certified else 'not certified'}: {start.reason}"
+        base = start.base
+        places[first][:3] = start.tool[:3, 3]
+        for other in places.keys() - {first}:  # where their positions are least off, seen from the base
+            own = marker == other
+            back: Any = np.linalg.inv(base @ flange[own])
+            precision = sigma[own, 0] ** -2
+            total = places[other][:3] * TOOL_ERROR**-2 + precision @ transformed(back, y[own])
+            places[other][:3] = total / (TOOL_ERROR**-2 + precision.sum())
+    for name in np.unique(marker[turned]).tolist():  # turned as poses show
+        own = turned & (marker == name)
+        turn = (base @ flange[own])[:, :3, :3].transpose(0, 2, 1) @ measured[own, :3, :3]
+        places[name] = frame_numbers(rigid(proper(turn.sum(axis=0)), places[name][:3]))
+    return Located(frame_numbers(base), places, how)
 
 
 APART = 0.1
@@ -171,8 +134,20 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
     """
     known: dict[str, Array] = {}
     found = {}
-    for robot, places in _touched(problem):
+    for robot, arm in problem.arms.items():
         p = problem.parameters.of_robot(robot)
+        touched: dict[str, list[Array]] = {}
+        for block in problem.data.blocks:
+            kind = block.measurement
+            if block.robot != robot or block.touched is None or not kind.touching or kind.planar:
+                continue
+            tool = numeric_frame(p.nominal[_frame_of(p, tool_prefix(block.markers[0]))])
+            T = forward_kinematics(arm, block.q[:, 0]) @ tool
+            for name, position in zip(block.touched[:, 0], T[:, :3, 3], strict=True):
+                touched.setdefault(str(name), []).append(position)
+        if not touched:
+            continue
+        places = {name: np.mean(positions, axis=0) for name, positions in touched.items()}  # in the robot's own frame
         k = _frame_of(p, "base_")
         base = numeric_frame(p.nominal[k])
         common = {name: place for name, place in places.items() if name in known}
@@ -191,23 +166,6 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
                 accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
                 raise InputError(f"together, problem '{robot}'", what, accepted)
     return found
-
-
-def _touched(problem: CalibrationProblem) -> Iterator[tuple[str, dict[str, Array]]]:
-    """Yield the nominal positions (3,) [m] of touched points by name in a robot's own frame, robot by robot."""
-    for robot, arm in problem.arms.items():
-        p = problem.parameters.of_robot(robot)
-        all_of: dict[str, list[Array]] = {}
-        for block in problem.data.blocks:
-            kind = block.measurement
-            if block.robot != robot or block.touched is None or not kind.touching or kind.planar:
-                continue
-            tool = numeric_frame(p.nominal[_frame_of(p, tool_prefix(block.markers[0]))])
-            T = forward_kinematics(arm, block.q[:, 0]) @ tool
-            for name, position in zip(block.touched[:, 0], T[:, :3, 3], strict=True):
-                all_of.setdefault(str(name), []).append(position)
-        if all_of:
-            yield robot, {name: np.mean(positions, axis=0) for name, positions in all_of.items()}
 
 
 MISPLACED = 3.0
@@ -389,25 +347,33 @@ def own_frames(data: Dataset) -> tuple[str, ...]:
 
 def relocated(problem: Source) -> Source | None:
     """Return the problem with base and reflectors where the data put them, if what is stated contradicts that."""
-    if len(problem.arms) > 1:
-        return _each_relocated(problem)
     p = problem.parameters
-    base = _frame_of(p, "base_")
-    if not p.identified[base].all():
-        return None
     nominal = p.nominal.copy()
-    try:
-        data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
-        at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
-        tools = {marker: p.nominal[k] for marker, k in at.items()}
-
-        found = locate(problem.robot, data, tools)
+    if len(problem.arms) > 1:  # each by itself; of a frame that they share the first one's word counts
+        for name in problem.arms:
+            alone = relocated(problem.sample().alone(name))
+            if alone is not None:
+                k = p.places_of(name)
+                nominal[k] = np.where(nominal[k] == p.nominal[k], alone.parameters.nominal, nominal[k])
+        for name, place in met(problem.sample()).items():
+            own = p.of_robot(name)
+            base = _frame_of(own, "base_")
+            if _misplaced(own, base, place):
+                nominal[p.places_of(name)[base]] = place
+    else:
+        base = _frame_of(p, "base_")
+        if not p.identified[base].all():
+            return None
+        try:
+            data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
+            at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
+            found = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
+        except InputError:
+            return None
         for k, place in [(base, found.base), *((k, found.tools[marker]) for marker, k in at.items())]:
             if _misplaced(p, k, place):
                 free = p.identified[k]
                 nominal[k[free]] = place[free]
-    except InputError:
-        return None
     if (nominal == p.nominal).all():
         return None
     return problem.with_parameters(replace(p, nominal=nominal))
@@ -428,26 +394,6 @@ def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
     deviation = np.concatenate([T[:3, 3] - T0[:3, 3], roll_pitch_yaw(T[:3, :3] @ T0[:3, :3].T)])
     far = np.abs(deviation) > MISPLACED * (p.scale[k] + NOMINAL_ERROR)
     return bool((far & p.identified[k]).any())
-
-
-def _each_relocated(problem: Source) -> Source | None:
-    """Return the problem of several robots, each relocated; of a frame that they share the first one's word counts."""
-    p = problem.parameters
-    nominal = p.nominal.copy()
-    for name in problem.arms:
-        found = relocated(problem.sample().alone(name))
-        if found is not None:
-            places = p.places_of(name)
-            untouched = nominal[places] == p.nominal[places]
-            nominal[places] = np.where(untouched, found.parameters.nominal, nominal[places])
-    for name, place in met(problem.sample()).items():
-        own = p.of_robot(name)
-        base = _frame_of(own, "base_")
-        if _misplaced(own, base, place):
-            nominal[p.places_of(name)[base]] = place
-    if (nominal == p.nominal).all():
-        return None
-    return problem.with_parameters(replace(p, nominal=nominal))
 
 
 def fitted_frames(problem: Source) -> tuple[Source, Array]:
@@ -487,6 +433,7 @@ def settled(alone: Source, steps: int = 200) -> Array:
     scale = alone.parameters.free.scale
     z = np.zeros(len(scale))
     model = source.linearize(scale * z)
+    least = float(np.sum(model.b**2))
     damping = 0.0
     for _ in range(steps):
         R = model.triangle[:, :-1]
@@ -495,16 +442,14 @@ def settled(alone: Source, steps: int = 200) -> Array:
         right = np.concatenate([model.triangle[:, -1] - R @ z, -z, np.zeros(len(z))])
         step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), right, rcond=None)[0]
         candidate = source.linearize(scale * (z + step))
-        if _objective(candidate, z + step) > _objective(model, z) * (1 + 1e-12):
+        objective = float(np.sum((candidate.A @ (z + step) - candidate.b) ** 2) + np.sum((z + step) ** 2))
+        if objective > least * (1 + 1e-12):
             damping = max(4 * damping, 1e-3)
             continue
         z = z + step
         model = candidate
+        least = objective
         if damping == 0 and np.linalg.norm(step) <= 1e-11 * (1 + np.linalg.norm(z)):
             break
         damping = damping / 8 if damping > 1e-6 else 0.0
     return scale * z
-
-
-def _objective(model: LinearModel, z: Array) -> float:
-    return float(np.sum((model.A @ z - model.b) ** 2) + np.sum(z**2))

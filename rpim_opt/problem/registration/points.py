@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -216,7 +215,22 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
     weights = np.ones((B, N))
     pull = (noise / candidates.spread) ** 2
     y = np.moveaxis(candidates.y, -1, 0)
-    at = partial(_at, robot, candidates, y, pull)
+
+    def at(weights: Array, zero: Array, tools: Array) -> _State:
+        """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
+        turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
+        tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
+        points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
+        share = weights / weights.sum(axis=1, keepdims=True)
+        mean = (points * share).sum(axis=-1, keepdims=True)
+        centred = points - mean
+        target = y - (y * share).sum(axis=-1, keepdims=True)
+        base = proper(np.einsum("ibn,jbn->bij", weights * centred, target))
+        residual = centred - np.einsum("bij,jbn->ibn", base, target)
+        off = tools - candidates.stated
+        cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
+        return _State(zero, tools, base, cost, points, turn, axes, origins, mean, residual)
+
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
     quiet = 0
@@ -245,24 +259,6 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
     base = rigid(turn, np.einsum("bn,bni->bi", weight, candidates.y - seen))
     modelled = seen + base[:, None, :3, 3]
     return Fit(modelled, np.linalg.norm(candidates.y - modelled, axis=2), state.cost, base, state.tools, state.zero)
-
-
-def _at(
-    robot: Robot, candidates: Candidates, y: Array, pull: Array, weights: Array, zero: Array, tools: Array
-) -> _State:
-    """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
-    turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
-    tau = np.moveaxis(tools[np.arange(len(tools))[:, None], candidates.marker], -1, 0)
-    points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
-    share = weights / weights.sum(axis=1, keepdims=True)
-    mean = (points * share).sum(axis=-1, keepdims=True)
-    centred = points - mean
-    target = y - (y * share).sum(axis=-1, keepdims=True)
-    base = proper(np.einsum("ibn,jbn->bij", weights * centred, target))
-    residual = centred - np.einsum("bij,jbn->ibn", base, target)
-    off = tools - candidates.stated
-    cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
-    return _State(zero, tools, base, cost, points, turn, axes, origins, mean, residual)
 
 
 def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
