@@ -112,7 +112,7 @@ class PartitionedProblem(RobotModel):
             raise InputError("parts", "none", "at least one function that reads measurements")
         self.sample()  # is checked
         if self.compute is None:
-            ours = all(isinstance(part, partial) and part.func in (read_data, _taken) for part in self.parts)
+            ours = all(isinstance(part, partial) and part.func in (read_data, Dataset.take) for part in self.parts)
             object.__setattr__(self, "compute", on_all_cores if ours else map)
 
     def _short(self) -> str:
@@ -219,14 +219,10 @@ def in_parts(problem: Source) -> Source:
         return problem.gathered() or problem
     if sum(index.size for index in equation_numbers(problem.data)) <= KEPT:
         return problem
-    parts = [partial(_taken, problem.data, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
+    parts = [partial(Dataset.take, problem.data, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
     return PartitionedProblem(
         problem.robots, problem.parameters, problem.data, parts, asked=problem.asked, scatter=problem.scatter
     )
-
-
-def _taken(data: Dataset, rows: np.ndarray) -> Dataset:
-    return data.take(rows)
 
 
 def _on_part(

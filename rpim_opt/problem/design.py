@@ -189,7 +189,15 @@ def choose(
         C = np.zeros((n, n))
         C[: P.shape[2], : P.shape[2]] = np.einsum("kin,kim->nm", P, P) / len(P)
     if measured is not None:
-        A, C = _beside(A, C, problem.on(measured))
+        # in coordinates in which what is measured already, with the prior, is the identity: with
+        # L L' = 1 + sum of A_i' A_i over those rows, M = L (1 + sum B_i' B_i) L' for B = A L'^-1: ln det but for a
+        # constant, and tr M^-1 C = tr (1 + ...)^-1 (L^-1 C L'^-1)
+        if measured.blocks[0].measurement.touching:
+            raise InputError("measured", "touches of points", "measurements of a row at a time")
+        known = problem.on(measured).linearize(np.zeros(len(problem.parameters.free))).A
+        L = np.linalg.cholesky(np.eye(n) + known.T @ known)
+        A = np.asarray(np.linalg.solve(L, A.reshape(-1, n).T).T.reshape(A.shape), dtype=float)
+        C = np.asarray(np.linalg.solve(L, np.linalg.solve(L, C).T), dtype=float)
     progress(f"relaxing over {len(A)} candidates")
     weights, bound = _relaxed(A, count, criterion, C, progress)
     progress("rounding")
@@ -224,21 +232,6 @@ def _rows(problem: CalibrationProblem, q: Array, whitened: bool = True) -> Array
     rows = there.linearize(x).A if whitened else there.jacobian(x) * scale
     rows = rows.reshape(len(q), -1, len(scale))
     return rows if whitened else rows[:, [i for i, d in enumerate(kind.components.values()) if d == "length"]]
-
-
-def _beside(A: Array, C: Array, there: CalibrationProblem) -> tuple[Array, Array]:
-    """Return rows and criterion in coordinates in which what is measured already, with the prior, is the identity.
-
-    With L L' = 1 + sum of A_i' A_i over those rows, M = L (1 + sum B_i' B_i) L' for B = A L'^-1: ln det but for a
-    constant, and tr M^-1 C = tr (1 + ...)^-1 (L^-1 C L'^-1).
-    """
-    if there.data.blocks[0].measurement.touching:
-        raise InputError("measured", "touches of points", "measurements of a row at a time")
-    known = there.linearize(np.zeros(len(there.parameters.free))).A
-    L = np.linalg.cholesky(np.eye(A.shape[2]) + known.T @ known)
-    B = np.linalg.solve(L, A.reshape(-1, A.shape[2]).T).T.reshape(A.shape)
-    W = np.linalg.solve(L, np.linalg.solve(L, C).T)
-    return np.asarray(B, dtype=float), np.asarray(W, dtype=float)
 
 
 def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -174,7 +174,28 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
         if len(planar) > 1 or (each.measurement is not known_distance and planar == {False}):
             accepted = "two planes, or for a distance two points"
             raise InputError(where, f"between '{each.between[0]}' and '{each.between[1]}'", accepted)
-        blocks.append(_stating(each, touched, len(data) + i))
+        # the row's joint values are those of a touch of either; it is of one robot, where the two are all touches say
+        second = touched[each.between[1]]
+        first = touched[each.between[0]]
+        if second.robot != first.robot:
+            first = second
+        own = {}
+        for what in ("torque", "approach"):
+            both = [getattr(one, what) for one in (first, second)]
+            own[what] = None if any(values is None for values in both) else np.concatenate(both, axis=1)
+        stated = Block(
+            each.measurement,
+            q=np.concatenate([first.q, second.q], axis=1),
+            y=np.array([[each.value]]),
+            covariance=each.sigma**2 * np.eye(len(each.measurement.components))[None],
+            row=np.array([len(data) + i]),
+            markers=(*first.markers, *second.markers),
+            payload=first.payload,
+            robot=first.robot,
+            point=np.array([each.between], dtype=object),
+            **own,
+        )
+        blocks.append(stated)
         label = " to ".join(each.between)
         if label in labels:  # planes may have both an angle and a distance
             label = f"{label}, {each.measurement.name.removeprefix('known_')}"
@@ -182,30 +203,6 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
     configuration = np.concatenate([data.configuration, alone])
     return Dataset((*data.blocks, *blocks), (*data.label, *labels), configuration).grouped_by_points()
-
-
-def _stating(known: Known, touched: Mapping[str, Block], row: int) -> Block:
-    """Return the row that states a distance; its joint values are those of a touch of either point."""
-    first, second = (touched[name] for name in known.between)
-    if second.robot != first.robot:  # a row is of one robot; where the two are all touches say
-        second = first
-
-    def both(one: Array | None, other: Array | None) -> Array | None:
-        return None if one is None or other is None else np.concatenate([one, other], axis=1)
-
-    return Block(
-        known.measurement,
-        q=np.concatenate([first.q, second.q], axis=1),
-        y=np.array([[known.value]]),
-        covariance=known.sigma**2 * np.eye(len(known.measurement.components))[None],
-        row=np.array([row]),
-        markers=(*first.markers, *second.markers),
-        torque=both(first.torque, second.torque),
-        payload=first.payload,
-        robot=first.robot,
-        approach=both(first.approach, second.approach),
-        point=np.array([known.between], dtype=object),
-    )
 
 
 def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool = False) -> Dataset:

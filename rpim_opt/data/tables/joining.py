@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -62,10 +63,48 @@ def together(
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
     joints = _stacked(moving)
     values = _stacked(seen)
+    notes = [*joints.notes, *values.notes]
     if within is None:
-        left, right, names, notes = _by_key(moving, seen, joints.columns, values.columns, key)
+        how, keys, others = _keys(moving, seen, joints.columns, values.columns, key)
+        place: dict[str, int] = {}
+        for i, name in enumerate(keys):
+            if place.setdefault(name, i) != i:
+                raise InputError(f"the key {how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
+        right = [i for i, name in enumerate(others) if name in place]
+        if not right:
+            found = f"no value that {moving[0].file} and {seen[0].file} share"
+            accepted = "--key with a column whose values both have, --key row, or --time-tolerance for the nearest time"
+            raise InputError(f"the key {how}", found, accepted)
+        names = [others[i] for i in right]
+        left = [place[name] for name in names]
+        notes.append(f"joined by {how}: {len(right)} rows of {len(keys)} with joints and {len(others)} measured.")
+        known = set(names)
+        lonely = [name for name in keys if name not in known] + [name for name in others if name not in place]
+        if lonely:
+            notes.append(f"without a partner, left out: {listed(lonely)}.")
     else:
-        left, right, names, notes = _by_time(moving, seen, values.columns, key, within)
+        if not (np.isfinite(within) and within >= 0):
+            raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
+        there, then = _times(moving, key), _times(seen, key)
+        rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
+        at, of, apart = partners(there, then, within + rounding)
+        if not len(at):
+            nearest = float(np.abs(there - then[0]).min())
+            found = (
+                f"no two within {within:g} s; the first measured row is {nearest:.6g} s from the nearest with joints"
+            )
+            raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
+        left, right = at.tolist(), of.tolist()
+        labels = _labels(values.columns)
+        names = [labels[i] for i in right]
+        notes.append(
+            f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
+            f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
+        )
+        lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right))]
+        if lonely:
+            several = f"{len(lonely)} measured rows without a partner within {within:g} s, left out"
+            notes.append(f"{several}: {listed(lonely)}.")
     whole = _chosen(joints.columns, left) | _chosen(values.columns, right)
     whole.pop("label", None)
     if len(set(names)) == len(names):
@@ -73,7 +112,7 @@ def together(
     else:  # several measured values of a configuration
         whole.setdefault("configuration", names)
     raw = _chosen(joints.raw, left) | _chosen(values.raw, right)
-    return Whole(whole, raw, (*joints.notes, *values.notes, *notes))
+    return Whole(whole, raw, tuple(notes))
 
 
 def _chosen(columns: Columns, rows: Rows) -> dict[str, Sequence[Any]]:
@@ -126,35 +165,23 @@ def _labels(columns: Columns) -> list[str]:
 # --- by a key ------------------------------------------------------------------------------------------------------
 
 
-def _by_key(
-    moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
-) -> tuple[Rows, Rows, list[str], list[str]]:
-    """Return the rows of joints and of measured values that have the same key, their keys, and notes."""
-    how, left, right = _keys(moving, seen, joints, values, key)
-    place: dict[str, int] = {}
-    for i, name in enumerate(left):
-        if place.setdefault(name, i) != i:
-            raise InputError(f"the key {how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
-    rows = [i for i, name in enumerate(right) if name in place]
-    if not rows:
-        found = f"no value that {moving[0].file} and {seen[0].file} share"
-        accepted = "--key with a column whose values both have, --key row, or --time-tolerance for the nearest time"
-        raise InputError(f"the key {how}", found, accepted)
-    names = [right[i] for i in rows]
-    notes = [f"joined by {how}: {len(rows)} rows of {len(left)} with joints and {len(right)} measured."]
-    known = set(names)
-    lonely = [name for name in left if name not in known] + [name for name in right if name not in place]
-    if lonely:
-        notes.append(f"without a partner, left out: {listed(lonely)}.")
-    return [place[name] for name in names], rows, names, notes
-
-
 def _keys(
     moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
 ) -> tuple[str, list[str], list[str]]:
     """Return what the key is, and those of the rows with joints and of the measured ones."""
     left, right = _raw(moving), _raw(seen)
-    pairs = [pair for pair in _pairs(moving, seen) if key in ("", "row") or key.lower() in map(str.lower, pair)]
+    # columns of either side, labels or left out, that name every row alike
+    sides = []
+    for tables, raw in ((moving, left), (seen, right)):
+        free = [each.column for each in tables[0].meant if each.name in ("", "label", "configuration")]
+        cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
+        sides.append({name: set(keys) for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)})
+    alike = [
+        (name, other)
+        for (name, keys), (other, others) in product(sides[0].items(), sides[1].items())
+        if len(keys & others) >= SAME * min(len(keys), len(others))
+    ]
+    pairs = [pair for pair in alike if key in ("", "row") or key.lower() in map(str.lower, pair)]
     names = [pair for pair in pairs if not _running(left[pair[0].lower()])]
     pair = next(iter(names or pairs), None) if len(names or pairs) == 1 else None
     if key == "row":
@@ -190,23 +217,6 @@ def _keys(
     return f"column '{name}'", _normal(left[name]), _normal(right[name])
 
 
-def _pairs(moving: Sequence[Understood], seen: Sequence[Understood]) -> list[tuple[str, str]]:
-    """Return the columns of joints' and of measured tables, labels or left out, that name every row alike."""
-    sides = []
-    for tables in (moving, seen):
-        raw = _raw(tables)
-        names = ("", "label", "configuration")
-        free = [each.column for each in tables[0].meant if each.name in names and each.column.lower() in raw]
-        cells = {name: _normal(raw[name.lower()]) for name in free}
-        sides.append({name: set(keys) for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)})
-    return [
-        (name, other)
-        for name, keys in sides[0].items()
-        for other, others in sides[1].items()
-        if len(keys & others) >= SAME * min(len(keys), len(others))
-    ]
-
-
 def _running(cells: Sequence[Any]) -> bool:
     """Whether cells count the rows."""
     return _normal(cells) == [str(i) for i in range(1, len(cells) + 1)]
@@ -226,31 +236,6 @@ def _normal(cells: Sequence[Any]) -> list[str]:
 
 
 # --- by the nearest time -------------------------------------------------------------------------------------------
-
-
-def _by_time(
-    moving: Sequence[Understood], seen: Sequence[Understood], values: Columns, key: str, within: float
-) -> tuple[Rows, Rows, list[str], list[str]]:
-    """Return the rows of joints and of measured values of the nearest times, the labels of these, and notes."""
-    if not (np.isfinite(within) and within >= 0):
-        raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
-    there = _times(moving, key)
-    then = _times(seen, key)
-    rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # of times since 1970, half a microsecond
-    left, right, apart = partners(there, then, within + rounding)
-    if not len(left):
-        nearest = float(np.abs(there - then[0]).min())
-        found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from the nearest with joints"
-        raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
-    notes = [
-        f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
-        f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
-    ]
-    labels = _labels(values)
-    lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
-    if lonely:
-        notes.append(f"{len(lonely)} measured rows without a partner within {within:g} s, left out: {listed(lonely)}.")
-    return left.tolist(), right.tolist(), [labels[i] for i in right], notes
 
 
 def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.ndarray, Array]:

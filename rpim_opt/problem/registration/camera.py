@@ -196,48 +196,43 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
     labels: list[str] = []
     configuration: list[int] = []
     for block in data.blocks:
-        seen, found = block, block.row
+        seen, rows = block, block.row
         if block.measurement in CAMERAS.values():
             camera = {name: own.get(of_fixture(f"camera_{name}", block.fixture), 0.0) for name in INTRINSICS}
-            seen, found = _posed(data, block, camera)
-        blocks.append(replace(seen, row=len(labels) + np.arange(len(found))))
-        labels += [data.label[i] for i in found]
-        configuration += data.configuration[found].tolist()
+            if not (camera["fx"] > 0 and camera["fy"] > 0):
+                raise InputError("the camera", f"a focal length of {camera['fx']:g} px", "one greater than zero")
+            points = targets(block)
+            xy = normalized(block.y, camera)
+            _, _, planar = _plane(points)
+            covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
+            found = []  # the first entry of each view, and its pose
+            for view in views(data, block):
+                if len(view) >= FEWEST[planar]:
+                    with suppress(InputError):  # points on a line
+                        found.append((int(view[0]), view_pose(points[view], xy[view])))
+            if not found:
+                accepted = f"views of {FEWEST[planar]} points or more"
+                raise InputError("the camera", "no view that shows a pose", accepted)
+            index = np.array([i for i, _ in found])
+            T = np.array([there for _, there in found])
+            focus = float(np.sqrt(camera["fx"] * camera["fy"]))
+            spread = np.sqrt(np.trace(covariance[index], axis1=1, axis2=2) / 2)
+            deviation = UNCERTAIN * spread / focus * T[:, 2, 3]
+            sigma = deviation[:, None] * [1, 1, 1, *[1 / float(np.ptp(points, axis=0).max())] * 3]
+            if block.measurement is eye_in_hand:
+                T = np.linalg.inv(T)
+            quaternion = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_quat()
+            rows = block.row[index]
+            seen = replace(
+                block.take(index, index),
+                measurement=pose,
+                y=np.hstack([T[:, :3, 3], quaternion[:, [3, 0, 1, 2]]]),
+                covariance=sigma[:, :, None] ** 2 * np.eye(6),
+                fixture="",
+                point=None,
+                columns={},
+            )
+        blocks.append(replace(seen, row=len(labels) + np.arange(len(rows))))
+        labels += [data.label[i] for i in rows]
+        configuration += data.configuration[rows].tolist()
     return Dataset(tuple(blocks), tuple(labels), np.array(configuration, dtype=int))
-
-
-def _posed(data: Dataset, block: Block, camera: Mapping[str, float]) -> tuple[Block, np.ndarray]:
-    """Return the poses of a camera's views as a block, and the first row of each."""
-    if not (camera["fx"] > 0 and camera["fy"] > 0):
-        raise InputError("the camera", f"a focal length of {camera['fx']:g} px", "one greater than zero")
-    points = targets(block)
-    xy = normalized(block.y, camera)
-    _, _, planar = _plane(points)
-    f = float(np.sqrt(camera["fx"] * camera["fy"]))
-    size = float(np.ptp(points, axis=0).max())
-    entries = []
-    poses = []
-    deviation = []
-    covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
-    for view in views(data, block):
-        if len(view) < FEWEST[planar]:
-            continue
-        with suppress(InputError):  # points on a line
-            T = view_pose(points[view], xy[view])
-            entries.append(int(view[0]))
-            poses.append(T)
-            deviation.append(UNCERTAIN * np.sqrt(np.trace(covariance[view[0]]) / 2) / f * T[2, 3])
-    if not poses:
-        raise InputError("the camera", "no view that shows a pose", f"views of {FEWEST[planar]} points or more")
-    whole = np.array(poses)
-    if block.measurement is eye_in_hand:
-        whole = np.linalg.inv(whole)
-    sigma = np.array(deviation)[:, None] * [1, 1, 1, *[1 / size] * 3]
-    index = np.array(entries)
-    quaternion = scipy.spatial.transform.Rotation.from_matrix(whole[:, :3, :3]).as_quat()
-    y = np.hstack([whole[:, :3, 3], quaternion[:, [3, 0, 1, 2]]])
-    taken = block.take(index, index)
-    seen = replace(
-        taken, measurement=pose, y=y, covariance=sigma[:, :, None] ** 2 * np.eye(6), fixture="", point=None, columns={}
-    )
-    return seen, block.row[index]

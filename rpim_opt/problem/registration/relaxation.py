@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import import_module
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -48,18 +49,12 @@ def rotation_constraints(count: int) -> Array:
     return (C + C.swapaxes(1, 2)) / 2
 
 
-@dataclass(frozen=True, eq=False)
-class Moments:
-    """The moment matrix (n, n), of rank one where it is x x' of rotations, and the multipliers (20 k,) of `relax`."""
+class Moments(NamedTuple):
+    """The relaxation of `relax`: its moment matrix is x x' where rotations are its solution."""
 
-    matrix: Array
-    multipliers: Array
-
-    @property
-    def rank_ratio(self) -> float:
-        """Second eigenvalue of the moment matrix over its first: zero where it is of rank one."""
-        eigenvalues = np.linalg.eigvalsh(self.matrix)
-        return float(abs(eigenvalues[-2]) / eigenvalues[-1])
+    matrix: Array  # (n, n)
+    multipliers: Array  # (20 k,)
+    rank_ratio: float  # second eigenvalue of the matrix over the first: zero where it is of rank one
 
 
 def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
@@ -97,7 +92,8 @@ def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
         found = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
     M = np.zeros((n, n))
     M[rows, columns] = M[columns, rows] = np.array(found.z) / root
-    return Moments(M, size * np.array(found.x)[1:])
+    eigenvalues = np.linalg.eigvalsh(M)
+    return Moments(M, size * np.array(found.x)[1:], float(abs(eigenvalues[-2]) / eigenvalues[-1]))
 
 
 @dataclass(frozen=True, eq=False)
