@@ -239,12 +239,6 @@ class Touches:
             found.append((index, _compared(tie, where, moved)))
         return found
 
-    @cached_property
-    def alone(self) -> np.ndarray:
-        """The equations of points that were touched once: they are met whatever the robot."""
-        single = [index.ravel() for index in self.rows if len(index) == 1]
-        return np.concatenate([np.empty(0, dtype=int), *single])
-
     def kept(self, where: Things) -> np.ndarray:
         """Return which of the equations' places contrasts have (m,)."""
         found = np.ones(self.equations, dtype=bool)

@@ -162,11 +162,24 @@ class Inspection(Tabled):
             figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
             of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
             measured.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
+        data = self.problem.data
+        lines = [
+            f"{len(data)} rows in {len(np.unique(data.configuration))} configurations. Nominal error "
+            f"{1e3 * np.nanmean(self.residual):.3f} mm mean, {1e3 * np.nanmax(self.residual):.3f} mm max "
+            f"({data.label[int(np.nanargmax(self.residual))]})."
+        ]
+        if self.repeated:
+            groups = listed([", ".join(group) for group in self.repeated], 5, "; ")
+            spread = f", repeatable to {1e3 * self.repeatability:.3g} mm" if self.repeatability else ""
+            lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
+        if self.standing_out:
+            named = listed([f"{label} ({self._mm[label]:.2f} mm)" for label in self.standing_out], 10)
+            lines.append(f"Nominal error stands out: {named}.")
         notes = self._notes()
         parts = [
             table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
             table(["measured", "unit", "from", "to", "typical sigma"], measured),
-            self._rows(),
+            "\n".join(lines),
             identifiable_sentences(self.observability),
             "\n".join(self.contact),
             "\n".join(notes[: len(self.warnings)]),
@@ -214,22 +227,6 @@ class Inspection(Tabled):
                 typical = float(of[column]) / size if column in of else None
                 rows[what] = {"measured": what, "unit": unit, "from": low, "to": high, f"sigma_{each}": typical}
         return list(rows.values())
-
-    def _rows(self) -> str:
-        data = self.problem.data
-        lines = [
-            f"{len(data)} rows in {len(np.unique(data.configuration))} configurations. Nominal error "
-            f"{1e3 * np.nanmean(self.residual):.3f} mm mean, {1e3 * np.nanmax(self.residual):.3f} mm max "
-            f"({data.label[int(np.nanargmax(self.residual))]})."
-        ]
-        if self.repeated:
-            groups = listed([", ".join(group) for group in self.repeated], 5, "; ")
-            spread = f", repeatable to {1e3 * self.repeatability:.3g} mm" if self.repeatability else ""
-            lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
-        if self.standing_out:
-            named = listed([f"{label} ({self._mm[label]:.2f} mm)" for label in self.standing_out], 10)
-            lines.append(f"Nominal error stands out: {named}.")
-        return "\n".join(lines)
 
 
 def identifiable_sentences(o: Observability) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import reduce
 from itertools import combinations, permutations, product
 from typing import Any, NamedTuple
@@ -445,65 +445,49 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     return Better(what, remedy, stated * points.extent, left * changed.extent)
 
 
-@dataclass(frozen=True, eq=False)
-class Lengths:
-    """Distances: joint values (N, p, dof), lengths (N, 1) [m], and the problem that they are of.
+def _better_lengths(problem: CalibrationProblem) -> Better | None:
+    """Return the single mistake that explains distances far better, or None.
 
     No frame can be eliminated from them, so that a reading is judged by a fit of anchor, reflectors and joint zeros.
     """
-
-    q: Array
-    y: Array
-    problem: CalibrationProblem
-
-    def take(self, index: np.ndarray) -> Lengths:
-        """Return the rows at ``index``."""
-        return replace(self, q=self.q[index], y=self.y[index])
-
-    def evenly(self, most: int) -> Lengths:
-        """Return so many rows, evenly spread, at most."""
-        count = len(self.y)
-        return self.take(np.unique(np.linspace(0, count - 1, min(most, count)).round().astype(int)))
-
-    def left(self) -> float:
-        """Return the RMS error of the best three quarters of the rows over the extent of the lengths."""
-        rows = np.arange(len(self.y))
-        of = self.problem.data.blocks[0]
-        block = Block(of.measurement, self.q, self.y, of.covariance[:1], rows, of.markers, of.fixture)
-        data = Dataset((block,), tuple(map(str, rows)), rows)
-        robot = self.problem.robot
-        p = self.problem.parameters
-        own = dict(zip(p.names, p.nominal, strict=True))
-        tools = {marker: [own[tool_prefix(marker) + c] for c in FRAME] for marker in block.markers}
-        try:
-            parameters = starting_parameters(robot, data, [own[f"base_{c}"] for c in FRAME], tools)
-        except InputError:  # lengths to which no anchor belongs
-            return float("inf")
-        zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, 1)]
-        reflectors = [tool_prefix(marker) + "[xyz]" for marker in block.markers]
-        fixture = [of_fixture(name, block.fixture) for name in block.measurement.parameters]
-        free = parameters.identify([*zeros, *reflectors, *fixture])
-        fit = CalibrationProblem(robot, replace(free, scale=np.where(free.placed, FIXTURE, ZERO)), data)
-        error = np.sort(np.abs(fit.errors(settled(fit, STEPS))))[: 3 * len(rows) // 4]
-        return float(np.sqrt(np.mean(error**2)) / np.ptp(self.y))
-
-
-def _better_lengths(problem: CalibrationProblem) -> Better | None:
-    """Return the single mistake that explains distances far better, or None."""
     blocks = problem.data.blocks
     kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
     if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance"):
         return None
     order = np.argsort(np.concatenate([block.row for block in blocks]))
     q, y = (np.concatenate([getattr(block, name) for block in blocks])[order] for name in ("q", "y"))
-    table = Lengths(q, y, problem)
-    stated = table.evenly(SOME_ROWS).left()
+    N = len(y)
+    table = Points(q, y, marker=np.zeros(N, dtype=int), tools=np.zeros((1, 3)), turns=None, row=np.arange(N))
     robot = problem.robot
-    readings = [*_of_joints(robot), *_of_rows(len(y), robot.dof)]
+    of = blocks[0]
+    p = problem.parameters
+    own = dict(zip(p.names, p.nominal, strict=True))
+    tools = {marker: [own[tool_prefix(marker) + c] for c in FRAME] for marker in of.markers}
+    zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, 1)]
+    reflectors = [tool_prefix(marker) + "[xyz]" for marker in of.markers]
+    fixture = [of_fixture(name, of.fixture) for name in of.measurement.parameters]
+
+    def left(lengths: Points) -> float:
+        """Return the RMS error of the best three quarters of some rows over the extent of the lengths."""
+        some = lengths.evenly(SOME_ROWS)
+        rows = np.arange(len(some.y))
+        block = Block(of.measurement, some.q, some.y, of.covariance[:1], rows, of.markers, of.fixture)
+        data = Dataset((block,), tuple(map(str, rows)), rows)
+        try:
+            parameters = starting_parameters(robot, data, [own[f"base_{c}"] for c in FRAME], tools)
+        except InputError:  # lengths to which no anchor belongs
+            return float("inf")
+        free = parameters.identify([*zeros, *reflectors, *fixture])
+        fit = CalibrationProblem(robot, replace(free, scale=np.where(free.placed, FIXTURE, ZERO)), data)
+        error = np.sort(np.abs(fit.errors(settled(fit, STEPS))))[: 3 * len(rows) // 4]
+        return float(np.sqrt(np.mean(error**2)) / np.ptp(some.y))
+
+    stated = left(table)
+    readings = [*_of_joints(robot), *_of_rows(N, robot.dof)]
     for factor, (unit, _) in LENGTHS.items():
         remedy = f"multiply column distance by {factor:g} or name its unit"
         readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
-    found = np.array([each.change(table).evenly(SOME_ROWS).left() for each in readings])
+    found = np.array([left(each.change(table)) for each in readings])
     best = float(found.min())
     if not best < min(BETTER * stated, LEFT):
         return None

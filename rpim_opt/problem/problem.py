@@ -472,8 +472,9 @@ class CalibrationProblem(RobotModel):
             of = [i for i, d in enumerate(dimensions) if d == dimension]
             if of:
                 errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
-        if self.touches is not None:
-            errors[self._equations.row[self.touches.alone]] = np.nan
+        for index in self.touches.rows if self.touches else ():
+            if len(index) == 1:  # met whatever the robot
+                errors[self._equations.row[index[0]]] = np.nan
         return errors
 
     def whitened_errors(self, x: Array) -> tuple[Array, np.ndarray]:

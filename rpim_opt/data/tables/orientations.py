@@ -32,9 +32,25 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
         read[name] = read[name]._replace(stem=f"q{letter}", why=f"component {i} of a quaternion, order {order}")
     stems = {found.stem for found in read.values()}
     if {"qx", "qy", "qz"} <= stems and "qw" not in stems:
-        first = [name for name in read if re.fullmatch(r"q_?0", name.strip().lower())]
-        read.update({name: read[name]._replace(stem="qw", why="beside qx, qy, qz") for name in first})
-    places = _places(read)
+        zeroth = [name for name in read if re.fullmatch(r"q_?0", name.strip().lower())]
+        read.update({name: read[name]._replace(stem="qw", why="beside qx, qy, qz") for name in zeroth})
+    # the columns of a matrix with their row and column from 0
+    pairs: dict[str, Place] = {}
+    single: dict[str, int] = {}
+    for name in read:
+        plain = re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower())
+        pair, alone = MATRIX.fullmatch(plain), ENTRIES.fullmatch(plain)
+        if pair:
+            pairs[name] = (int(pair[1]), int(pair[2]))
+        elif alone:
+            single[name] = int(alone[1])
+    first = min((i for i, _ in pairs.values()), default=0)
+    places = {name: (i - first, j - first) for name, (i, j) in pairs.items()}
+    if len(pairs) not in SHAPES or set(places.values()) != set(product(*map(range, SHAPES[len(pairs)]))):
+        single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
+        ordered = sorted(single, key=lambda name: single[name])
+        whole = len(ordered) in (12, 16) and single[ordered[-1]] - single[ordered[0]] == len(ordered) - 1
+        places = {name: divmod(k, 4) for k, name in enumerate(ordered)} if whole else {}
     why = "a matrix, row by row"
     if len(places) == 16:
         matrices = np.empty((len(next(iter(table.values()))), 4, 4))
@@ -71,28 +87,6 @@ def quaternion_columns(read: Readings, dof: int) -> list[str]:
             if prefix != "q" or counted:
                 return [columns[i] for i in sorted(columns)]
     return []
-
-
-def _places(read: Readings) -> dict[str, Place]:
-    """Return the columns of a matrix with their row and column from 0; nothing where there is none."""
-    pairs: dict[str, Place] = {}
-    single: dict[str, int] = {}
-    for name in read:
-        plain = re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower())
-        pair, alone = MATRIX.fullmatch(plain), ENTRIES.fullmatch(plain)
-        if pair:
-            pairs[name] = (int(pair[1]), int(pair[2]))
-        elif alone:
-            single[name] = int(alone[1])
-    first = min((i for i, _ in pairs.values()), default=0)
-    shifted = {name: (i - first, j - first) for name, (i, j) in pairs.items()}
-    if len(pairs) in SHAPES and set(shifted.values()) == set(product(*map(range, SHAPES[len(pairs)]))):
-        return shifted
-    single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
-    ordered = sorted(single, key=lambda name: single[name])
-    if len(ordered) in (12, 16) and single[ordered[-1]] - single[ordered[0]] == len(ordered) - 1:
-        return {name: divmod(k, 4) for k, name in enumerate(ordered)}
-    return {}
 
 
 def require_rotation(stated: str) -> None:

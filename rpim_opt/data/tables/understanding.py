@@ -183,7 +183,28 @@ def _readings(
             rotation = turns
             break
     numbered(read, table, dof, options.quaternion or "wxyz")
-    _by_joint_names(read, table, joints, dof)
+    # ROS' joints in the robot's order, where columns name0, ... name them
+    matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem) for name, found in read.items()}
+    named = {int(match[1]): name for name, match in matches.items() if match}
+    if named and f"q{min(named)}" in {found.stem for found in read.values()}:
+        places: dict[str, int] = {}  # 0 for a joint that the robot does not have
+        for i, column in named.items():
+            called = {str(cell) for cell in table[column]}
+            if len(called) > 1:
+                raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
+            (joint,) = called
+            places[f"q{i}"] = ur_joint(joint)
+            if joints:
+                places[f"q{i}"] = joints.index(joint) + 1 if joint in joints else 0
+            elif not places[f"q{i}"] or dof != len(UR_JOINTS):
+                accepted = "a robot from a URDF, which names its joints"
+                raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
+        why = "the joint that its column of names names"
+        for name, found in list(read.items()):
+            if places.get(found.stem):
+                read[name] = found._replace(stem=f"q{places[found.stem]}", why=why)
+            elif found.stem in places:
+                read[name] = found._replace(stem=f"another {found.stem}")
     read.update(_from_one(read, dof))
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, {"x", "y", "z"}):
         read.update(_without_prefix(read, stems, joints, options.prefix))
@@ -238,32 +259,6 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
 
 def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
     read.update({name: each._replace(stem=new[each.stem], why=why) for name, each in read.items() if each.stem in new})
-
-
-def _by_joint_names(read: Readings, table: Columns, joints: Sequence[str], dof: int) -> None:
-    """Give ROS' joints the robot's order, where columns name0, ... name them."""
-    matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem) for name, found in read.items()}
-    named = {int(match[1]): name for name, match in matches.items() if match}
-    if not named or f"q{min(named)}" not in {found.stem for found in read.values()}:
-        return
-    places: dict[str, int] = {}  # 0 for a joint that the robot does not have
-    for i, column in named.items():
-        called = {str(cell) for cell in table[column]}
-        if len(called) > 1:
-            raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
-        (joint,) = called
-        number = ur_joint(joint)
-        if joints:
-            number = joints.index(joint) + 1 if joint in joints else 0
-        elif not number or dof != len(UR_JOINTS):
-            accepted = "a robot from a URDF, which names its joints"
-            raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
-        places[f"q{i}"] = number
-    for name, found in list(read.items()):
-        if places.get(found.stem):
-            read[name] = found._replace(stem=f"q{places[found.stem]}", why="the joint that its column of names names")
-        elif found.stem in places:
-            read[name] = found._replace(stem=f"another {found.stem}")
 
 
 def _from_one(read: Readings, dof: int) -> Readings:

@@ -224,6 +224,12 @@ def problem_from(
     return found if isinstance(found, CalibrationProblem) else problem
 
 
+FIXTURE, REFLECTOR = 1.0, 0.1
+"""How far [m, rad] a fixture and a reflector may be from where the first registration puts them."""
+TRIMMED, STEPS, GROSS = 3, 30, 5.0
+"""How often fixtures are fitted, in how many steps, and medians of the errors beyond which a row is left out then."""
+
+
 def starting_parameters(
     robot: Robot,
     data: Dataset,
@@ -289,28 +295,17 @@ def starting_parameters(
     if temperature is None and len(data.temperatures):
         temperature = float(data.temperatures.mean())
     named = sorted({*data.sessions, *sessions})
-    parameters = model_parameters(robot, base, tools, entries, own_frames(data), named, temperature)
-    return _with_fixtures(robot, parameters, data, fixtures)
-
-
-FIXTURE, REFLECTOR = 1.0, 0.1
-"""How far [m, rad] a fixture and a reflector may be from where the first registration puts them."""
-TRIMMED, STEPS, GROSS = 3, 30, 5.0
-"""How often fixtures are fitted, in how many steps, and medians of the errors beyond which a row is left out then."""
-
-
-def _with_fixtures(robot: Robot, parameters: Parameters, data: Dataset, names: set[str]) -> Parameters:
-    """Return the parameters with fixtures at the least squares of the nominal robot, reflectors fitted beside them.
-
-    A start that takes the reflector for known is off by more than the reflector is: a long cable's anchor by metres.
-    """
-    if not names:
+    frames = dict.fromkeys(of_fixture(f"{name}_", b.fixture) for b in data.blocks for name in b.measurement.frames)
+    parameters = model_parameters(robot, base, tools, entries, tuple(frames), named, temperature)
+    if not fixtures:
         return parameters
-    own = np.isin(parameters.names, list(names))
+    # Fixtures at the least squares of the nominal robot, reflectors fitted beside them: a start that takes reflectors
+    # for known is off by more than these are, a long cable's anchor by metres.
+    fitted = np.isin(parameters.names, list(fixtures))
     markers = {marker for block in data.blocks for marker in block.markers}
-    tools = np.isin(parameters.names, [tool_prefix(marker) + c for marker in markers for c in "xyz"])
-    scale = np.where(own, FIXTURE, np.where(tools, REFLECTOR, parameters.scale))
-    free = replace(parameters, identified=own | tools, scale=scale)
+    reflectors = np.isin(parameters.names, [tool_prefix(marker) + c for marker in markers for c in "xyz"])
+    scale = np.where(fitted, FIXTURE, np.where(reflectors, REFLECTOR, parameters.scale))
+    free = replace(parameters, identified=fitted | reflectors, scale=scale)
     problem = whole = CalibrationProblem(robot, free, data)
     x = np.zeros(len(free.free))
     for _ in range(TRIMMED):  # gross outliers would pull the start
@@ -324,7 +319,7 @@ def _with_fixtures(robot: Robot, parameters: Parameters, data: Dataset, names: s
         except InputError:
             return parameters
     nominal = parameters.nominal.copy()
-    nominal[own] += x[own[free.identified]]
+    nominal[fitted] += x[fitted[free.identified]]
     return replace(parameters, nominal=nominal)
 
 
@@ -337,12 +332,6 @@ def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float
             start = starting_camera(data, block)
             found |= {of_fixture(f"camera_{name}", block.fixture): value for name, value in start.items()}
     return found
-
-
-def own_frames(data: Dataset) -> tuple[str, ...]:
-    """Return the prefixes of the frames that measurements have of their own, ``plane_``."""
-    blocks = [(block.measurement, block.fixture) for block in data.blocks]
-    return tuple(dict.fromkeys(of_fixture(name + "_", fixture) for kind, fixture in blocks for name in kind.frames))
 
 
 def relocated(problem: Source) -> Source | None:

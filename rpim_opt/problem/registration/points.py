@@ -126,10 +126,6 @@ class Fit(NamedTuple):
     tools: Array  # (B, M, 3) in the flange frame [m]
     zero: Array  # (B, dof) joint zeros [rad or m]
 
-    def take(self, index: np.ndarray) -> Fit:
-        """Return the fits at ``index``."""
-        return Fit(*(each[index] for each in self))
-
 
 class Candidates(NamedTuple):
     """B sets of N points to be fitted at once."""
