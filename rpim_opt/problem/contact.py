@@ -230,14 +230,27 @@ class Touches:
 
     def through(self, tie: Tie, where: Things) -> list[tuple[np.ndarray, Array]]:
         """Return equations (K, 3) of a tie's two things, and how what it compares follows their positions (e, 3K)."""
-        found = []
-        for k, end in enumerate(tie.ends):
-            index = self.rows[end]
-            still = np.zeros((3, index.size))
-            moved = [Moved(still, still), Moved(still, still)]
-            moved[k] = where[end].moved(np.eye(index.size).reshape(*index.shape, -1))
-            found.append((index, _compared(tie, where, moved)))
-        return found
+        first, second = (where[end] for end in tie.ends)
+        rows = [self.rows[end] for end in tie.ends]
+        eyes = [np.eye(index.size).reshape(*index.shape, -1) for index in rows]
+        one, other = first.moved(eyes[0]), second.moved(eyes[1])
+        apart = second.centre - first.centre
+        same = np.copysign(1.0, first.normal @ second.normal)
+        if tie.kind == "known_square":
+            sine = np.sqrt(max(1 - (first.normal @ second.normal) ** 2, 1e-12))
+            slopes = [second.normal @ one.normal / sine, first.normal @ other.normal / sine]
+        elif tie.kind == "known_parallel":
+            turned = -first.across @ one.normal
+            if one.across is not None:
+                turned = same * np.einsum("aic,i->ac", one.across, second.normal)
+            slopes = [turned, same * first.across @ other.normal]
+        elif first.planar:
+            way = np.copysign(1.0, first.normal @ apart)
+            slopes = [way * (apart @ one.normal - first.normal @ one.centre), way * first.normal @ other.centre]
+        else:
+            u = apart / max(float(np.linalg.norm(apart)), 1e-300)
+            slopes = [-u @ one.centre, u @ other.centre]
+        return [(index, np.atleast_2d(G)) for index, G in zip(rows, slopes, strict=True)]
 
     def kept(self, where: Things) -> np.ndarray:
         """Return which of the equations' places contrasts have (m,)."""
@@ -264,27 +277,6 @@ class Touches:
             for index, G in self.through(tie, where):
                 found[tie.equations[:, None], index.ravel()] = G
         return found.tocsr()[self.kept(where)]
-
-
-def _compared(tie: Tie, where: Things, moved: Sequence[Moved]) -> Array:
-    """Return how what a tie compares changes (e, c) where its two things move."""
-    first, second = (where[end] for end in tie.ends)
-    one, other = moved
-    if tie.kind == "known_square":
-        cosine = first.normal @ second.normal
-        turned = second.normal @ one.normal + first.normal @ other.normal
-        return turned[None] / np.sqrt(max(1 - cosine**2, 1e-12))
-    if tie.kind == "known_parallel":
-        same = np.copysign(1.0, first.normal @ second.normal)
-        if one.across is None:
-            return first.across @ (same * other.normal - one.normal)
-        return same * (first.across @ other.normal + np.einsum("aic,i->ac", one.across, second.normal))
-    apart = second.centre - first.centre
-    if first.planar:
-        along = first.normal @ (other.centre - one.centre) + apart @ one.normal
-        return along[None] * np.copysign(1.0, first.normal @ apart)
-    u = apart / max(float(np.linalg.norm(apart)), 1e-300)
-    return (u @ (other.centre - one.centre))[None]
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:

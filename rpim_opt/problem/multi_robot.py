@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from string import ascii_uppercase
+from typing import Any
 
 import numpy as np
 
@@ -147,19 +148,15 @@ def _common(
 def _concatenated(tables: Sequence[Parameters]) -> Parameters:
     """Return tables one after the other."""
 
-    def listed(what: str) -> tuple[str, ...]:
-        return tuple(chain.from_iterable(getattr(table, what) for table in tables))
+    def listed(what: str) -> list[Any]:
+        return list(chain.from_iterable(getattr(table, what) for table in tables))
 
-    numbers = {
-        what: np.concatenate([getattr(table, what) for table in tables])
-        for what in ("nominal", "scale", "tolerance", "identified")
-    }
     return Parameters(
-        names=listed("names"),
-        dimensions=listed("dimensions"),
+        names=tuple(listed("names")),
+        dimensions=tuple(listed("dimensions")),
         own_frames=tuple(dict.fromkeys(listed("own_frames"))),
         terms=tuple(dict.fromkeys(listed("terms"))),
-        **numbers,
+        **{what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")},
     )
 
 

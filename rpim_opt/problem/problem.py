@@ -26,7 +26,6 @@ from rpim_opt.problem.row_functions import (
     Functions,
     Kept,
     Structure,
-    asked,
     loads_in,
     loads_of,
     measured_torques,
@@ -380,7 +379,7 @@ class CalibrationProblem(RobotModel):
                 robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
                 tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
             )  # fmt: skip
-        return (self.asked or asked)(self._structures[block], block.measurement)
+        return (self.asked or Kept())(self._structures[block], block.measurement)
 
     @cached_property
     def _sessions(self) -> dict[str, tuple[str, ...]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
+from types import MappingProxyType
 from typing import NamedTuple
 
 import casadi as ca
@@ -61,45 +62,24 @@ class Structure(NamedTuple):
 
 
 class Kept:
-    """Functions that are asked for once: what a calibration works with from its first iteration to its last."""
+    """Functions of rows: of ready measurements built once, of a user's by the answer that it gave when first asked.
 
-    def __init__(self) -> None:
-        self._functions: dict[tuple[Structure, Measurement], Functions] = {}
+    A calibration works with one from its first iteration to its last. It is sent to other processes with the answers,
+    expressions as text: there a user's function may be another one.
+    """
+
+    def __init__(self, answers: Mapping[tuple[Structure, Measurement], str] = MappingProxyType({})) -> None:
+        self.answers = dict(answers)
 
     def __call__(self, structure: Structure, measurement: Measurement) -> Functions:
         """Return the functions as they were when they were first asked for."""
+        if structure.is_pure(measurement):
+            return _ready(structure, measurement)
         with SYMBOLS:
-            if (structure, measurement) not in self._functions:
-                self._functions[structure, measurement] = asked(structure, measurement)
-            return self._functions[structure, measurement]
-
-    def __getstate__(self) -> dict[tuple[Structure, Measurement], dict[str, str]]:
-        """Return what cannot be asked for elsewhere: answers of a user's functions, as they were."""
-        return {
-            (structure, measurement): {name: function.serialize() for name, function in functions.items()}
-            for (structure, measurement), functions in self._functions.items()
-            if not structure.is_pure(measurement)
-        }
-
-    def __setstate__(self, kept: dict[tuple[Structure, Measurement], dict[str, str]]) -> None:
-        self._functions = {
-            key: {name: _restored(text) for name, text in functions.items()} for key, functions in kept.items()
-        }
-
-
-@lru_cache(maxsize=256)
-def _restored(text: str) -> ca.Function:
-    """Return a function that was sent, the same one every time: what was prepared for many rows of it is not lost."""
-    return ca.Function.deserialize(text)
-
-
-def asked(structure: Structure, measurement: Measurement) -> Functions:
-    """Return the functions of a row: of ready measurements built once, of a user's by their present answer."""
-    if structure.is_pure(measurement):
-        return _ready(structure, measurement)
-    with SYMBOLS:
-        inputs, outputs = _expressions(structure, measurement)
-        return _built(ca.Function("row", inputs, outputs).serialize())
+            if (structure, measurement) not in self.answers:
+                inputs, outputs = _expressions(structure, measurement)
+                self.answers[structure, measurement] = ca.Function("row", inputs, outputs).serialize()
+            return _built(self.answers[structure, measurement])
 
 
 @lru_cache(maxsize=MANY)
@@ -108,7 +88,7 @@ def _ready(structure: Structure, measurement: Measurement) -> Functions:
         return _derived(*_expressions(structure, measurement))
 
 
-@lru_cache(maxsize=256)
+@lru_cache(maxsize=MANY)
 def _built(answer: str) -> Functions:
     function = ca.Function.deserialize(answer)
     symbols = function.sx_in()
