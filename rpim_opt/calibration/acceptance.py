@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -92,20 +92,6 @@ class Region:
             raise InputError("the box", "no configuration of the joint ranges that reaches into it", accepted)
         return found
 
-    def largest(self, q: Array, value: Array, figure: Callable[[Array], Array]) -> Array:
-        """Return where a figure, (N,) of configurations q (N, dof), is largest (dof,): a search from the worst."""
-        rng = np.random.default_rng(0)
-        span = np.ptp(self.limits, axis=1)
-        for step in STEPS:
-            beside = q[np.argsort(-value)[:WORST]].repeat(BESIDE, axis=0)
-            beside = beside + step * span * rng.normal(size=beside.shape)
-            beside = np.clip(beside, *self.limits.T)
-            beside = beside[self.inside(beside)]
-            if len(beside):
-                q = np.concatenate([q, beside])
-                value = np.concatenate([value, figure(beside)])
-        return q[np.argmax(value)]
-
 
 def region_of(result: Outcome, requirement: Requirement) -> Region:
     """Return the region of a requirement; refuse several robots, and joints and reflectors that the robot has not."""
@@ -158,16 +144,22 @@ class Workspace:
         return float(np.median(self.expanded[:-1]))
 
 
-def workspace(result: Outcome, requirement: Requirement, region: Region, q: Array) -> Workspace:
-    """Return the expanded uncertainty at configurations q (N, dof) of a region and at the worst that a search finds.
+def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: Array) -> Workspace:
+    """Return the expanded uncertainty at configurations (N, dof) of a region and at the worst that a search finds.
 
     InputError for a formulation without covariance.
     """
-
-    def bound(q: Array) -> Array:
-        return reaching(result, region, q, requirement.confidence)[1]
-
-    q = np.vstack([q, region.largest(q, bound(q), bound)])
+    rng = np.random.default_rng(0)
+    span = np.ptp(region.limits, axis=1)
+    q, bound = drawn, reaching(result, region, drawn, requirement.confidence)[1]
+    for step in STEPS:
+        beside = q[np.argsort(-bound)[:WORST]].repeat(BESIDE, axis=0)
+        beside = np.clip(beside + step * span * rng.normal(size=beside.shape), *region.limits.T)
+        beside = beside[region.inside(beside)]
+        if len(beside):
+            q = np.concatenate([q, beside])
+            bound = np.concatenate([bound, reaching(result, region, beside, requirement.confidence)[1]])
+    q = np.vstack([drawn, q[np.argmax(bound)]])
     return Workspace(requirement, region, q, *reaching(result, region, q, requirement.confidence))
 
 
@@ -203,81 +195,6 @@ def distance_quantile(covariance: Array, freedom: float, probability: float) -> 
 
 
 @dataclass(frozen=True, eq=False)
-class Checked:
-    """What held-out rows say.
-
-    Parameters
-    ----------
-    count, largest
-        How many rows measure a length in the region, and the largest error of these [m].
-    instrument
-        The largest part of an error that the instrument may have added to it, with the required confidence [m].
-    missing
-        Labels of those that miss by more than the limit and what the instrument may add to it.
-    rows
-        How many rows were held out in all.
-    beyond
-        Labels of those, in the region or not, that the prediction's uncertainty does not explain.
-    coverage
-        Share of their lengths that lie in the 95 % interval of a reading; None where there is none.
-    """
-
-    count: int
-    largest: float
-    instrument: float
-    missing: tuple[str, ...]
-    rows: int
-    beyond: tuple[str, ...]
-    coverage: float | None
-
-    def sentence(self) -> str:
-        """Return the figures in a sentence."""
-        if not self.count:
-            return f"None of the {self.rows} held-out rows is in the region."
-        text = f"Held out: {self.rows} rows, {self.count} of them in the region, the largest error there "
-        text += f"{1e3 * self.largest:.3f} mm, of which the instrument may account for {1e3 * self.instrument:.3f} mm"
-        if self.coverage is not None:
-            text += f"; {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals"
-            text += f" (at least {100 * self.least_coverage:.0f} % are required of so many rows)"
-        return f"{text}."
-
-    @property
-    def least_coverage(self) -> float:
-        """Share of lengths in their intervals below which so many rows do not bear these out."""
-        # coordinates of a row are not independent of each other: a row counts once
-        unlikely = bdtr(np.arange(self.rows + 1), self.rows, CONFIDENCE) < UNLIKELY
-        return float(np.sum(unlikely)) / self.rows
-
-    def lacking(self) -> list[str]:
-        """Return why the rows do not bear the intervals out, a sentence each."""
-        lines: list[str] = []
-        if self.rows < FEWEST:
-            lines.append(f"Lacking: at least {FEWEST} held-out rows; there are {self.rows}.")
-        if self.beyond:
-            lines.append(
-                f"Lacking: valid prediction intervals. Rows outside theirs: "
-                f"{listed(list(self.beyond), MOST)}. Measure again, or find what the model lacks."
-            )
-        if self.coverage is not None and self.coverage < self.least_coverage:
-            lines.append(
-                f"Lacking: valid prediction intervals. Only {100 * self.coverage:.0f} % of the coordinates lie in "
-                "their 95 % intervals."
-            )
-        return lines
-
-    def content(self) -> dict[str, Any]:
-        """Return the figures as a document [mm]."""
-        return {
-            "rows": self.rows,
-            "in_region": self.count,
-            "largest_mm": 1e3 * self.largest,
-            "missing": list(self.missing),
-            "beyond": list(self.beyond),
-            "coverage95": self.coverage,
-        }
-
-
-@dataclass(frozen=True, eq=False)
 class Acceptance:
     """What a requirement and a calibration come to.
 
@@ -293,8 +210,8 @@ class Acceptance:
         The bounds at configurations of the region; None where there are none.
     scatter
         What would be left of the largest bound if all parameters were known [m].
-    checked
-        The held-out rows, beside the limit.
+    held_out
+        What held-out rows say, as a document [mm] with its ``sentence``; None where there are none.
 
     Examples
     --------
@@ -310,7 +227,7 @@ class Acceptance:
     reasons: tuple[str, ...]
     workspace: Workspace | None = None
     scatter: float | None = None
-    checked: Checked | None = None
+    held_out: Mapping[str, Any] | None = None
 
     @property
     def bound(self) -> float | None:
@@ -319,20 +236,18 @@ class Acceptance:
 
     def sentences(self) -> list[str]:
         """Return the verdict and what it rests on, sentence by sentence."""
-        limit = f"{1e3 * self.requirement.limit:g} mm"
+        asked = self.requirement
         said = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Cannot be decided"}[self.verdict]
-        lines = [
-            f"{said}: limit {limit} with {percent(self.requirement.confidence)} at every configuration of the region."
-        ]
-        lines.append(f"Region: {self.requirement.where}.")
+        limit = f"limit {1e3 * asked.limit:g} mm with {percent(asked.confidence)}"
+        lines = [f"{said}: {limit} at every configuration of the region.", f"Region: {asked.where}."]
         found = self.workspace
         if found is not None and np.isfinite(found.largest):
             lines.append(
                 f"Expanded uncertainty of the position reached: U = {1e3 * found.largest:.3f} mm at most (worst of "
                 f"{found.count} configurations and a search from there), median {1e3 * found.typical:.3f} mm."
             )
-        if self.checked is not None:
-            lines.append(self.checked.sentence())
+        if self.held_out is not None:
+            lines.append(self.held_out["sentence"])
         return [*lines, *self.reasons]
 
     def __str__(self) -> str:
@@ -345,6 +260,7 @@ class Acceptance:
         box = None
         if r.box is not None:
             box = {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
+        lengths = {"bound": self.bound, "typical": found and found.typical, "scatter": self.scatter}
         return {
             "verdict": self.verdict,
             "limit_mm": 1e3 * r.limit,
@@ -352,20 +268,12 @@ class Acceptance:
             "region": r.where,
             "box_mm": box,
             "configurations": 0 if found is None else found.count,
-            "bound_mm": _milli(found and found.largest),
-            "typical_mm": _milli(found and found.typical),
+            **{f"{k}_mm": None if v is None or not np.isfinite(v) else 1e3 * v for k, v in lengths.items()},
             "worst": found and found.q[-1].tolist(),
             "place_mm": found and (1e3 * found.position[-1]).tolist(),
-            "scatter_mm": _milli(self.scatter),
-            "checked": self.checked and self.checked.content(),
+            "checked": self.held_out and {k: v for k, v in self.held_out.items() if k != "sentence"},
             "reasons": list(self.reasons),
         }
-
-
-def _milli(value: float | None) -> float | None:
-    if value is None or not np.isfinite(value):
-        return None
-    return 1e3 * value
 
 
 @one_blas_thread
@@ -408,43 +316,70 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         raise InputError("acceptance", "no limit", "a limit [mm]: --limit, or limit_mm in [acceptance]")
     if data is not None:
         refuse_misread(result, data)
+    limit = requirement.limit
     region = region_of(result, requirement)
-    q = region.drawn()
-    seen = checked(result, region, requirement, data)
+    drawn = region.drawn()
+    held_out, missed, unheld = _held_out(result, region, requirement, data)
+    lacking = [*_unmodelled(result, region), *unheld]
     against = list(result.verdict.reasons)
-    lacking = _lacking(result, region, seen)
     try:
-        mapped = workspace(result, requirement, region, q)
+        mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
         reasons = (*against, *lacking, f"No bound: {error}")
-        return Acceptance(requirement, "rejected" if against else "undecided", reasons, checked=seen)
+        return Acceptance(requirement, "rejected" if against else "undecided", reasons, held_out=held_out)
     scatter, least = scatter_bounds(result, region, mapped.q[-1], requirement.confidence)
-    against += _against(requirement, least, seen)
-    lacking += _wide(requirement.limit, mapped.largest, scatter)
-    if np.isfinite(mapped.largest) and max(requirement.limit, scatter) < mapped.largest:
-        lacking += decisive(result, mapped)
+    against += missed
+    if least > limit:
+        against.append(
+            f"With this model the robot's repeatability contributes {1e3 * least:.3f} mm at least: only a model that "
+            'explains more of it (model = "auto") or a more repeatable robot lowers that.'
+        )
+    if not np.isfinite(mapped.largest):
+        lacking.append(
+            "Lacking: measurements that identify combinations which neither data nor penalty determine, and which move "
+            "the robot."
+        )
+    elif mapped.largest > limit:
+        if scatter > limit:
+            lacking.append(
+                f"Lacking: a more precise repeatability. Its upper bound, {1e3 * scatter:.3f} mm, may exceed the "
+                "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
+            )
+        else:
+            lacking.append(
+                f"Lacking: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
+                f"robot's repeatability would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment "
+                "--count 10` names the configurations that help most."
+            )
+        if scatter < mapped.largest:
+            lacking += decisive(result, mapped)
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "undecided"
-    return Acceptance(requirement, verdict, tuple(against or lacking), mapped, scatter, seen)
+    return Acceptance(requirement, verdict, tuple(against or lacking), mapped, scatter, held_out)
 
 
-def checked(result: Calibration, region: Region, requirement: Requirement, data: Dataset | None) -> Checked | None:
-    """Return what held-out rows, of the result's record or other ones, say of a limit; None where there are none."""
+def _held_out(
+    result: Calibration, region: Region, requirement: Requirement, data: Dataset | None
+) -> tuple[dict[str, Any] | None, list[str], list[str]]:
+    """Return what held-out rows, of the result's record or other ones, say of a limit.
+
+    As a document [mm] with its sentence, None without rows; that they miss the limit; and why they do not bear the
+    intervals out.
+    """
     apart = result.record.validation if data is None else data
     held = result.record.held_out
     if apart is not None:
-        error, found = result.errors(apart), judged(result, apart)
-        sigmas, allowed, coverage = found
+        error, (sigmas, allowed, coverage) = result.errors(apart), judged(result, apart)
     elif held is not None:
         known = {label: row for row, label in enumerate(result.problem.data.label)}
         kept = np.array([label in known for label in held.label])
         apart = result.problem.data.take([known[label] for label in held.label if label in known])
         error, sigmas, allowed, coverage = held.error[kept], held.sigmas[kept], held.allowed[kept], held.coverage
     else:
-        return None
+        return None, [], ["Lacking: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
     inside = np.isfinite(error)
-    instrument = np.zeros(len(apart))
+    instrument = np.zeros(len(apart))  # what it may add to an error, with the required confidence
     for block in apart.blocks:
         points = [region.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
         inside[block.row] &= np.all(points, axis=0)
@@ -453,17 +388,40 @@ def checked(result: Calibration, region: Region, requirement: Requirement, data:
         if lengths:
             of_lengths = stated[:, lengths][:, :, lengths]
             instrument[block.row] = distance_quantile(of_lengths, STATED, requirement.confidence)
-    missing = np.flatnonzero(inside & (error > requirement.limit + instrument))
-    beyond = np.flatnonzero(np.nan_to_num(sigmas) > np.nan_to_num(allowed, nan=np.inf))
-    return Checked(
-        count=int(inside.sum()),
-        largest=float(error[inside].max(initial=0.0)),
-        instrument=float(instrument[inside].max(initial=0.0)),
-        missing=tuple(apart.label[i] for i in missing),
-        rows=len(apart),
-        beyond=tuple(apart.label[i] for i in beyond),
-        coverage=coverage,
-    )
+    missing = [apart.label[i] for i in np.flatnonzero(inside & (error > requirement.limit + instrument))]
+    unexplained = np.nan_to_num(sigmas) > np.nan_to_num(allowed, nan=np.inf)
+    beyond = [apart.label[i] for i in np.flatnonzero(unexplained)]
+    rows, count = len(apart), int(inside.sum())
+    largest = 1e3 * float(error[inside].max(initial=0.0))
+    missed: list[str] = []
+    chance = 1 - requirement.confidence
+    if missing and bdtrc(len(missing) - 1, count, chance) < chance:
+        missed.append(
+            f"{len(missing)} of {count} rows miss by more than the limit and the instrument's part of it: "
+            f"{listed(missing, MOST)}."
+        )
+    lacking: list[str] = []
+    if rows < FEWEST:
+        lacking.append(f"Lacking: at least {FEWEST} held-out rows; there are {rows}.")
+    if beyond:
+        lacking.append(
+            f"Lacking: valid prediction intervals. Rows outside theirs: {listed(beyond, MOST)}. Measure again, or find "
+            "what the model lacks."
+        )
+    sentence = f"Held out: {rows} rows, {count} of them in the region, the largest error there {largest:.3f} mm, of "
+    sentence += f"which the instrument may account for {1e3 * instrument[inside].max(initial=0.0):.3f} mm"
+    if coverage is not None:
+        # coordinates of a row are not independent of each other: a row counts once
+        least = float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
+        share = f"{100 * coverage:.0f} % of the coordinates lie in their 95 % intervals"
+        sentence += f"; {share} (at least {100 * least:.0f} % are required of so many rows)"
+        if coverage < least:
+            lacking.append(f"Lacking: valid prediction intervals. Only {share}.")
+    document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
+    document |= {"beyond": beyond, "coverage95": coverage, "sentence": f"{sentence}."}
+    if not count:
+        document["sentence"] = f"None of the {rows} held-out rows is in the region."
+    return document, missed, lacking
 
 
 def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
@@ -483,28 +441,6 @@ def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: fl
         if np.isfinite(mean).all():
             found[i] = float(distance_quantile(reached - mean, each.freedom, confidence)[0])
     return found[0], found[1]
-
-
-def _wide(limit: float, bound: float, scatter: float) -> list[str]:
-    """Say what would lower a bound that is above the limit."""
-    if not np.isfinite(bound):
-        return [
-            "Lacking: measurements that identify combinations which neither data nor penalty determine, and which move "
-            "the robot."
-        ]
-    if bound <= limit:
-        return []
-    if scatter > limit:
-        return [
-            f"Lacking: a more precise repeatability. Its upper bound, "
-            f"{1e3 * scatter:.3f} mm, may exceed the limit: approach some poses repeatedly "
-            "(`rpim-opt iso9283`)."
-        ]
-    return [
-        f"Lacking: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's "
-        f"repeatability would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment --count 10` "
-        "names the configurations that help most."
-    ]
 
 
 def decisive(result: Calibration, found: Workspace) -> list[str]:
@@ -537,34 +473,12 @@ def decisive(result: Calibration, found: Workspace) -> list[str]:
     return [text]
 
 
-def _against(requirement: Requirement, least: float, seen: Checked | None) -> list[str]:
-    """Return what shows that the limit is not kept."""
-    reasons: list[str] = []
-    if seen is not None and seen.missing:
-        chance = 1 - requirement.confidence
-        if bdtrc(len(seen.missing) - 1, seen.count, chance) < chance:
-            reasons.append(
-                f"{len(seen.missing)} of {seen.count} rows miss by more than the limit and the instrument's part of "
-                f"it: {listed(list(seen.missing), MOST)}."
-            )
-    if least > requirement.limit:
-        reasons.append(
-            f"With this model the robot's repeatability contributes {1e3 * least:.3f} mm at least: only a model that "
-            'explains more of it (model = "auto") or a more repeatable robot lowers that.'
-        )
-    return reasons
-
-
-def _lacking(result: Calibration, region: Region, seen: Checked | None) -> list[str]:
-    """Return what invalidates a bound."""
+def _unmodelled(result: Calibration, region: Region) -> list[str]:
+    """Say that the model does not fit, and that joints go in the region where nothing was measured."""
     lines: list[str] = []
     fit = judged_fit(result)
     if fit is not None and fit.alarming:
         lines.append(f"Lacking: a model that fits. {fit}")
-    if seen is None:
-        lines.append("Lacking: held-out rows (`new --hold-out`, or a table for `accept --data`).")
-    else:
-        lines += seen.lacking()
     corners = Dataset.of(region.limits.T.copy(), np.zeros((2, 3)), 1.0)
     named: list[str] = []
     for joint in result.outside(corners).joints:
@@ -572,7 +486,6 @@ def _lacking(result: Calibration, region: Region, seen: Checked | None) -> list[
         low, high = region.limits[joint - 1] / si
         named.append(f"joint {joint} from {low:.4g} to {high:.4g} {unit}")
     if named:
-        lines.append(
-            f"Lacking: measurements with {joined(named)}, as the region has it: nothing checked the model there."
-        )
+        where = f"{joined(named)}, as the region has it: nothing checked the model there."
+        lines.append(f"Lacking: measurements with {where}")
     return lines

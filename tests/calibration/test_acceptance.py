@@ -141,6 +141,16 @@ def test_the_mean_of_the_errors_does_not_decide(result) -> None:
     found = accept(result, Requirement(1.2 * largest))
     assert found.bound > 1.2 * largest
     assert found.verdict == "undecided"
+    assert f"Held out: 40 rows, 40 of them in the region, the largest error there {1e3 * largest:.3f} mm, of" in str(
+        found
+    )
+    assert "their 95 % intervals (at least 85 % are required of so many rows)." in str(found)
+
+
+def test_held_out_rows_may_be_elsewhere(result) -> None:
+    found = accept(result, Requirement(1e-3, joints=((1, (-0.01, 0.01)),)))
+    assert found.content()["checked"]["in_region"] == 0
+    assert "None of the 40 held-out rows is in the region." in found.sentences()
 
 
 def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:

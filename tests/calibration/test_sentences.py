@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Checked, Workspace, _wide, scatter_bounds
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, scatter_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.covariance import require_interval as interval
 from rpim_opt.calibration.lack_of_fit import Autocorrelation, Effect, LackOfFit, autocorrelation
@@ -43,32 +43,15 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     assert "The position reached" not in str(free)
     assert free.content()["bound_mm"] is None
     assert free.content()["typical_mm"] == pytest.approx(0.05)
-    seen = Checked(3, 8e-5, 2e-5, (), 4, (), 0.9)
-    whole = Acceptance(LIMIT, "accepted", (), expanded(500, 9e-5, 5e-5), 2e-5, checked=seen)
+    whole = Acceptance(
+        LIMIT, "accepted", (), expanded(500, 9e-5, 5e-5), 2e-5, {"rows": 4, "sentence": "Held out: 4 rows."}
+    )
     assert whole.sentences()[2:] == [
         "Expanded uncertainty of the position reached: U = 0.090 mm at most (worst of 500 configurations and a search "
         "from there), median 0.050 mm.",
-        "Held out: 4 rows, 3 of them in the region, the largest error there 0.080 mm, of which the "
-        "instrument may account for 0.020 mm; 90 % of the coordinates lie in their 95 % intervals (at least 50 % are "
-        "required of so many rows).",
+        "Held out: 4 rows.",
     ]
-
-
-def test_rows_that_were_kept_apart_may_say_little() -> None:
-    none = Checked(0, 0.0, 0.0, (), 4, (), None)
-    assert none.sentence() == "None of the 4 held-out rows is in the region."
-    unknown = Checked(2, 1e-4, 3e-5, (), 4, (), None)
-    assert unknown.sentence().endswith("0.100 mm, of which the instrument may account for 0.030 mm.")
-
-
-def test_a_bound_above_the_limit_says_what_would_lower_it() -> None:
-    assert _wide(1e-4, 1e-4, 5e-5) == []
-    (open_directions,) = _wide(1e-4, np.inf, 5e-5)
-    assert "combinations which neither data nor penalty determine" in open_directions
-    (scatter,) = _wide(1e-4, 3e-4, 2e-4)
-    assert scatter.startswith("Lacking: a more precise repeatability.")
-    (more,) = _wide(1e-4, 3e-4, 5e-5)
-    assert more.startswith("Lacking: measurements. The bound is 0.300 mm")
+    assert whole.content()["checked"] == {"rows": 4}
 
 
 def test_a_share_of_scatter_that_is_not_known_is_zero() -> None:
