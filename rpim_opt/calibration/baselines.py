@@ -12,7 +12,6 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.problem.problem import CalibrationProblem
 
 __all__ = [
-    "extended_kalman_filter",
     "gauss_newton",
     "gradient_descent",
     "levenberg_marquardt",
@@ -111,25 +110,3 @@ def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, precon
             break
         x, r = x + step, after
     return Baseline(x, k, "gradient descent, preconditioned" if preconditioned else "gradient descent")
-
-
-def extended_kalman_filter(problem: CalibrationProblem, passes: int = 1) -> Baseline:
-    """Filter one configuration after the other (extended Kalman filter), scales as prior, stated noise as noise.
-
-    Linearizes each configuration at the estimate so far; with more passes the prior is taken again, at the last
-    estimate (iterated filter), which ends at the Tikhonov solution of weight 1.
-    """
-    scale = problem.parameters.free.scale
-    groups = np.unique(problem.data.configuration)
-    start = np.zeros_like(scale)
-    z = start
-    for _ in range(passes):
-        at, z, P = (start if passes == 1 else z), np.zeros_like(scale), np.eye(len(scale))
-        for group in groups:
-            rows = problem.on(problem.data.take(np.flatnonzero(problem.data.configuration == group)))
-            model = rows.linearize(scale * (z if passes == 1 else at))
-            gain = P @ model.A.T @ np.linalg.inv(model.A @ P @ model.A.T + np.eye(len(model.b)))
-            z = z + gain @ (model.b - model.A @ z)
-            left = np.eye(len(z)) - gain @ model.A
-            P = left @ P @ left.T + gain @ gain.T  # Joseph's form stays symmetric and positive
-    return Baseline(scale * z, passes, "extended Kalman filter")

@@ -76,16 +76,23 @@ def certified(
         program = before.anew(formulation, model, z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
-    gradient = _gradient(program, slope, z, weight)
+    relative = None
+    gradient = program.gradient(z, weight) if program.quadratic else None
+    if gradient is not None and program.box is not None:  # off the bounds that hold it, relative to that at nominal
+        lower, upper = program.box
+        at_low = np.isfinite(lower) & (z <= lower + 1e-9)
+        at_high = np.isfinite(upper) & (z >= upper - 1e-9)
+        held = (at_low & (gradient > 0)) | (at_high & (gradient < 0))
+        relative = float(np.linalg.norm(gradient[~held]) / max(slope, TINY))
     try:
         best = program.inside(program.solve(weight).z, z, weight)
     except NoSolutionFound:
-        return Certificate(gradient, float("inf"), violation, None)
+        return Certificate(relative, float("inf"), violation, None)
     step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))
     promised = objective - program.objective(best, weight)
     if not np.isfinite(promised):
-        return Certificate(gradient, step, violation, None)
-    return Certificate(gradient, step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
+        return Certificate(relative, step, violation, None)
+    return Certificate(relative, step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
 
 
 def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: Array) -> LinearModel:
@@ -105,18 +112,3 @@ def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: A
             A = np.column_stack([slope(unit) for unit in np.eye(len(z))])
             return replace(model, A=A, b=residual(z) + A @ z)
     return model
-
-
-def _gradient(program: Program, slope: float, z: Array, weight: float) -> float | None:
-    """Return the norm of the gradient off the bounds, relative to that of the data at nominal."""
-    if not program.quadratic or program.box is None:
-        return None
-    gradient = program.gradient(z, weight)
-    if gradient is None:
-        return None
-    lower, upper = program.box
-    at_low = np.isfinite(lower) & (z <= lower + 1e-9)
-    at_high = np.isfinite(upper) & (z >= upper - 1e-9)
-    held = (at_low & (gradient > 0)) | (at_high & (gradient < 0))
-    left = np.where(held, 0.0, gradient)
-    return float(np.linalg.norm(left) / max(slope, TINY))

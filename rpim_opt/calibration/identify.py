@@ -128,7 +128,13 @@ def calibrate(
     formulation = formulation_of(formulation)
     weight = weight_of(weight)
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
-    kinds = _noise(noise, model)
+    if model not in MODELS:
+        raise InputError("model", f"'{model}'", choices(model, MODELS))
+    if noise not in NOISE:
+        raise InputError("noise", f"'{noise}'", choices(noise, NOISE))
+    kinds = NOISE[noise]
+    if model == "geometry":  # without the families joints would take gravity for noise
+        kinds = tuple(kind for kind in kinds if kind != "joint")
     require_affordable(problem)
     require_finite(*(block.y for block in problem.sample().data.blocks))
     elsewhere = None
@@ -139,7 +145,11 @@ def calibrate(
         found = find_mapping(problem)
         if found is not None:
             mapping, problem = found
-            prior = (prior or Prior()) & _zeros(mapping)
+            # quarter turns are conventions, other zeros chance
+            own = np.flatnonzero((mapping.zero % (np.pi / 2) != 0) & (np.array(mapping.joint_types) == "revolute"))
+            wide = ((1 / ZERO,),)
+            zeros = [Statement((f"theta{i + 1}",), ("angle",), wide, (0.0,), whole=True) for i in own]
+            prior = (prior or Prior()) & Prior(statements=tuple(zeros))
         elsewhere = relocated(problem)
     problem = elsewhere or problem
     asked: Callable[[Source], Calibration] = partial(
@@ -172,13 +182,6 @@ def calibrate(
     return replace(result, message=message, asked=mapped_as(mapping, asked), mapping=mapping)
 
 
-def _zeros(mapping: JointMapping) -> Prior:
-    """Return what is expected of zeros that were found from the data: quarter turns are conventions, others chance."""
-    found = np.flatnonzero((mapping.zero % (np.pi / 2) != 0) & (np.array(mapping.joint_types) == "revolute"))
-    wide = ((1 / ZERO,),)
-    return Prior(statements=tuple(Statement((f"theta{i + 1}",), ("angle",), wide, (0.0,), whole=True) for i in found))
-
-
 def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:
     """Return a calibration of problems whose joints are mapped already, which says so."""
     return asked if mapping is None else partial(_mapped, mapping, asked)
@@ -198,15 +201,3 @@ def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration
             progress(it)
 
     return report
-
-
-def _noise(noise: str, model: str) -> tuple[str, ...]:
-    """Return which parts of the noise are estimated."""
-    if model not in MODELS:
-        raise InputError("model", f"'{model}'", choices(model, MODELS))
-    if noise not in NOISE:
-        raise InputError("noise", f"'{noise}'", choices(noise, NOISE))
-    kinds = NOISE[noise]
-    if model == "geometry":  # without the families joints would take gravity for noise
-        kinds = tuple(kind for kind in kinds if kind != "joint")
-    return kinds

@@ -176,7 +176,14 @@ class LackOfFit:
             count = max(round(self.spare), 0)
             degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
             return [f"{rms}; {degrees} too few to tell what it consists of. Measure more configurations."]
-        lines = [f"{rms} ({_division(self)})."]
+        parts = [f"measurement noise {_size(self, self.instrument)}"]
+        if self.repeatable:
+            parts.append(f"missing effects {_size(self, self.repeatable)}")
+        if self.robot > NEGLIGIBLE * self.instrument:
+            parts.append(f"repeatability {_size(self, self.robot)}")
+            if self.joint > NEGLIGIBLE * self.robot:
+                parts[-1] += f", of it {_size(self, self.joint)} from the joints"
+        lines = [f"{rms} ({', '.join(parts)})."]
         for family, effect in self.present.items():
             size = ""
             if effect.rms is not None:
@@ -263,7 +270,13 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     share = 0.0
     if best.families:
         share = max(total - sum(part**2 for part in after.values()), 0.0) / total
-    present = _present(compared)
+    group = [family_of(name) for name in compared.own]
+    present = {}
+    for family, terms in OWNED.items():
+        members = np.isin(group, terms)
+        gain = compared.rise_without(members) if members.any() else 0.0
+        if gain > SPEAK:
+            present[family] = Effect(gain, _beyond_geometry(compared, members))
     again, freedom = _repeated(problem, result.x, dimension)
     excess = 0.0
     if again is not None:
@@ -330,20 +343,6 @@ def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
         else:
             squares["position"] += own**2 * float(np.sum(which))
     return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
-
-
-def _present(compared: Comparison) -> Mapping[str, Effect]:
-    """Return the extensions of the result's own model that are worth more than `SPEAK`, with what they do."""
-    group = [family_of(name) for name in compared.own]
-    owned = {family: np.isin(group, terms) for family, terms in OWNED.items()}
-    found = {}
-    for family, members in owned.items():
-        if not members.any():
-            continue
-        gain = compared.rise_without(members)
-        if gain > SPEAK:
-            found[family] = Effect(gain, _beyond_geometry(compared, members))
-    return found
 
 
 def _beyond_geometry(compared: Comparison, members: np.ndarray) -> float | None:
@@ -461,18 +460,6 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
 def _size(found: LackOfFit, value: float) -> str:
     unit, si = UNITS[found.dimension]
     return f"{value / si:.3g} {unit}"
-
-
-def _division(found: LackOfFit) -> str:
-    """Say by what a new reading would differ from the model."""
-    said = [f"measurement noise {_size(found, found.instrument)}"]
-    if found.repeatable:
-        said.append(f"missing effects {_size(found, found.repeatable)}")
-    if found.robot > NEGLIGIBLE * found.instrument:
-        said.append(f"repeatability {_size(found, found.robot)}")
-        if found.joint > NEGLIGIBLE * found.robot:
-            said[-1] += f", of it {_size(found, found.joint)} from the joints"
-    return ", ".join(said)
 
 
 def _limit(found: LackOfFit) -> list[str]:

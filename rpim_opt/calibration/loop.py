@@ -217,7 +217,11 @@ class Loop:
         if state.damping > 0 and (short or nothing):
             return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
         state = replace(state, idle=state.idle + 1 if nothing else 0)
-        if state.choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED or self._stalled(state)):
+        stalled = False  # many iterations together have changed the objective by no more than its accuracy
+        if len(state.history) > STALLED and state.history[-STALLED].weight == state.choice.weight:
+            limit = accuracy if np.isfinite(best) else STALLED * accuracy
+            stalled = state.history[-STALLED].objective - state.merit <= limit
+        if state.choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED or stalled):
             return replace(state, outcome="rest")
         if state.choice.waiting and state.damping == 0 and length <= NEAR_FIRST:
             return self.answered(replace(state, idle=0))
@@ -235,7 +239,13 @@ class Loop:
             return self._accepted(state, candidate, z, after, short)
         state = replace(state, refused=state.refused + 1)
         hopeless = state.refused > MANY_REFUSED and promised <= DECREASE * max(abs(state.merit), 1.0)
-        return _refused(state, short or nothing or hopeless)
+        if short or nothing or hopeless:  # none was promised: the loop is at rest
+            if state.choice.settled:
+                return replace(state, outcome="rest")
+            return replace(state, choice=state.choice.after(0.0))
+        if damping > DAMPING_MOST or not np.isfinite(damping):
+            return replace(state, outcome="stuck")
+        return state
 
     def _promised(self, state: State) -> tuple[Array, float]:
         """Return the minimum (n,) of the convex program, and by how much it lowers the objective."""
@@ -313,15 +323,6 @@ class Loop:
         size = max(size, 1.0)  # an interior point's accuracy is absolute below one squared sigma
         return INTERIOR * size, BEST * size
 
-    def _stalled(self, state: State) -> bool:
-        """Whether many iterations together have changed the objective by no more than its accuracy."""
-        if len(state.history) <= STALLED or state.history[-STALLED].weight != state.choice.weight:
-            return False
-        accuracy, best = self._accuracy(state)
-        if not np.isfinite(best):
-            accuracy = STALLED * accuracy
-        return state.history[-STALLED].objective - state.merit <= accuracy
-
 
 def merit(program: Program, z: Array, weight: float) -> float:
     """Return the nonlinear objective at the z (n,) of a linearization, and what missing ``largest`` costs."""
@@ -345,17 +346,6 @@ def _damping(state: State, gain: float, promised: float, z: Array) -> float:
         if damping * effect <= DAMPING_LEAST * promised:
             return 0.0
     return damping
-
-
-def _refused(state: State, nothing: bool) -> State:
-    """Return the state after a step that does not lower the objective; where none was promised, it is at rest."""
-    if nothing and state.choice.settled:
-        return replace(state, outcome="rest")
-    if nothing:
-        return replace(state, choice=state.choice.after(0.0))
-    if state.damping > DAMPING_MOST or not np.isfinite(state.damping):
-        return replace(state, outcome="stuck")
-    return state
 
 
 # --- the loop ---------------------------------------------------------------------------------------------------------

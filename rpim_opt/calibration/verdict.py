@@ -105,7 +105,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
     if np.mean(~kept) > EXCLUDED:
         reasons.append(f"{(~kept).sum()} of {len(kept)} rows are outliers, more than {EXCLUDED:.0%}.")
-    reasons += [*_worse(result), *_held_out(result), *_computed(result), *causes]
+    reasons += [*_worse(result), *_computed(result), *causes]
     return Verdict(tuple(dict.fromkeys(reasons)))
 
 
@@ -177,7 +177,16 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
         np.where(kept, result.errors(dimension=each), np.nan) for each in ("length", "angle", "pixel")
     )
     ratio = max(noise_ratio(problem, lengths), noise_ratio(problem, pixels, "pixel"))
-    share = rms(lengths) / _length(problem)
+    longest = 0.0  # of the arms stretched out [m], prismatic joints as far as they were measured
+    for robot in problem.arms.values():
+        sliding = np.array(robot.joint_dimensions) == "length"
+        stroke = np.zeros(robot.dof)
+        for part in problem.rows() if sliding.any() else ():
+            for block in part.data.blocks:
+                if block.q.shape[-1] == robot.dof:
+                    stroke = np.maximum(stroke, np.abs(block.q).max(axis=(0, 1)))
+        longest = max(longest, float(np.abs(robot.mdh[:, [1, 3]]).sum() + stroke[sliding].sum()))
+    share = rms(lengths) / longest
     if ratio > NOISY and share > REACH:
         yield (
             f"Residual RMS {three_digits(1e3 * rms(lengths))} mm: {three_digits(ratio)} times the stated noise and "
@@ -189,20 +198,6 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
             f"Residual RMS {three_digits(1e3 * rms(angles))} mrad: {three_digits(ratio)} times the stated noise; a "
             f"robot's own effects stay below {1e3 * ANGULAR:g} mrad."
         )
-
-
-def _length(problem: Source) -> float:
-    """Return the length of the longest arm stretched out [m], prismatic joints as far as they were measured."""
-    longest = 0.0
-    for robot in problem.arms.values():
-        sliding = np.array(robot.joint_dimensions) == "length"
-        stroke = np.zeros(robot.dof)
-        for part in problem.rows():
-            for block in part.data.blocks:
-                if sliding.any() and block.q.shape[-1] == robot.dof:
-                    stroke = np.maximum(stroke, np.abs(block.q).max(axis=(0, 1)))
-        longest = max(longest, float(np.abs(robot.mdh[:, [1, 3]]).sum() + stroke[sliding].sum()))
-    return longest
 
 
 def _repeatability(result: Outcome) -> Iterator[str]:
@@ -245,7 +240,7 @@ def _deviations(result: Outcome) -> Iterator[str]:
 
 
 def _worse(result: Outcome) -> Iterator[str]:
-    """Say that the robot misses the identification rows by more than the nominal one: a penalty far too heavy."""
+    """Say that the robot misses rows by more than the nominal one: by a far too large weight, or held-out ones."""
     nominal, identified = result.nominal_errors(), result.errors()
     if worse_than_nominal(nominal, identified):
         yield (
@@ -253,16 +248,11 @@ def _worse(result: Outcome) -> Iterator[str]:
             f"{three_digits(1e3 * rms(identified))} mm against "
             f"{three_digits(1e3 * rms(nominal))} mm: too large a weight."
         )
-
-
-def _held_out(result: Outcome) -> Iterator[str]:
-    """Say that the robot misses held-out rows by more than the nominal one."""
-    held = result.record.held_out
+    held, validation = result.record.held_out, result.record.validation
     if held is not None:
         nominal, identified = held.nominal, held.error
-    elif result.record.validation is not None:
-        nominal = result.nominal_errors(result.record.validation)
-        identified = result.errors(result.record.validation)
+    elif validation is not None:
+        nominal, identified = result.nominal_errors(validation), result.errors(validation)
     else:
         return
     if worse_than_nominal(nominal, identified):
@@ -278,25 +268,18 @@ def _computed(result: Outcome) -> Iterator[str]:
         return
     errors = result.nominal_errors()
     nominal = rms(errors[measured])
+    rounding: list[float] = []  # RMS error [m] that it makes, nothing beyond four decimals of a millimetre
+    for block in (block for part in problem.rows() for block in part.data.blocks):
+        lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
+        decimals = decimals_of(1e3 * block.y[:, lengths]) if lengths else None
+        rounding.append(0.0 if decimals is None else 1e-3 * 10.0**-decimals * np.sqrt(len(lengths) / 12))
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
         yield (
             f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, far below the stated noise: they look "
             "computed from it, not measured."
         )
-    elif nominal < ROUNDED * _rounding(problem):
+    elif min(rounding) > 0 and nominal < ROUNDED * max(rounding):
         yield (
             f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, no more than their rounding: they look "
             "computed from it, or have too few decimals to calibrate it."
         )
-
-
-def _rounding(problem: Source) -> float:
-    """Return the RMS error [m] that rounding of measured lengths makes; zero beyond four decimals of a millimetre."""
-    largest = 0.0
-    for block in (block for part in problem.rows() for block in part.data.blocks):
-        lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
-        decimals = decimals_of(1e3 * block.y[:, lengths]) if lengths else None
-        if decimals is None:
-            return 0.0
-        largest = max(largest, 1e-3 * 10.0**-decimals * np.sqrt(len(lengths) / 12))
-    return largest

@@ -13,7 +13,6 @@ from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS
-from rpim_opt.calibration.diagnosis import Held
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
 from rpim_opt.calibration.verdict import Verdict, rms
@@ -167,7 +166,13 @@ def weight_lines(result: Outcome) -> list[str]:
 def remarks(result: Outcome) -> list[str]:
     """Say what a reader must know besides the figures: outliers, active bounds, what did not converge."""
     lines = _outlying(result)
-    lines += [_bound(result, held) for held in result.held[:MOST_BOUNDS]]
+    for held in result.held[:MOST_BOUNDS]:
+        unit, si = display(result.problem.parameters.dimension_of(held.name))
+        tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
+        lines.append(
+            f"Active bound: {held.name} at {held.bound / si:+.3g} {unit}. Loosening its tolerance by {tenth} would "
+            f"lower the whitened RMS by {held.gain:.2g}."
+        )
     beyond = np.flatnonzero(np.abs(result.x) > 1.001 * result.problem.parameters.free.tolerance)
     if len(beyond):
         names = listed([result.problem.parameters.free.names[i] for i in beyond])
@@ -197,15 +202,6 @@ def _outlying(result: Outcome) -> list[str]:
     if len(together) < len(flagged) and result.squared_loss:
         lines.append("A squared loss lets outliers pull the fit: use formulation 'robust', or exclude them.")
     return lines
-
-
-def _bound(result: Outcome, held: Held) -> str:
-    unit, si = display(result.problem.parameters.dimension_of(held.name))
-    tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
-    return (
-        f"Active bound: {held.name} at {held.bound / si:+.3g} {unit}. Loosening its tolerance by {tenth} would lower "
-        f"the whitened RMS by {held.gain:.2g}."
-    )
 
 
 # --- hyperparameters --------------------------------------------------------------------------------------------
@@ -240,16 +236,33 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         if own_name(name) == EXPANSION and EXPANSION in learned.sizes:
             per_kelvin = 1e6 * stated * learned.sizes[EXPANSION].value * value
             expansion.append(f"{per_kelvin:.3g} um per metre and kelvin")
+    sessions = []  # a coordinate and an axis
+    for dimension, group in SESSIONS.items():
+        if group in learned.sizes:
+            turn = dimension == "angle"
+            of = [of_session(name) and own_name(name).rpartition("_")[2].startswith("r") == turn for name in names]
+            scale = learned.stated[of.index(True)]
+            sessions.append(_figure_or_bound(learned.sizes[group], 1e3 * scale, "mrad" if turn else "mm"))
     lines = [
         _said("Estimated prior scale", groups),
         _said("Estimated scale of model extensions", deflections),
         _said("Transmission error of joints (1 sigma)", curves),
         _said("Robot repeatability (1 sigma)", parts),
         _said("Measurement noise", instrument),
-        _said("Session offsets (1 sigma)", _sessions(learned, names)),
+        _said("Session offsets (1 sigma)", sessions),
         _said("Thermal expansion", expansion),
-        _model(learned),
     ]
+    if learned.trials:
+        gains = {family: learned.gain(family) for trial in learned.trials for family in trial.families}
+        supported = [f"{family} {gain:.0f}" for family, gain in gains.items() if gain is not None and gain >= 0.5]
+        evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
+        model = f"Model: the data support no extension{evidence}."
+        if learned.families:
+            model = (
+                f"Model: geometry with {joined(learned.families)}{evidence}. `compensate` uses the whole model; files "
+                "of controllers hold geometry alone, and `export` states the error of what it writes."
+            )
+        lines.append(model)
     ratio = np.abs(z) * learned.local
     for i in np.argsort(-ratio)[:MOST]:
         if ratio[i] > UNUSUAL:
@@ -279,35 +292,6 @@ def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
     if size.spread <= VAGUE:
         return _figure(size, factor, unit)
     return f"at most {factor * size.value * np.exp(ONE_SIDED * size.spread):.2g} {unit} (95 % confidence)"
-
-
-def _sessions(learned: Learned, names: tuple[str, ...]) -> list[str]:
-    """Say the standard deviation of session offsets, a coordinate and an axis."""
-    said = []
-    for dimension, group in SESSIONS.items():
-        if group not in learned.sizes:
-            continue
-        turn = dimension == "angle"
-        scale = next(
-            s for name, s in zip(names, learned.stated, strict=True)
-            if of_session(name) and own_name(name).rpartition("_")[2].startswith("r") == turn
-        )  # fmt: skip
-        said.append(_figure_or_bound(learned.sizes[group], 1e3 * scale, "mrad" if turn else "mm"))
-    return said
-
-
-def _model(learned: Learned) -> str:
-    if not learned.trials:
-        return ""
-    gains = {family: learned.gain(family) for trial in learned.trials for family in trial.families}
-    supported = [f"{family} {gain:.0f}" for family, gain in gains.items() if gain is not None and gain >= 0.5]
-    evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
-    if not learned.families:
-        return f"Model: the data support no extension{evidence}."
-    return (
-        f"Model: geometry with {joined(learned.families)}{evidence}. `compensate` uses the whole model; files of "
-        "controllers hold geometry alone, and `export` states the error of what it writes."
-    )
 
 
 # --- tables -----------------------------------------------------------------------------------------------------

@@ -57,24 +57,6 @@ def test_descent_falls_at_every_step() -> None:
 def test_all_end_where_the_data_decide() -> None:
     want = baselines.gauss_newton(PROBLEM).x
     assert baselines.levenberg_marquardt(PROBLEM).x == pytest.approx(want, rel=1e-4, abs=1e-9)
-    one, more = baselines.extended_kalman_filter(PROBLEM), baselines.extended_kalman_filter(PROBLEM, passes=4)
-    assert (one.iterations, more.iterations) == (1, 4)
-    tikhonov = ro.calibrate(PROBLEM, ro.tikhonov, 1.0).x
-    assert more.x == pytest.approx(tikhonov, rel=1e-6, abs=1e-10)
-    two = baselines.extended_kalman_filter(PROBLEM, passes=2)
-    left = [float(np.linalg.norm((found.x - tikhonov) / SCALE)) for found in (one, two, more)]
-    m = PROBLEM.linearize(0 * SCALE)
-    linear = np.linalg.solve(m.A.T @ m.A + np.eye(len(SCALE)), m.A.T @ m.b)
-    assert left[0] < 0.5 * np.linalg.norm(linear - tikhonov / SCALE)  # linearized anew at every configuration
-    assert left[1] < 0.1 * left[0]
-
-
-def test_a_kalman_filter_of_linear_data_is_ridge_regression() -> None:
-    """One pass over data that are almost linear: the order does not matter, the prior is one scale."""
-    near, _ = simulated(("a[234]", "d5"), noise=1e-6, sigma=1e-4, size=0.01)
-    m = near.linearize(np.zeros(4))
-    want = np.linalg.solve(m.A.T @ m.A + np.eye(4), m.A.T @ m.b) * near.parameters.free.scale
-    assert baselines.extended_kalman_filter(near).x == pytest.approx(want, rel=1e-2, abs=1e-8)
 
 
 def test_too_few_equations_are_said() -> None:

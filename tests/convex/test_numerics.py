@@ -155,14 +155,6 @@ def test_baselines_agree_where_the_data_decide() -> None:
     assert np.abs(baselines.linear_least_squares(problem).x / scale - want).max() < 0.05
 
 
-def test_an_iterated_kalman_filter_is_tikhonov_with_weight_one() -> None:
-    problem, _ = simulated(noise=5e-5)
-    scale = problem.parameters.free.scale
-    want = ro.calibrate(problem, ro.tikhonov, 1.0).x
-    assert np.abs((baselines.extended_kalman_filter(problem, 8).x - want) / scale).max() < 1e-8
-    assert np.abs((baselines.extended_kalman_filter(problem).x - want) / scale).max() < 0.5
-
-
 def test_a_constraint_that_does_not_bind_changes_nothing_at_weak_directions() -> None:
     rng = np.random.default_rng(0)
     U, V = (np.linalg.qr(rng.normal(size=(k, 8)))[0] for k in (40, 8))
