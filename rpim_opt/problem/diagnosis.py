@@ -845,37 +845,30 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
         "combinations are identified better than by their prior scales. Touches do not identify the base frame and the "
         "offset of the first joint."
     )
-    drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
-    known = {problem.labels[i] for block in drawn for i in block.row}
-    alone = _scale(problem, problem.without(known).linearize(x).A)
-    if alone is None:
+    jacobian = problem.slopes(x, centred=False)[1]
+    slopes = [jacobian[index].mean(axis=0) * problem.parameters.free.scale for index in touches.rows]
+    relative = []  # slopes of distances between touched places, in parts of these
+    for (one, at), (other, there) in combinations(zip(slopes, problem.touched, strict=True), 2):
+        apart = there.centre - at.centre
+        length = float(np.linalg.norm(apart))
+        if length > CLOSE:
+            relative.append(apart @ (other - one) / length**2)
+
+    def known_to(A: Array) -> str:
+        C = np.linalg.inv(A.T @ A + np.eye(len(x)))
+        return f"{1e3 * np.sqrt(np.mean([g @ C @ g for g in relative])):.2g} mm in a metre"
+
+    if not relative:
         yield "All touched points are in one place: the size of the robot rests on its nominal lengths."
         return
+    drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
+    known = {problem.labels[i] for block in drawn for i in block.row}
+    by_touches = known_to(problem.without(known).linearize(x).A)
     distances = "Distances between touched places: known to"
-    by_touches = f"{1e3 * alone:.2g} mm in a metre"
     if known:
-        with_known = f"{1e3 * (_scale(problem, model.A) or alone):.2g} mm in a metre"
-        yield f"{distances} {with_known}, and to {by_touches} without the stated distances."
+        yield f"{distances} {known_to(model.A)}, and to {by_touches} without the stated distances."
     else:
         yield (
             f"{distances} {by_touches} by touches and the scales of the file; a known distance between two of them "
             "([[known_distance]]) would determine the size of the robot."
         )
-
-
-def _scale(problem: CalibrationProblem, A: Array) -> float | None:
-    """Return the relative standard deviation of distances between touched places; None for a single one."""
-    free = problem.parameters.free
-    jacobian = problem.slopes(np.zeros(len(free)), centred=False)[1]
-    places = [thing.centre for thing in problem.touched]
-    rows = problem.touches.rows if problem.touches else ()
-    slopes = [jacobian[index].mean(axis=0) * free.scale for index in rows]
-    C = np.linalg.inv(A.T @ A + np.eye(A.shape[1]))
-    squares = []
-    for i, j in combinations(range(len(places)), 2):
-        apart = places[j] - places[i]
-        length = float(np.linalg.norm(apart))
-        if length > CLOSE:
-            g = apart @ (slopes[j] - slopes[i]) / length**2
-            squares.append(float(g @ C @ g))
-    return float(np.sqrt(np.mean(squares))) if squares else None

@@ -59,22 +59,6 @@ class Points:
         """How far the points spread [m]."""
         return max(float(np.linalg.norm(self.y.std(axis=0))), 1e-12)
 
-    @property
-    def targets(self) -> tuple[Array, Array, np.ndarray]:
-        """Joint values (K, dof), positions (K, 3) and reflectors (K,): of poses also the tips of their axes."""
-        if self.turns is None:
-            return self.q, self.y, self.marker
-        tips = self.y[:, None] + LEVER * self.extent * np.swapaxes(self.turns, 1, 2)
-        y = np.concatenate([self.y[:, None], tips], axis=1).reshape(-1, 3)
-        return np.repeat(self.q, 4, axis=0), y, (4 * self.marker[:, None] + np.arange(4)).ravel()
-
-    @property
-    def stated(self) -> tuple[Array, Array]:
-        """Stated places (M, 3) of the reflectors of `targets` [m], and their standard deviations (M,) [m]."""
-        if self.turns is None:
-            return self.tools, np.full(len(self.tools), TOOL_ERROR)
-        return np.repeat(self.tools, 4, axis=0), np.tile([TOOL_ERROR, *3 * [10 * TOOL_ERROR]], len(self.tools))
-
 
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
     """Return the measured points of positions, poses and a camera's views; None where there are too few."""
@@ -140,12 +124,23 @@ class Candidates(NamedTuple):
 
     @classmethod
     def of(cls, robot: Robot, tries: Sequence[Points]) -> Candidates:
-        """Return candidates of as many points each, joint zeros and reflectors as they are stated."""
-        targets = [points.targets for points in tries]
-        q, y, marker = (np.stack(each) for each in zip(*targets, strict=True))
-        stated, spread = tries[0].stated
-        tools = np.stack([points.stated[0] for points in tries])
-        return cls(q @ robot.joint_map.T, y, marker, np.zeros((len(y), len(robot.mdh))), tools, stated, spread)
+        """Return candidates of as many points each, joint zeros and reflectors as they are stated.
+
+        Of poses the tips of their axes are points of further reflectors.
+        """
+        q, y, marker, tools = (
+            np.stack([getattr(points, name) for points in tries]) for name in ("q", "y", "marker", "tools")
+        )
+        B, M, _ = tools.shape
+        spread = np.full(M, TOOL_ERROR)
+        turns = [LEVER * points.extent * points.turns for points in tries if points.turns is not None]
+        if turns:
+            axes = np.swapaxes(np.stack(turns), 2, 3)
+            q, tools = q.repeat(4, axis=1), tools.repeat(4, axis=1)
+            y = np.concatenate([y[:, :, None], y[:, :, None] + axes], axis=2).reshape(B, -1, 3)
+            marker = (4 * marker[:, :, None] + np.arange(4)).reshape(B, -1)
+            spread = np.tile([TOOL_ERROR, *3 * [10 * TOOL_ERROR]], M)
+        return cls(q @ robot.joint_map.T, y, marker, np.zeros((B, len(robot.mdh))), tools, tools[0], spread)
 
     def take(self, index: np.ndarray) -> Candidates:
         """Return the candidates at ``index``."""
