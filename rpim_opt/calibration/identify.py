@@ -13,13 +13,14 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.text import counted
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Statement
-from rpim_opt.calibration.at_weight import calibrated
-from rpim_opt.calibration.loop import Iteration, Options, nearby, require_finite, require_start
+from rpim_opt.calibration.certificate import DECREASE
+from rpim_opt.calibration.loop import ROUNDS, Ended, Iteration, Options, minimize, nearby, require_finite, require_start
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.select import Selector, weight_of
@@ -37,6 +38,11 @@ NOISE = {
 }
 """Parts of the noise that are estimated, by the option's name."""
 MODELS = ("geometry", "auto")
+LEVEL = 1e-9
+"""Relative fall of the objective over five iterations below which it hardly changes."""
+FAR = 1000.0
+"""Deviations in prior standard deviations beyond which a fit without a penalty is called divergent."""
+DIVERGES = "poorly identifiable combinations diverge without a penalty"
 ZERO = 0.1
 """Standard deviation [rad] of a joint's zero that was found from the data."""
 ELSEWHERE = "The stated frames are far from their registration; deviations count from the registered frames."
@@ -164,22 +170,74 @@ def calibrate(
     if weight is None and formulation.penalty is None:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
+    learned = None
     if weight is None:
         found = estimate(problem, estimator, model, start)
+        problem, weight, start, learned = found.problem, 1.0, found.x, found.learned
         formulation = found.stated.penalized(formulation)
-        result = calibrated(found.problem, formulation, 1.0, start=found.x, options=options)
-        result = replace(result, learned=found.learned)
     else:
         if model == "auto":
             problem = with_extensions(problem, estimate(problem, estimator, model, start))
         if prior is not None:
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
-        result = calibrated(problem, formulation, weight, start=start, options=options)
-    message = " ".join(
-        filter(None, [result.message, ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""])
-    )
+    ended = minimize(problem, formulation, weight, start, options)
+    choice = ended.state.choice
+    said = [ending(ended, max_iterations), ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""]
+    message = " ".join(filter(None, said))
     LOGGER.info(message)
-    return replace(result, message=message, asked=mapped_as(mapping, asked), mapping=mapping)
+    return Calibration(
+        problem=problem,
+        formulation=formulation,
+        x=ended.x,
+        weight=choice.weight,
+        selection=choice.selection,
+        converged=ended.converged,
+        message=message,
+        history=ended.state.history,
+        program=ended.state.program,
+        certificate=ended.certificate,
+        asked=mapped_as(mapping, asked),
+        learned=learned,
+        mapping=mapping,
+    )
+
+
+def ending(ended: Ended, most: int) -> str:
+    """Say how the loop ended within so many iterations, and why."""
+    state = ended.state
+    iterations = counted(len(state.history), "iteration")
+    if not ended.settled:
+        what = "the positions that constraints bound still change; give a larger weight"
+        return f"Not converged: after {ROUNDS} rounds {what}."
+    if ended.converged and ended.rounds > 1:
+        return f"Converged after {iterations} in {ended.rounds} rounds, positions linear about the solution."
+    if ended.converged:
+        text = f"Converged after {iterations}."
+        if state.choice.weight == 0 and np.abs(state.z).max(initial=0.0) > FAR:
+            text += f" Deviations exceed {FAR:g} prior standard deviations: {DIVERGES}; add one."
+        return " ".join(filter(None, [text, state.choice.note]))
+    if state.outcome == "rest":
+        decrease = ended.certificate.decrease
+        why = f"the constraints are violated by {ended.certificate.violation:.1g} scales."
+        if decrease is None:
+            why = "the convex program at the end could not be solved again, so that the solution is not certified."
+        elif decrease > DECREASE:
+            why = f"the convex program at the end still predicts a decrease by {decrease:.1g} of the objective."
+    elif state.outcome == "stuck":
+        why = (
+            "no step lowers the nonlinear objective, however short; the formulation may have no minimum here, or the "
+            "start is far away."
+        )
+    else:
+        why = f"{counted(most, 'iteration')} {'was' if most == 1 else 'were'} not enough"
+        last = [iteration.objective for iteration in state.history[-5:]]
+        if len(last) == 5 and last[0] - last[-1] <= LEVEL * abs(last[-1]):
+            why += ", though the objective hardly changes: the data hardly determine the solution; use a larger weight."
+        elif state.choice.weight == 0 and most > 1:
+            why += f": {DIVERGES}; add one."
+        else:
+            why += "; allow more (max_iterations)."
+    return " ".join(filter(None, [f"Not converged: {why}", state.choice.note]))
 
 
 def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:

@@ -318,28 +318,7 @@ def improvement(result: Outcome) -> Improvement | None:
 
 
 def _slopes(result: Outcome) -> tuple[Array, Array]:
-    """Return the slopes of flange positions less what fitting base and tool takes back, (3 W, n) and (W, 3, n)."""
-    machine, columns = _at_flange(result)
-    q = within_ranges(machine)
-    p = predicted(machine, q).position
-    J = np.zeros((len(p), 3, len(result.x)))
-    J[:, :, columns] = moved(machine, q).slope
-    D = J.reshape(-1, J.shape[2])
-    p = p - p.mean(axis=0)
-    turning = np.zeros((len(p), 3, 3))
-    turning[:, [0, 1, 2], [1, 2, 0]] = p[:, [2, 0, 1]]
-    turning[:, [0, 1, 2], [2, 0, 1]] = -p[:, [1, 2, 0]]
-    nominal = dict(zip(machine.parameters.names, machine.parameters.nominal, strict=True))
-    base = numeric_frame([nominal[f"base_{c}"] for c in FRAME])
-    along = base[:3, :3] @ forward_kinematics(require_robot(machine), q)[:, :3, :3]
-    fitting = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
-    U = np.linalg.qr(fitting)[0]
-    D = D - U @ (U.T @ D)
-    return D, D.reshape(J.shape)
-
-
-def _at_flange(result: Outcome) -> tuple[Machine, np.ndarray]:
-    """Return the machine with its reflectors at the flange, where it was linearized, and which columns of x it has.
+    """Return the slopes of flange positions less what fitting base and tool takes back, (3 W, n) and (W, 3, n).
 
     Several problems of `together` are one machine where they share all that is identified of the joints.
     """
@@ -357,4 +336,20 @@ def _at_flange(result: Outcome) -> tuple[Machine, np.ndarray]:
     nominal = np.where(tools, 0.0, of_robot.nominal)
     at = np.where(tools[of_robot.identified], 0.0, result.x[columns])
     data = problem.alone(robot).data
-    return Machine(problem.arms[robot], replace(of_robot, nominal=nominal), data, at=at), columns
+    machine = Machine(problem.arms[robot], replace(of_robot, nominal=nominal), data, at=at)
+    q = within_ranges(machine)
+    p = predicted(machine, q).position
+    J = np.zeros((len(p), 3, len(result.x)))
+    J[:, :, columns] = moved(machine, q).slope
+    D = J.reshape(-1, J.shape[2])
+    p = p - p.mean(axis=0)
+    turning = np.zeros((len(p), 3, 3))
+    turning[:, [0, 1, 2], [1, 2, 0]] = p[:, [2, 0, 1]]
+    turning[:, [0, 1, 2], [2, 0, 1]] = -p[:, [1, 2, 0]]
+    values = dict(zip(of_robot.names, nominal, strict=True))
+    base = numeric_frame([values[f"base_{c}"] for c in FRAME])
+    along = base[:3, :3] @ forward_kinematics(require_robot(machine), q)[:, :3, :3]
+    fitting = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
+    U = np.linalg.qr(fitting)[0]
+    D = D - U @ (U.T @ D)
+    return D, D.reshape(J.shape)

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.at_weight import uncertified, unfinished
 from rpim_opt.calibration.certificate import Certificate, certified
-from rpim_opt.calibration.loop import Iteration, Loop, Options, State, begun, merit
+from rpim_opt.calibration.identify import ending
+from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State, begun, merit
 from rpim_opt.calibration.weight_choice import weight_choice
 from rpim_opt.problem.linear import LinearModel
 from tests.simulate import simulated
@@ -231,21 +231,32 @@ def test_three_idle_passes_are_enough_and_two_are_not() -> None:
 # --- what is said ------------------------------------------------------------------------------------------
 
 
+CERTIFIED = Certificate(None, 1.0, 0.0, 0.0)
+
+
+def unfinished(most: int, history: tuple[Iteration, ...]) -> str:
+    return ending(Ended(state(history=history), np.zeros(N), CERTIFIED), most)
+
+
+def uncertified(evidence: Certificate) -> str:
+    return ending(Ended(state(outcome="rest"), np.zeros(N), evidence), 8)
+
+
 def test_why_passes_ran_out() -> None:
     falling = tuple(Iteration(100.0 - k, 1.0, 1.0, 0.0) for k in range(8))
-    assert unfinished(state(history=falling), 8) == "8 iterations were not enough; allow more (max_iterations)."
+    assert unfinished(8, falling) == "Not converged: 8 iterations were not enough; allow more (max_iterations)."
     level = tuple(Iteration(100.0 - 2e-8 * k, 1.0, 1.0, 0.0) for k in range(8))
-    flat = unfinished(state(history=level), 8)
+    flat = unfinished(8, level)
     assert flat == (
-        "8 iterations were not enough, though the objective hardly changes: the data hardly determine the solution; "
-        "use a larger weight."
+        "Not converged: 8 iterations were not enough, though the objective hardly changes: the data hardly determine "
+        "the solution; use a larger weight."
     )
-    assert unfinished(state(history=level[:4]), 1) == "1 iteration was not enough; allow more (max_iterations)."
+    assert unfinished(1, level[:4]) == "Not converged: 1 iteration was not enough; allow more (max_iterations)."
     slowly = tuple(Iteration(100.0 - 1e-6 * k, 1.0, 1.0, 0.0) for k in range(8))
-    assert "allow more" in unfinished(state(history=slowly), 8)
+    assert "allow more" in unfinished(8, slowly)
     late = (*falling, *level)
-    assert "hardly determine" in unfinished(state(history=late), 16)
-    assert "allow more" in unfinished(state(history=(*level, *falling)), 16)
+    assert "hardly determine" in unfinished(16, late)
+    assert "allow more" in unfinished(16, (*level, *falling))
 
 
 def test_why_a_loop_at_rest_has_not_converged() -> None:

@@ -11,9 +11,9 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import words
-from rpim_opt.calibration.at_weight import ending
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import Flag, Held, Price
+from rpim_opt.calibration.identify import ending
 from rpim_opt.calibration.loop import Ended, State
 from tests.calibration.test_loop import state
 
