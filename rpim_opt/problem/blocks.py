@@ -14,12 +14,12 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import counted
-from rpim_opt.basics.threads import on_all_cores, one_blas_thread, phase
+from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.data.dataset import Dataset, whole_configurations
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.problem.linear import LinearModel, Reweigh, from_triangle, reduced_models, reduced_rows
+from rpim_opt.problem.linear import LinearModel, Reweigh, reduced_models
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem, RobotModel
 from rpim_opt.robot.mdh import Robot
@@ -27,9 +27,7 @@ from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
 from rpim_opt.robot.parameters import Parameters
 
 ROWS = 4096
-"""Rows that are weighed and reduced together, of losses that are no squares."""
-FEW = 1024
-"""Rows that are evaluated and reduced together: as many as a core's cache holds."""
+"""Rows that are evaluated, weighed and reduced together."""
 KEPT = 200_000
 """Equations up to which a calibration keeps its rows, wherever they stand; beyond, only their QR factor."""
 Part = Callable[[], Dataset]
@@ -40,21 +38,11 @@ Part = Callable[[], Dataset]
 def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
     """Return the model of ``problem.linearize(x)`` as its QR factor: n + 1 equations, the same |A z - b| for every z.
 
-    Rows are evaluated, whitened and reduced `FEW` at a time, so that memory does not grow with their number; where a
-    loss weighs them by their residuals at x (n,) [SI], `ROWS` at a time, whole configurations.
+    Rows are evaluated, whitened and reduced `ROWS` at a time, whole configurations, so that memory does not grow with
+    their number.
     """
-    if reweigh is not None:
-        groups = whole_configurations(problem.data, ROWS)
-        return reduced_models(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
-    R, equations = None, 0
-    for rows in problem.equations(x, FEW):
-        equations += len(rows)
-        with phase("reduction"):
-            R = reduced_rows(rows, R)
-    if R is None:
-        raise InputError("data", "no row", "at least one")
-    R[:, -1] += R[:, :-1] @ (x / problem.parameters.free.scale)  # of [A r] that of [A b], b = r + A z
-    return from_triangle(problem.model_of(R[:, :-1], R[:, -1], np.zeros(len(R), dtype=int)), R, equations)
+    groups = whole_configurations(problem.data, ROWS) if len(problem.data) else ()
+    return reduced_models(problem.on(problem.data.take(rows)).linearize(x, reweigh) for rows in groups)
 
 
 @dataclass(frozen=True, eq=False, repr=False)

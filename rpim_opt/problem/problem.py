@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.basics.threads import phase
-from rpim_opt.data.dataset import Block, Dataset, whole_configurations
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import READY
@@ -391,7 +391,7 @@ class CalibrationProblem(RobotModel):
             for robot in self.arms
         }
 
-    def _evaluated(self, block: Block, what: str, x: Array, part: slice = slice(None)) -> list[Array]:
+    def _evaluated(self, block: Block, what: str, x: Array) -> list[Array]:
         """Return the results of one of the functions for rows of a block at x (n,), (N, ...) each."""
         if block not in self._arguments:
             prefixes = self._sessions[block.robot]
@@ -400,7 +400,7 @@ class CalibrationProblem(RobotModel):
             self._arguments[block] = np.hstack([*loads_in(self.arms[block.robot], block), *shifted, block.y])
         function = self.functions(block)[what]
         with phase("evaluation"):
-            return evaluate_rows(function, [x, self.parameters.nominal], self._arguments[block][part])
+            return evaluate_rows(function, [x, self.parameters.nominal], self._arguments[block])
 
     def _values(self, block: Block, what: str, x: Array) -> Array:
         return self._evaluated(block, what, x)[0][:, 0]
@@ -511,44 +511,28 @@ class CalibrationProblem(RobotModel):
             What weighs the equations by their residuals there, or None.
         """
         z = x / self.parameters.free.scale
-        both = np.concatenate(list(self.equations(x, len(self.data))))
-        A = np.ascontiguousarray(both[:, :-1]) if self._shares_noise else np.asfortranarray(both[:, :-1])
-        model = self.model_of(A, both[:, -1] + A @ z, self.groups)
+        scale = np.append(self.parameters.free.scale, 1.0)
+        if self._shares_noise:
+            residual, jacobian = self.slopes(x)
+            both = self._whitened(self.contrasts(np.column_stack([jacobian, residual]) * scale))
+            A = np.ascontiguousarray(both[:, :-1])
+        else:
+            parts = []
+            for block, L in zip(self.data.blocks, self._whitening, strict=True):
+                residual, jacobian = self._evaluated(block, "jacobian", x)
+                part = np.empty((len(scale), *residual.shape[::2]))  # a column of all equations is dense
+                _times(L, jacobian, scale[:-1], part[:-1].transpose(1, 2, 0))
+                _times(L, residual.transpose(0, 2, 1), 1.0, part[-1:].transpose(1, 2, 0))
+                parts.append(part.reshape(len(scale), -1).T)
+            both = np.concatenate(parts)
+            A = np.asfortranarray(both[:, :-1])
+        kinds = [block.measurement for block in self.data.blocks]
+        constrained = any(not kind.columns and not kind.touching for kind in kinds)
+        model = LinearModel(A, both[:, -1] + A @ z, self.groups, self._identified, constrained)
         if reweigh is None:
             return model
         weighed, offset = reweigh(model, z)
         return replace(weighed, offset=offset)
-
-    def equations(self, x: Array, most: int) -> Iterator[Array]:
-        """Yield the whitened, scaled equations [A r] (m', n + 1) at x (n,) [SI], of at most so many rows together.
-
-        Where rows of a configuration share noise, they are whole configurations.
-        """
-        scale = np.append(self.parameters.free.scale, 1.0)
-        if not self._shares_noise:
-            for block, L in zip(self.data.blocks, self._whitening, strict=True):
-                for start in range(0, len(block.row), most):
-                    part = slice(start, start + most)
-                    residual, jacobian = self._evaluated(block, "jacobian", x, part)
-                    whitening = L if len(L) == 1 else L[part]
-                    both = np.empty((len(scale), *residual.shape[::2]))  # a column of all equations is dense
-                    _times(whitening, jacobian, scale[:-1], both[:-1].transpose(1, 2, 0))
-                    _times(whitening, residual.transpose(0, 2, 1), 1.0, both[-1:].transpose(1, 2, 0))
-                    yield both.reshape(len(scale), -1).T
-            return
-        parts = [np.arange(len(self.data))]
-        if len(self.data) > most:
-            parts = whole_configurations(self.data, most)
-        for rows in parts:
-            problem = self if len(parts) == 1 else self.on(self.data.take(rows))
-            residual, jacobian = problem.slopes(x)
-            yield problem._whitened(problem.contrasts(np.column_stack([jacobian, residual]) * scale))
-
-    def model_of(self, A: Array, b: Array, group: np.ndarray) -> LinearModel:
-        """Return the linear model of equations A (m, n), b (m,), and the numbers of their configurations (m,)."""
-        kinds = [block.measurement for block in self.data.blocks]
-        constrained = any(not kind.columns and not kind.touching for kind in kinds)
-        return LinearModel(A, b, group, self._identified, constrained)
 
     @cached_property
     def _identified(self) -> Identified:
