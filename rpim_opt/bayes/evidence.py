@@ -406,7 +406,12 @@ class Evidence:
         if len(heavy):
             # the others' variances stay: their share of the information is taken out once
             light = np.setdiff1d(np.arange(len(v)), heavy)
-            S, g = _without(H, h, own / v, heavy, light)
+            S, g = H[heavy][:, heavy], h[heavy]
+            if len(light):  # by Cholesky's factor: an inverse loses all digits where frames are nearly free
+                factor, d = _factored(H[light][:, light], (own / v)[light])
+                right = np.column_stack([H[light][:, heavy], h[light]]) * d[:, None]
+                Y = solve_triangular(factor, right, lower=True, check_finite=False)
+                S, g = S - Y[:, :-1].T @ Y[:, :-1], g - Y[:, :-1].T @ Y[:, -1]
             v[heavy] = self._local(S, g, size2[heavy], local, accuracy)
         return *_posterior(H, h, own / v), v
 
@@ -513,19 +518,6 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
             if np.abs(step).max() <= LONGEST_COUPLED:
                 return np.asarray(step, dtype=float)
     return change / (1 - np.minimum(M.diagonal() / (weighed * v), STEEPEST))
-
-
-def _without(H: Array, h: Array, precision: Array, kept: np.ndarray, others: np.ndarray) -> tuple[Array, Array]:
-    """Return the information on some deviations, and its product with their mean, where the others are integrated.
-
-    By Cholesky's factor: an inverse loses all digits where frames are nearly free.
-    """
-    if not len(others):
-        return H, h
-    factor, d = _factored(H[others][:, others], precision[others])
-    right = np.column_stack([H[others][:, kept], h[others]]) * d[:, None]
-    Y = solve_triangular(factor, right, lower=True, check_finite=False)
-    return H[kept][:, kept] - Y[:, :-1].T @ Y[:, :-1], h[kept] - Y[:, :-1].T @ Y[:, -1]
 
 
 # --- what tails add to covariances ------------------------------------------------------------------------------

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -355,29 +355,17 @@ def camera_remarks(result: Outcome) -> list[str]:
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
 
-class Scatter(NamedTuple):
-    """How far the touches of a point or plane are from it: RMS before and after calibration, and the largest [m]."""
+def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str, Any], ...]:
+    """Return how far the touches of every point or plane are from it [mm], the worst first, from errors (N,) [m].
 
-    name: str
-    touches: int
-    nominal: float
-    identified: float
-    largest: float
-
-    def content(self) -> dict[str, Any]:
-        """Return the figures [mm]."""
-        lengths = {"nominal_rms_mm": self.nominal, "rms_mm": self.identified, "max_mm": self.largest}
-        return {"name": self.name, "count": self.touches, **{key: 1e3 * value for key, value in lengths.items()}}
-
-
-def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[Scatter, ...]:
-    """Return the scatter of every point or plane that rows touched, the worst first, from errors (N,) [m]."""
+    By its name: how many, their RMS before and after calibration, and the largest.
+    """
     found = []
     for name, rows in _touched(data):
-        before = float(np.sqrt(np.mean(nominal[rows] ** 2)))
-        after = float(np.sqrt(np.mean(error[rows] ** 2)))
-        found.append(Scatter(name, len(rows), before, after, float(error[rows].max())))
-    return tuple(sorted(found, key=lambda each: -each.identified))
+        before, after = 1e3 * nominal[rows], 1e3 * error[rows]
+        lengths = {"nominal_rms_mm": rms(before), "rms_mm": rms(after), "max_mm": float(after.max())}
+        found.append({"name": name, "count": len(rows), **lengths})
+    return tuple(sorted(found, key=lambda each: -each["rms_mm"]))
 
 
 def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
@@ -391,18 +379,16 @@ def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
         yield name, np.array(of)
 
 
-def scatter_rows(found: Sequence[Scatter]) -> list[list[str]]:
+def scatter_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the rows of a table [mm] under `HEADER`: the worst points, and how many others there are."""
     rows = []
     for each in found[:MOST_POINTS]:
-        lengths = (each.nominal, each.identified, each.largest)
-        rows.append([each.name, str(each.touches), *(f"{1e3 * value:.3f}" for value in lengths)])
+        lengths = [f"{each[key]:.3f}" for key in ("nominal_rms_mm", "rms_mm", "max_mm")]
+        rows.append([each["name"], str(each["count"]), *lengths])
     others = found[MOST_POINTS:]
     if others:
-        largest = max(each.largest for each in others)
-        rows.append(
-            [f"{len(others)} others", str(sum(each.touches for each in others)), "", "", f"{1e3 * largest:.3f}"]
-        )
+        touches, largest = sum(each["count"] for each in others), max(each["max_mm"] for each in others)
+        rows.append([f"{len(others)} others", str(touches), "", "", f"{largest:.3f}"])
     return rows
 
 

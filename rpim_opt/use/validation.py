@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -16,7 +16,7 @@ from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import worse_sentence, worse_than_nominal
-from rpim_opt.calibration.words import HEADER, Scatter, contact_remarks, known_points, scatter, scatter_rows
+from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import shared_rows
 
@@ -45,7 +45,7 @@ class Validation:
     outside
         Rows beyond the joint ranges that the calibration measured.
     touched
-        How far touches are from their points and planes, the worst first.
+        How far touches are from their points and planes, the worst first, as documents [mm].
     remarks
         What a reader of the errors has to know: of touches, and that the calibration is not delivered.
     mistake
@@ -61,7 +61,7 @@ class Validation:
     allowed: Array
     coverage: float | None = None
     outside: Outside = field(default_factory=Outside)
-    touched: tuple[Scatter, ...] = ()
+    touched: tuple[Mapping[str, Any], ...] = ()
     remarks: tuple[str, ...] = ()
     mistake: str = ""
 
@@ -93,7 +93,7 @@ class Validation:
             "beyond": [self.label[i] for i in self.beyond],
             "coverage95": self.coverage,
             "outside": [self.label[i] for i in self.outside.rows],
-            "touched": [each.content() for each in self.touched],
+            "touched": [dict(each) for each in self.touched],
             "remarks": self.remarks,
             "mistake": self.mistake,
             "worse": self.worse,

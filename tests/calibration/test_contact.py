@@ -109,17 +109,17 @@ def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path)
     folder = Path(__file__).parents[2] / "problems" / problem
     data, *_ = ro.use.read_measurements(result, folder / "validation.csv")
     found = ro.use.validate(result, data)
-    assert [each.identified for each in found.touched] == sorted((e.identified for e in found.touched), reverse=True)
+    assert [each["rms_mm"] for each in found.touched] == sorted((e["rms_mm"] for e in found.touched), reverse=True)
     names = data.blocks[0].touched[:, 0]
     for each in found.touched:
-        mine = names == each.name
-        assert each.touches == mine.sum()
-        assert each.identified == pytest.approx(np.sqrt(np.mean(result.errors(data)[mine] ** 2)))
+        mine = names == each["name"]
+        assert each["count"] == mine.sum()
+        assert each["rms_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(result.errors(data)[mine] ** 2)))
         if problem == "contact":
             reached = result.forward(data.q[mine])[:, :3, 3]
             away = np.linalg.norm(reached - reached.mean(axis=0), axis=1)
             # touches count in units of how far all of them spread on the nominal robot
-            assert each.largest == pytest.approx(away.max(), rel=0.01)
+            assert each["max_mm"] == pytest.approx(1e3 * away.max(), rel=0.01)
     assert "Error of a touch" in str(found)
     assert "touches by point" in str(found)
     assert "Not held out" not in str(found)

@@ -107,8 +107,8 @@ def test_a_point_is_in_one_fold_whoever_touched_it(cell) -> None:
     data = problem.data
     assert len(np.unique(data.configuration)) == len(SOCKETS)
     found = scatter(data, np.zeros(len(data)), np.ones(len(data)))
-    assert sorted(each.name for each in found) == sorted(SOCKETS)
-    assert {each.touches for each in found} == {8}
+    assert sorted(each["name"] for each in found) == sorted(SOCKETS)
+    assert {each["count"] for each in found} == {8}
 
 
 def test_a_known_distance_joins_points_of_two_arms(cell) -> None:
