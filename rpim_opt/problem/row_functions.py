@@ -107,19 +107,14 @@ def _derived(inputs: list[ca.SX], outputs: list[ca.SX]) -> Functions:
     }
 
 
-@lru_cache(maxsize=16)
-def _places(names: tuple[str, ...], identified: bytes, absent: bytes) -> tuple[dict[str, int], dict[str, int]]:
-    """Return the places of nominal values that are not zero, and of deviations of what is identified."""
-    there = np.flatnonzero(~np.frombuffer(absent, dtype=bool))
-    free = np.flatnonzero(np.frombuffer(identified, dtype=bool))
-    return {names[i]: int(i) for i in there}, {names[i]: k for k, i in enumerate(free)}
-
-
 class _Parameters:
     """The parameters of a row by name: symbols are taken as asked for, since a row sees few of many."""
 
     def __init__(self, of: Structure) -> None:
-        self._start, self._free = _places(of.names, of.identified, of.absent)
+        there = np.flatnonzero(~np.frombuffer(of.absent, dtype=bool))
+        free = np.flatnonzero(np.frombuffer(of.identified, dtype=bool))
+        self._start = {of.names[i]: int(i) for i in there}  # nominal values that are not zero, or identified
+        self._free = {of.names[i]: k for k, i in enumerate(free)}
         self.x = ca.SX.sym("x", len(self._free))
         self.nominal = ca.SX.sym("nominal", len(of.names))
 

@@ -26,15 +26,12 @@ def read(text: str) -> Rows:
             raise InputError("the JSON text", "lists of several lengths", "an array of rows, or columns of one length")
         found = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
     elif isinstance(found, dict):
-        inner = [value for value in found.values() if isinstance(value, list) and value and all(map(_is_object, value))]
+        lists = [value for value in found.values() if isinstance(value, list) and value]
+        inner = [value for value in lists if all(isinstance(row, dict) for row in value)]
         found = inner[0] if len(inner) == 1 else [found]
-    if not all(map(_is_object, found)):
+    if not all(isinstance(row, dict) for row in found):
         raise InputError("the JSON text", "an array of other things", "an array of objects, one a row")
     return [dict(_flat("", row)) for row in found]
-
-
-def _is_object(value: Any) -> bool:
-    return isinstance(value, dict)
 
 
 def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
