@@ -152,12 +152,6 @@ def triangle_of(A: Array, b: Array) -> Array:
     return reduce(lambda R, other: reduced_rows(other, R), on_all_cores(block, range(0, max(len(b), 1), most)))
 
 
-def from_triangle(like: LinearModel, R: Array, equations: int, offset: float = 0.0) -> LinearModel:
-    """Return the linear model of a QR factor R (n+1, n+1) of [A b], which had so many equations."""
-    group = np.zeros(len(R), dtype=int)
-    return replace(like, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)
-
-
 def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
     """Reduce the equations of models, at least one, to one QR factor, which stands for them all."""
     R, equations, offset, last = None, 0, 0.0, None
@@ -168,7 +162,8 @@ def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
             R = reduced_rows(np.column_stack([last.A, last.b]), R)
     if last is None or R is None:
         raise InputError("data", "no row", "at least one")
-    return from_triangle(last, R, equations, offset)
+    group = np.zeros(len(R), dtype=int)
+    return replace(last, A=R[:, :-1], b=R[:, -1], group=group, stands_for=equations, offset=offset)
 
 
 Reweigh = Callable[[LinearModel, Array], tuple[LinearModel, float]]

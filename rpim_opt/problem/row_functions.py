@@ -56,10 +56,6 @@ class Structure(NamedTuple):
     several: bool = False
     sessions: tuple[str, ...] = ()
 
-    def is_pure(self, measurement: Measurement) -> bool:
-        """Return whether the functions depend on nothing but what is stated here."""
-        return measurement in _READY and all(term.ready for term in self.terms)
-
 
 class Kept:
     """Functions of rows: of ready measurements built once, of a user's by the answer that it gave when first asked.
@@ -73,7 +69,7 @@ class Kept:
 
     def __call__(self, structure: Structure, measurement: Measurement) -> Functions:
         """Return the functions as they were when they were first asked for."""
-        if structure.is_pure(measurement):
+        if measurement in _READY and all(term.ready for term in structure.terms):  # they depend on nothing else
             return _ready(structure, measurement)
         with SYMBOLS:
             if (structure, measurement) not in self.answers:
