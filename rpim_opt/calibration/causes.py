@@ -8,7 +8,6 @@ from typing import cast
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
@@ -93,7 +92,23 @@ def likely_causes(result: Outcome) -> list[str]:
         for figure, ratio in zip(figures, ratios, strict=True)
         if ratio > NOISY
     ]
-    signs += [*_curves(result), *_large(result, problem)]
+    learned, free = result.learned, problem.parameters.free
+    if learned is not None and learned.curves is not None:  # beyond those of gears, or no transmission errors at all
+        size, ratio = learned.curves.size.value, result.noise_test().ratio
+        if size > LARGEST_CURVE:
+            signs.append(f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)")
+        if ratio > NOISY:
+            noise = f"{three_digits(ratio)} times the stated noise"
+            signs.append(f"residuals {noise}, the freedom of transmission errors counted")
+    # no drawing is as wrong as that; what was learned to be large is not what was expected
+    expected = free.scale if learned is None else learned.stated
+    largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
+    share = np.abs(result.x) / np.maximum(largest, SCALES * expected)
+    share[problem.parameters.of_frames[problem.parameters.identified]] = 0.0
+    worst = int(np.argmax(share))
+    if share[worst] > 1:
+        unit = "mm" if free.dimensions[worst] == "length" else "mrad"
+        signs.append(f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}")
     head: list[str] = []
     causes: list[str] = []
     if signs:
@@ -119,33 +134,18 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return [*rows_without_values(problem), better.sentence]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
     found = found or list(moved(problem, result.x))
-    found = found or list(transmission(*_geometry(result, problem)))
+    if not found:
+        alone, x = problem, result.x
+        if result.learned is not None and result.learned.added:  # curves take up ratios and scales of all kinds
+            p = problem.parameters
+            alone = problem.identifying(p.identified & ~np.isin(p.names, result.learned.added))
+            x = settled(alone)
+        found = list(transmission(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be
         return found
     return list(part_way(ordered)) or list(odd_columns(problem)) or list(unrelated_rows(problem, error))
-
-
-def _curves(result: Outcome) -> Iterator[str]:
-    """Say that transmission errors are beyond those of gears, or take up what is no transmission error."""
-    if result.learned is None or result.learned.curves is None:
-        return
-    size, ratio = result.learned.curves.size.value, result.noise_test().ratio
-    if size > LARGEST_CURVE:
-        yield f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)"
-    if ratio > NOISY:
-        yield f"residuals {three_digits(ratio)} times the stated noise, the freedom of transmission errors counted"
-
-
-def _geometry(result: Outcome, problem: CalibrationProblem) -> tuple[CalibrationProblem, Array]:
-    """Return the problem without model extensions, and its solution: curves take up ratios and scales of all kinds."""
-    added = () if result.learned is None else result.learned.added
-    if not added:
-        return problem, result.x
-    p = problem.parameters
-    alone = problem.identifying(p.identified & ~np.isin(p.names, added))
-    return alone, settled(alone)
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:
@@ -198,19 +198,3 @@ def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
     yield from rows_without_values(problem)
     if len(problem.arms) == 1:
         yield from exchanged_rows(problem)
-
-
-def _large(result: Outcome, problem: CalibrationProblem) -> list[str]:
-    """Return the robot's parameter that deviates most, where no drawing is as wrong as that."""
-    free = problem.parameters.free
-    expected = free.scale
-    if result.learned is not None:  # what was learned to be large is not what was expected
-        expected = result.learned.stated
-    largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
-    share = np.abs(result.x) / np.maximum(largest, SCALES * expected)
-    share[problem.parameters.of_frames[problem.parameters.identified]] = 0.0
-    worst = int(np.argmax(share))
-    if share[worst] <= 1:
-        return []
-    unit = "mm" if free.dimensions[worst] == "length" else "mrad"
-    return [f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}"]

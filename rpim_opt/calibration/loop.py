@@ -223,7 +223,8 @@ class Loop:
             stalled = state.history[-STALLED].objective - state.merit <= limit
         if state.choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED or stalled):
             return replace(state, outcome="rest")
-        if state.choice.waiting and state.damping == 0 and length <= NEAR_FIRST:
+        waiting = state.choice.settled and not state.choice.final and not state.choice.answers
+        if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
             return self.answered(replace(state, idle=0))
         z = self._curved(state, straight)
         candidate = state.program.on(self.linearized(z, state.z))

@@ -53,11 +53,6 @@ class WeightChoice:
             return self
         return replace(self, weight=NEUTRAL, settled=True)
 
-    @property
-    def waiting(self) -> bool:
-        """Whether a rule is to be asked where the weight that the loop began with leads."""
-        return self.settled and not self.final and not self.answers
-
     def asked(self, program: Program) -> WeightChoice:
         """Return what the rule makes of a program, unless the weight is settled."""
         if self.settled or self.rule is None:
@@ -86,7 +81,15 @@ class WeightChoice:
         if self.final:
             return self
         again = replace(self, settled=False).asked(program)
-        apart = SAME_ROBUST if self.robust and program.closed_form else _resolution(again.selection)
+        apart = SAME  # by how much logarithms of weights differ that a rule tells apart
+        found = again.selection
+        if self.robust and program.closed_form:
+            apart = SAME_ROBUST
+        elif found is not None and found.interior:  # an answer from a grid is no closer than its neighbours
+            order = np.sort(found.weights)
+            place = int(np.searchsorted(order, found.weight))
+            if 0 < place < len(order) - 1 and order[place] == found.weight and order[place - 1] > 0:
+                apart = float(np.clip(0.5 * np.log(order[place + 1] / order[place - 1]), SAME, SAME_SEARCH))
         if self.answers and _same(again.weight, self.weight, apart):
             return replace(self, settled=True, final=True, note=again.note)
         return again
@@ -125,18 +128,6 @@ def _same(one: float, other: float, apart: float = SAME) -> bool:
     if one <= 0 or other <= 0:
         return one == other
     return abs(np.log(one / other)) <= apart
-
-
-def _resolution(selection: Selection | None) -> float:
-    """Return by how much logarithms of weights differ that a rule tells apart: an answer from a grid is no closer."""
-    if selection is None or not selection.interior:
-        return SAME
-    order = np.sort(selection.weights)
-    place = int(np.searchsorted(order, selection.weight))
-    if not 0 < place < len(order) - 1 or order[place] != selection.weight or order[place - 1] <= 0:
-        return SAME
-    between = 0.5 * float(np.log(order[place + 1] / order[place - 1]))
-    return float(np.clip(between, SAME, SAME_SEARCH))
 
 
 def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
