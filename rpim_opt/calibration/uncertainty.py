@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.covariance import NoiseTest, coverage_factor, position_noise, scattered
+from rpim_opt.calibration.covariance import coverage_factor, position_noise, scattered
 from rpim_opt.calibration.outcome import Outcome, Prediction
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.terms import transmission
@@ -80,16 +80,6 @@ class Uncertainty(Tabled):
         half = self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
         return np.column_stack([self.result.x - half, self.result.x + half])
 
-    def noise_test(self) -> NoiseTest:
-        """Compare the residuals with the stated noise: RSS against chi^2 with m - dof degrees of freedom.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> print(ro.calibration.Uncertainty(result).noise_test().verdict)
-        Residuals agree with the stated measurement noise (ratio 1.02).
-        """
-        return self.result.noise_test()
-
     def predict(self, q: Array, marker: str = "", **arguments: Any) -> Prediction:
         """Return what `Calibration.predict` does, with the confidence's coverage factor; arguments as for it.
 
@@ -152,7 +142,7 @@ class Uncertainty(Tabled):
 
     def _notes(self) -> list[str]:
         lines = [
-            self.noise_test().verdict,
+            self.result.noise_test().verdict,
             f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
         ]
         if any(row["held_back"] for row in self._frame_rows()):

@@ -66,7 +66,7 @@ def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     ],
 )
 def test_the_noise_is_judged_by_its_distribution(variance: float, said: str) -> None:
-    test = stand_in(60, 20.0, variance).noise_test()
+    test = stand_in(60, 20.0, variance).result.noise_test()
     upper = chi2.sf(40 * variance, 40)
     assert test.probability == pytest.approx(2 * min(upper, 1 - upper), rel=1e-9)
     assert test.ratio == pytest.approx(np.sqrt(variance), rel=1e-12)
@@ -77,15 +77,15 @@ def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
     for tail in (0.005, 0.995):
         edge = chi2.ppf(tail, 40) / 40
         inner, outer = (edge * (1 + by * (0.5 - tail)) for by in (1e-6, -1e-6))
-        assert "agree with the stated measurement noise (" in stand_in(60, 20.0, inner).noise_test().verdict
-        assert "agree with the stated measurement noise (" not in stand_in(60, 20.0, outer).noise_test().verdict
+        assert "agree with the stated measurement noise (" in stand_in(60, 20.0, inner).result.noise_test().verdict
+        assert "agree with the stated measurement noise (" not in stand_in(60, 20.0, outer).result.noise_test().verdict
 
 
 @pytest.mark.parametrize(("left", "tells"), [(0.0, False), (0.9, False), (1.0, True), (1.5, True)])
 def test_what_few_equations_tell(left: float, tells: bool) -> None:
     u = stand_in(20, 20.0 - left, 1.0)
     assert u.result.freedom == pytest.approx(left, abs=1e-12)
-    test = u.noise_test()
+    test = u.result.noise_test()
     assert ("No degree of freedom is left" in test.verdict) != tells
     if not tells:
         assert (test.ratio, test.probability) == (1.0, 1.0)
