@@ -27,7 +27,7 @@ import rpim_opt as ro
 from rpim_opt.basics.text import markdown
 from rpim_opt.basics.threads import clock, cores, on_all_cores, one_blas_thread
 from rpim_opt.convex.formulation import FORMULATIONS
-from rpim_opt.problem.blocks import ROWS, PartitionedProblem, on_cluster, partitions, reduced
+from rpim_opt.problem.blocks import ROWS, PartitionedProblem, partitions, reduced
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.study import Metric, Report
@@ -287,8 +287,12 @@ def _cluster(count: int) -> dict[str, Any]:
             Client(cluster) as client,
         ):
             start = time.perf_counter()
+
+            def compute(task: Any, each: Any) -> Any:
+                return client.gather(client.map(task, list(each), pure=False))
+
             spread = PartitionedProblem(
-                problem.robot, problem.parameters, problem.sample().data, problem.parts, on_cluster(client)
+                problem.robot, problem.parameters, problem.sample().data, problem.parts, compute
             )
             result = ro.calibrate(spread, ro.tikhonov, ro.reml)
             seconds = time.perf_counter() - start
