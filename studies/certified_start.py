@@ -205,12 +205,24 @@ def _another(rng: np.random.Generator, flange: Any, measured: Any, base: Any, to
 def _closed_forms(flange: Any, measured: Any) -> dict[str, tuple[np.ndarray, np.ndarray]]:
     """Return base and tool by every closed form that has an answer."""
     found = {}
-    for name, method in zip(CLOSED, (ro.problem.hand_eye, _li, _park), strict=True):
+    for name, method in zip(CLOSED, (_shah, _li, _park), strict=True):
         try:
             found[name] = method(flange, measured)
-        except (ro.InputError, np.linalg.LinAlgError):
+        except np.linalg.LinAlgError:
             continue
     return found
+
+
+def _shah(flange: Any, measured: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Take rotations from one singular value decomposition (Shah 2013, J. Mechanisms and Robotics 5:031007)."""
+    # R_B = R_Z R_A R_X, so that sum_i R_B kron R_A maps vec(R_X') to N vec(R_Z)
+    K = np.einsum("nij,nkl->ikjl", measured[:, :3, :3], flange[:, :3, :3]).reshape(9, 9)
+    U, s, Vt = np.linalg.svd(K)
+    if s[1] > (1 - 1e-6) * s[0]:
+        raise np.linalg.LinAlgError("rotations about one axis only")
+    V, W = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)  # R_Z and R_X', up to one common factor
+    sign = np.sign(np.linalg.det(V))
+    return _with_translations(flange, measured, _proper(sign * V), _proper(sign * W).T)
 
 
 def _li(flange: Any, measured: Any) -> tuple[np.ndarray, np.ndarray]:

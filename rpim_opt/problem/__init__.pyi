@@ -1,6 +1,5 @@
 from .blocks import PartitionedProblem as PartitionedProblem
 from .blocks import Source as Source
-from .blocks import on_cluster as on_cluster
 from .blocks import partitions as partitions
 from .design import Design as Design
 from .design import Observability as Observability
@@ -16,7 +15,6 @@ from .problem import CalibrationProblem as CalibrationProblem
 from .registration.camera import view_pose as view_pose
 from .registration.certified import CertifiedStart as CertifiedStart
 from .registration.certified import certified_hand_eye as certified_hand_eye
-from .registration.closed_forms import hand_eye as hand_eye
 from .registration.closed_forms import register as register
 from .registration.frames import fitted_frames as fitted_frames
 from .registration.frames import problem_from as problem_from

@@ -62,7 +62,8 @@ class PartitionedProblem(RobotModel):
     parts
         Functions that read the blocks, at least one; `partitions` makes them from files.
     compute
-        Like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or `on_cluster` (client).
+        Like the built-in ``map``, in any order of execution: ``ThreadPoolExecutor().map``, or with a client of a Dask
+        cluster ``lambda task, parts: client.gather(client.map(task, list(parts), pure=False))``.
         By default files of `partitions` are read and reduced on all cores, while functions of a script are called one
         after the other. Each block has one QR factor, so that no digit depends on who computed it.
     dropped
@@ -153,11 +154,7 @@ class PartitionedProblem(RobotModel):
             parts.append(part.data)
         if not parts:
             raise InputError("data", "no row", "at least one")
-        first = np.cumsum([0, *(len(data) for data in parts)])
-        pairs = zip(parts, first, strict=False)
-        blocks = tuple(replace(block, row=block.row + start) for data, start in pairs for block in data.blocks)
-        labels = tuple(label for data in parts for label in data.label)
-        return self.on(Dataset(blocks, labels, np.concatenate([data.configuration for data in parts])))
+        return self.on(Dataset.concatenated(parts, [str(i) for i in range(len(parts))]))
 
     @property
     def labels(self) -> tuple[str, ...]:
@@ -245,19 +242,8 @@ def partitions(
 ) -> tuple[Part, ...]:
     """Return functions that read the files, each a table as `read_data` takes it, of a few hundred thousand rows.
 
-    A configuration's rows stand in one file. Parquet is read fastest.
-
-    Parameters
-    ----------
-    paths
-        Tables; at least one.
-    robot, noise, measurement
-        As for `read_data`.
-
-    Raises
-    ------
-    InputError
-        For no paths; when a part is read, as `read_data`.
+    A configuration's rows stand in one file. Parquet is read fastest. Other arguments as for `read_data`; InputError
+    for no paths, and when a part is read.
 
     Examples
     --------
@@ -270,25 +256,3 @@ def partitions(
     if not paths:
         raise InputError("paths", "no file", "at least one")
     return tuple(partial(read_data, Path(path), robot, noise, measurement) for path in paths)
-
-
-def on_cluster(client: Any) -> Callable[..., Iterable[Any]]:
-    """Return a ``compute`` for `PartitionedProblem` that lets the workers of a Dask cluster read and reduce the parts.
-
-    Parameters
-    ----------
-    client
-        A ``distributed.Client``.
-
-    Examples
-    --------
-    With ``from distributed import Client`` and the address of the cluster's scheduler::
-
-        compute = ro.problem.on_cluster(Client("tcp://10.0.0.7:8786"))
-        problem = ro.problem.PartitionedProblem(robot, parameters, parts[0](), parts, compute)
-    """
-
-    def compute(task: Callable[[Any], Any], parts: Sequence[Any]) -> list[Any]:
-        return client.gather(client.map(task, list(parts), pure=False))
-
-    return compute

@@ -45,14 +45,6 @@ class Design(Brief):
     gap
         bound over value as efficiencies, minus 1: 0.01 means that no set is more than 1 % better. D counts per
         parameter, det^(1/n).
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> design = ro.problem.choose(problem, ro.problem.random_candidates(problem.robot, 60), count=30, criterion="D")
-    >>> len(design.chosen), design.gap < 0.02, design.value < design.bound
-    (30, True, True)
     """
 
     chosen: np.ndarray
@@ -78,16 +70,8 @@ class Design(Brief):
 def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator = 0, share: float = 1.0) -> Array:
     """Return joint values (count, dof) [rad or m], uniform in the middle of every joint's range.
 
-    Parameters
-    ----------
-    robot
-        Its limits have to be finite: InputError otherwise.
-    count
-        How many configurations.
-    seed
-        Of the draws, or a generator to draw from.
-    share
-        Which part of every joint's range is used, from 0 to 1.
+    ``seed`` is that of the draws, or a generator to draw from; ``share`` which part of every joint's range is used,
+    from 0 to 1. InputError for a joint without limits.
 
     Examples
     --------
@@ -144,25 +128,10 @@ def choose(
     The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
     any set can reach. The largest weights are rounded and improved by exchanges (Fedorov 1972).
 
-    Parameters
-    ----------
-    problem
-        Gives robot, parameters, scales and noise; the first block of its data says what is measured.
-    candidates
-        (M, dof) joint values of the controller that could be measured.
-    count
-        How many to choose.
-    criterion
-        One of ``D``, ``A``, ``V``.
-    progress
-        Told what goes on.
-    measured
-        Rows that are there already, which M then counts, too.
-
-    Raises
-    ------
-    InputError
-        For another criterion, a count that the candidates do not allow, or measurements between two points.
+    The problem gives robot, parameters, scales and noise; the first block of its data says what is measured.
+    ``candidates`` (M, dof) are joint values of the controller that could be measured, ``measured`` rows that are there
+    already, which M then counts, too. InputError for another criterion, a count that the candidates do not allow, or
+    measurements between two points.
 
     Examples
     --------
@@ -171,6 +140,8 @@ def choose(
     >>> design = ro.problem.choose(problem, ro.problem.random_candidates(problem.robot, 60), count=30)
     >>> print(str(design).partition(":")[0])
     30 of 60 configurations, V-optimal (predicted variance)
+    >>> len(design.chosen), design.gap < 0.1, design.value > design.bound
+    (30, True, True)
     """
     if criterion not in CRITERIA:
         raise InputError("criterion", f"'{criterion}'", choices(criterion, CRITERIA))
@@ -359,6 +330,21 @@ class Observability(Brief):
     def _short(self) -> str:
         return f"{self.rank} of {len(self.names)} combinations identifiable, condition {self.condition:.3g}"
 
+    def __str__(self) -> str:
+        """Return what configurations can show, in lines."""
+        indices = ", ".join(f"{name} {value:.3g}" for name, value in self.indices.items())
+        lines = [
+            f"{self.rank} of {len(self.names)} parameter combinations are identifiable, {self.weak} of them less "
+            "precisely than by the prior.",
+            f"Condition {self.condition:.3g} scaled and whitened, {self.raw_condition:.3g} in mm and rad; {indices}.",
+        ]
+        if self.unidentifiable:
+            lines.append(f"Unidentifiable: {', '.join(self.unidentifiable)}.")
+        if self.redundant:
+            named = "; ".join(map(combination, self.redundant))
+            lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")
+        return "\n".join(lines)
+
     @property
     def indices(self) -> dict[str, float]:
         """Observability indices O1 to O5 on the identifiable combinations, larger is better.
@@ -382,13 +368,6 @@ def observe(problem: Source) -> Observability:
 
     It is linearized at nominal, where redundancies are exact. Measured values do not matter, configurations, scales
     and covariance do.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> found = ro.problem.observe(ro.load("paper_arm").problem)
-    >>> f"{found.rank} of {len(found.names)} directions are seen, condition {found.condition:.3g}"
-    '20 of 26 directions are seen, condition 2.87e+03'
     """
     free = problem.parameters.free
     x = np.zeros(len(free))

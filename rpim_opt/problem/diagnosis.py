@@ -17,7 +17,7 @@ from rpim_opt.basics.text import Tabled, counted, joined, listed, table, three_d
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.problem.design import Observability, combination, observe
+from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.misreadings import better_reading, coupling, misfit, placed, signs
 from rpim_opt.problem.noise import Equations
@@ -67,8 +67,6 @@ TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 MOST_EQUATIONS = 3000
 """Equations up to which a change is looked for."""
-CLOSE = 0.05
-"""Places that are nearer [m] say little of the scale."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -94,7 +92,7 @@ class Inspection(Tabled):
     observability
         What the configurations can show.
     contact
-        One sentence each: what touches show, and known distances.
+        One sentence each: what touches show.
 
     Examples
     --------
@@ -102,13 +100,6 @@ class Inspection(Tabled):
     >>> found = ro.problem.inspect(ro.load("paper_arm", variant="misprints").problem)
     >>> found.standing_out, found.observability.rank, len(found.warnings)
     (('T8-6', 'T8-7'), 20, 0)
-    >>> [row["label"] for row in found.content()["standing_out"]]
-    ['T8-6', 'T8-7']
-    >>> lines = str(found).splitlines()
-    >>> print(lines[0])
-     joint   unit      from        to     span   limits   of them
-    >>> print(lines[2])
-     q1       deg    -39.95     40.00    79.95        -         -
     """
 
     problem: CalibrationProblem
@@ -180,7 +171,7 @@ class Inspection(Tabled):
             table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
             table(["measured", "unit", "from", "to", "typical sigma"], measured),
             "\n".join(lines),
-            identifiable_sentences(self.observability),
+            str(self.observability),
             "\n".join(self.contact),
             "\n".join(notes[: len(self.warnings)]),
             "\n".join(notes[len(self.warnings) :]),
@@ -229,35 +220,13 @@ class Inspection(Tabled):
         return list(rows.values())
 
 
-def identifiable_sentences(o: Observability) -> str:
-    """Return what configurations can show, in lines."""
-    indices = ", ".join(f"{name} {value:.3g}" for name, value in o.indices.items())
-    lines = [
-        f"{o.rank} of {len(o.names)} parameter combinations are identifiable, {o.weak} of them less precisely "
-        "than by the prior.",
-        f"Condition {o.condition:.3g} scaled and whitened, {o.raw_condition:.3g} in mm and rad; {indices}.",
-    ]
-    if o.unidentifiable:
-        lines.append(f"Unidentifiable: {', '.join(o.unidentifiable)}.")
-    if o.redundant:
-        named = "; ".join(map(combination, o.redundant))
-        lines.append(f"Redundant combinations, without effect on the data (mm, mrad): {named}.")
-    return "\n".join(lines)
-
-
 def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> Inspection:
     """Look at a problem's data: ranges, coverage, repeated rows, likely mistakes, what can be identified.
 
     Mistakes are units, signs, zeros, orders and couplings of joints, rows that are shifted, exchanged or have no value,
     left-handed frames, another robot, an instrument that moved: another reading of the data that leaves less than a
-    fifth of the position error is named, with what to write.
-
-    Parameters
-    ----------
-    problem
-        In memory.
-    validation
-        The rows that were kept apart, of which none should be an identification row.
+    fifth of the position error is named, with what to write. Of the rows that were kept apart for ``validation`` none
+    should be an identification row.
 
     Examples
     --------
@@ -821,23 +790,11 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 
 
 def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
-    """Yield what the touches of a problem show, and what they do not; nothing where there are none.
-
-    Of the scale it is said how well distances between touched places are known: the root of the mean square over all
-    pairs of
-
-    ::
-
-        sd(|c_2 - c_1|) / |c_2 - c_1|,    var = g'(A'A + 1)^-1 g,    g the slope of the distance by z
-
-    in units of the file's scales, before anything is learned.
-    """
+    """Yield what the touches of a problem show, and what they do not; nothing where there are none."""
     touches = problem.touches
     if touches is None:
         return
-    x = np.zeros(len(problem.parameters.free))
-    model = problem.linearize(x)
-    s = model.svd[1]
+    s = problem.linearize(np.zeros(len(problem.parameters.free))).svd[1]
     kinds = {"points": touches.planar.count(False), "planes": touches.planar.count(True)}
     things = " and ".join(f"{number} {name}" for name, number in kinds.items() if number)
     yield (
@@ -845,30 +802,8 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
         "combinations are identified better than by their prior scales. Touches do not identify the base frame and the "
         "offset of the first joint."
     )
-    jacobian = problem.slopes(x, centred=False)[1]
-    slopes = [jacobian[index].mean(axis=0) * problem.parameters.free.scale for index in touches.rows]
-    relative = []  # slopes of distances between touched places, in parts of these
-    for (one, at), (other, there) in combinations(zip(slopes, problem.touched, strict=True), 2):
-        apart = there.centre - at.centre
-        length = float(np.linalg.norm(apart))
-        if length > CLOSE:
-            relative.append(apart @ (other - one) / length**2)
-
-    def known_to(A: Array) -> str:
-        C = np.linalg.inv(A.T @ A + np.eye(len(x)))
-        return f"{1e3 * np.sqrt(np.mean([g @ C @ g for g in relative])):.2g} mm in a metre"
-
-    if not relative:
-        yield "All touched points are in one place: the size of the robot rests on its nominal lengths."
-        return
-    drawn = [b for b in problem.data.blocks if b.touched is not None and not b.measurement.touching]
-    known = {problem.labels[i] for block in drawn for i in block.row}
-    by_touches = known_to(problem.without(known).linearize(x).A)
-    distances = "Distances between touched places: known to"
-    if known:
-        yield f"{distances} {known_to(model.A)}, and to {by_touches} without the stated distances."
-    else:
+    if all(tie.kind != "known_distance" for tie in touches.ties):
         yield (
-            f"{distances} {by_touches} by touches and the scales of the file; a known distance between two of them "
-            "([[known_distance]]) would determine the size of the robot."
+            "The size of the robot rests on its nominal lengths: a known distance between two touched places "
+            "([[known_distance]]) would determine it."
         )

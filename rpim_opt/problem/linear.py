@@ -1,9 +1,9 @@
-"""A calibration problem linearized: whitened, scaled equations, their QR factor, and whose parameters they have."""
+"""A calibration problem linearized: whitened, scaled equations and their QR factor."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 
 import numpy as np
@@ -14,8 +14,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, counted
 from rpim_opt.basics.threads import on_all_cores, phase
-from rpim_opt.data.dataset import Dataset
-from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10
@@ -168,50 +166,3 @@ def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
 
 Reweigh = Callable[[LinearModel, Array], tuple[LinearModel, float]]
 """``reweigh(model, z)``: some equations whose squares, and a constant, stand at z (n,) for a loss of the model's."""
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Machine:
-    """What positions are predicted from: the nominal robot, all its parameters, and a row of each kind of data.
-
-    They are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
-    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at. ``robot`` is None for several robots.
-    """
-
-    robot: Robot | None
-    parameters: Parameters
-    data: Dataset
-    at: Array | None = None
-    farthest: Array | None = None
-
-
-@dataclass(frozen=True, eq=False, repr=False)
-class Identified(Parameters):
-    """The n identified parameters of a problem, with the machine that they belong to; None for a table alone."""
-
-    machine: Machine | None = None
-
-
-def require_robot(machine: Machine) -> Robot:
-    """Return the machine's robot; InputError where there are several."""
-    if machine.robot is None:
-        raise InputError("positions", "several robots in one problem", "one robot: constraints of `problem.alone(...)`")
-    return machine.robot
-
-
-def identified_of(robot: Robot | None, parameters: Parameters, data: Dataset) -> Identified:
-    """Return the identified parameters of a table, with the machine; of the data one row of each kind."""
-    blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(data.blocks))
-    labels = tuple(f"{data.label[int(block.row[0])]}" for block in data.blocks)
-    few = Dataset(blocks, labels, np.arange(len(blocks)))
-    table = {each.name: getattr(parameters.free, each.name) for each in fields(Parameters)}
-    return Identified(**table, machine=Machine(robot, parameters, few))
-
-
-def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
-    """Return a model that predicts positions linearly about x (n,) [SI], regions at ``farthest``, by default x, too."""
-    known = model.parameters
-    if x is None or not isinstance(known, Identified) or known.machine is None:
-        return model
-    machine = replace(known.machine, at=x, farthest=x if farthest is None else farthest)
-    return replace(model, parameters=replace(known, machine=machine))

@@ -17,7 +17,8 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.closed_forms import hand_eye, transforms
+from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
+from rpim_opt.problem.registration.closed_forms import transforms
 from rpim_opt.problem.registration.frames import FIXTURE, settled, starting_parameters
 from rpim_opt.problem.registration.global_start import described, explained, rms, search
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
@@ -66,10 +67,12 @@ def pose_misfit(robot: Robot, data: Dataset) -> float:
     measured = transforms(block.y)
     flange = forward_kinematics(robot, block.q[:, 0])
     try:
-        Z, X = hand_eye(flange, measured)
-    except InputError:
+        start = certified_hand_eye(flange, measured)
+    except InputError:  # two poses
         return float(np.pi)
-    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (Z @ flange @ X)[:, :3, :3]
+    if start.uncertainty > UNKNOWN:
+        return float(np.pi)
+    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (start.base @ flange @ start.tool)[:, :3, :3]
     return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
 
 

@@ -22,18 +22,9 @@ class Scatter:
     with Sigma as the rows state it and J_theta (k, dof) the slopes by the angles of the revolute joints: a joint that
     stops elsewhere shows in every reflector of a configuration, and the more the longer the lever arm.
 
-    Parameters
-    ----------
-    position
-        Standard deviation of every measured length, apart from the joints' part [m].
-    orientation
-        Of every measured angle [rad].
-    joint
-        Of every revolute joint [rad].
-    instrument
-        By how much the stated noise is multiplied; 1 for as stated.
-    at
-        (P,) values of all parameters at which the joints' slopes are taken [SI]; nominal if there are none.
+    ``position``, ``orientation`` and ``joint`` are standard deviations of every measured length, apart from the joints'
+    part [m], of every measured angle and of every revolute joint [rad]; ``instrument`` multiplies the stated noise.
+    ``at`` (P,) are the values of all parameters at which the joints' slopes are taken [SI], nominal if there are none.
 
     Examples
     --------

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import Any, Self
@@ -20,7 +20,7 @@ from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import READY
 from rpim_opt.problem.contact import Things, Touches, contrasted, of_rows
-from rpim_opt.problem.linear import Identified, LinearModel, Reweigh, identified_of
+from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.noise import Equations, Scatter, Stack, equation_numbers
 from rpim_opt.problem.row_functions import (
     Functions,
@@ -65,16 +65,9 @@ class RobotModel(Tabled):
     def identify(self, patterns: Iterable[str]) -> Self:
         """Return the same problem with just the parameters identified that match one of the patterns.
 
-        Parameters
-        ----------
-        patterns
-            Names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links, Hayati's
-            beta between nearly parallel axes, and the frames that the measurements can tell.
-
-        Raises
-        ------
-        InputError
-            For a pattern that matches no parameter.
+        These are names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links,
+        Hayati's beta between nearly parallel axes, and the frames that the measurements can tell. InputError for a
+        pattern that matches no parameter.
 
         Examples
         --------
@@ -124,20 +117,11 @@ class RobotModel(Tabled):
         return replace(self, scatter=scatter)
 
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> Self:
-        """Return the same problem on an arm that moves by the terms of a model, too.
+        """Return the same problem on an arm that moves by the terms of a model, too, beside those that it has.
 
-        Parameters
-        ----------
-        model
-            The terms, beside those that the robot has. What reads blocks has to read the columns that they see.
-        identify
-            Patterns of the terms' parameters that are identified besides what is; all of them by default.
-
-        Raises
-        ------
-        InputError
-            For a name that the problem has, a pattern that matches none of the new ones, and data without a column
-            that an identified term sees.
+        ``identify`` are patterns of the terms' parameters that are identified besides what is; all of them by default.
+        What reads blocks has to read the columns that terms see. InputError for a name that the problem has, a pattern
+        that matches none of the new ones, and data without a column that an identified term sees.
 
         Examples
         --------
@@ -303,18 +287,10 @@ class CalibrationProblem(RobotModel):
     ) -> CalibrationProblem:
         """Return the same problem with a reflector measured at joint values q (N, dof) [rad or m], all values zero.
 
-        Parameters
-        ----------
-        marker
-            By default that of the first row.
-        torque, payload, columns
-            What the joints bear: (N, dof) [Nm], mass at the flange [kg], one or (N,), further columns by name [SI], one
-            number or (N,). Directions of approach are 0 where the data state them: the joints are in the middle of
-            their backlash.
-        robot
-            Which of several.
-        covariance
-            As `Dataset.of` takes it.
+        The reflector is by default that of the first row, ``robot`` one of several. ``torque`` (N, dof) [Nm],
+        ``payload`` [kg] and further ``columns`` by name [SI], one number or (N,), are what the joints bear. Where
+        the data state directions of approach, the column "approach" (N, dof) holds -1, 0 or 1, by default 0: the joints
+        are in the middle of their backlash. ``covariance`` is as `Dataset.of` takes it.
         """
         if robot not in self.arms:
             raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
@@ -324,6 +300,8 @@ class CalibrationProblem(RobotModel):
         if "qw" in measurement.columns:
             y[:, list(measurement.columns).index("qw")] = 1.0
         sided = any(block.approach is not None for block in self.data.blocks)
+        approach = np.broadcast_to(np.asarray(columns.get("approach", 0.0), dtype=float), q.shape) if sided else None
+        others = {name: each for name, each in columns.items() if name != "approach"}
         data = Dataset.of(
             q,
             y,
@@ -331,8 +309,8 @@ class CalibrationProblem(RobotModel):
             measurement=measurement,
             torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
-            approach=np.zeros(q.shape) if sided else None,
-            columns={name: np.broadcast_to(np.asarray(each, dtype=float), N) for name, each in columns.items()},
+            approach=approach,
+            columns={name: np.broadcast_to(np.asarray(each, dtype=float), N) for name, each in others.items()},
         )
         first = self.data.blocks[0]
         own = first.markers[:1] if marker is None else (marker,)
@@ -437,18 +415,13 @@ class CalibrationProblem(RobotModel):
     # Errors
 
     def errors(self, x: Array, dimension: str = "length") -> Array:
-        """Return the norm of every row's residual, (N,) [m]: for positions and poses the position error.
+        """Return the norm of every row's residual at x (n,) [SI], (N,) [m]: for positions and poses the position error.
 
-        Parameters
-        ----------
-        x
-            (n,) deviations [SI].
-        dimension
-            ``"length"``, or ``"angle"`` for the norm of the angles [rad], for poses the orientation error. Rows without
-            such components get NaN. ``"pixel"``: what cameras are off [px]; their length is by how much the line of
-            sight passes by the point. For touches the length is the distance from the mean of their point's touches,
-            NaN for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of them,
-            which is no measurement.
+        ``dimension`` is ``"length"``, or ``"angle"`` for the norm of the angles [rad], for poses the orientation error.
+        Rows without such components get NaN. ``"pixel"``: what cameras are off [px]; their length is by how much the
+        line of sight passes by the point. For touches the length is the distance from the mean of their point's
+        touches, NaN for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of
+        them, which is no measurement.
 
         Examples
         --------
@@ -501,15 +474,7 @@ class CalibrationProblem(RobotModel):
     # Linearization
 
     def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
-        """Return the whitened, scaled linear model around the deviations x (n,) [SI].
-
-        Parameters
-        ----------
-        x
-            (n,) deviations [SI].
-        reweigh
-            What weighs the equations by their residuals there, or None.
-        """
+        """Return the whitened, scaled linear model around x (n,) [SI], its equations weighed by ``reweigh``, if any."""
         z = x / self.parameters.free.scale
         scale = np.append(self.parameters.free.scale, 1.0)
         if self._shares_noise:
@@ -520,24 +485,26 @@ class CalibrationProblem(RobotModel):
             parts = []
             for block, L in zip(self.data.blocks, self._whitening, strict=True):
                 residual, jacobian = self._evaluated(block, "jacobian", x)
-                part = np.empty((len(scale), *residual.shape[::2]))  # a column of all equations is dense
-                _times(L, jacobian, scale[:-1], part[:-1].transpose(1, 2, 0))
-                _times(L, residual.transpose(0, 2, 1), 1.0, part[-1:].transpose(1, 2, 0))
-                parts.append(part.reshape(len(scale), -1).T)
-            both = np.concatenate(parts)
-            A = np.asfortranarray(both[:, :-1])
+                rows = np.concatenate([jacobian, residual.transpose(0, 2, 1)], axis=2)
+                parts.append(_times(L, rows, scale).reshape(-1, len(scale)))
+            both = np.asfortranarray(np.concatenate(parts))
+            A = both[:, :-1]
         kinds = [block.measurement for block in self.data.blocks]
         constrained = any(not kind.columns and not kind.touching for kind in kinds)
-        model = LinearModel(A, both[:, -1] + A @ z, self.groups, self._identified, constrained)
+        model = LinearModel(A, both[:, -1] + A @ z, self.groups, self.identified, constrained)
         if reweigh is None:
             return model
         weighed, offset = reweigh(model, z)
         return replace(weighed, offset=offset)
 
     @cached_property
-    def _identified(self) -> Identified:
-        only = self.robots if isinstance(self.robots, Robot) else None
-        return identified_of(only, self.parameters, self.data)
+    def identified(self) -> Identified:
+        """The identified parameters, with the problem of one row of each kind, which predicts positions."""
+        blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(self.data.blocks))
+        labels = tuple(f"{self.data.label[int(block.row[0])]}" for block in self.data.blocks)
+        few = replace(self, data=Dataset(blocks, labels, np.arange(len(blocks))))
+        table = {each.name: getattr(self.parameters.free, each.name) for each in fields(Parameters)}
+        return Identified(**table, problem=few)
 
     @cached_property
     def _equations(self) -> Equations:
@@ -679,6 +646,26 @@ class CalibrationProblem(RobotModel):
         return self._slopes_by(joints, max(len(robot.mdh) for robot in self.arms.values()), at)
 
 
+@dataclass(frozen=True, eq=False, repr=False)
+class Identified(Parameters):
+    """The n identified parameters of a linear model, with the problem that positions are predicted from.
+
+    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
+    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
+    """
+
+    problem: CalibrationProblem | None = None
+    at: Array | None = None
+    farthest: Array | None = None
+
+
+def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
+    """Return a model that predicts positions linearly about x (n,) [SI], regions at ``farthest``, by default x, too."""
+    if x is None or not isinstance(model.parameters, Identified):
+        return model
+    return replace(model, parameters=replace(model.parameters, at=x, farthest=x if farthest is None else farthest))
+
+
 def error_dimensions(block: Block) -> list[str]:
     """Return what the components of a block's residual count as in errors: ``length``, ``angle``, ``stated``."""
     dimensions = list(block.measurement.components.values())
@@ -697,15 +684,11 @@ def _inverse_root(covariance: Array) -> Array:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
 
-def _times(L: Array, values: Array, scale: float | Array = 1.0, out: Array | None = None) -> Array:
-    """Return L (N or 1, k, k) times values (N, k, c) times scales (c,), in ``out`` if given."""
+def _times(L: Array, values: Array, scale: float | Array = 1.0) -> Array:
+    """Return L (N or 1, k, k) times values (N, k, c) times scales (c,)."""
     if len(L) == 1 and np.count_nonzero(L) == L.shape[1]:  # most instruments: a multiplication each
-        return np.multiply(values, np.diagonal(L[0])[:, None] * scale, out=out)
-    found = np.empty_like(values) if out is None else out
-    found[:] = 0.0
-    for i, j in zip(*np.nonzero(L.any(axis=0)), strict=True):  # a triangle, often with few entries
-        found[:, i] += L[:, i, j, None] * scale * values[:, j]
-    return found
+        return np.asarray(values * (np.diagonal(L[0])[:, None] * scale))
+    return np.asarray(L @ (values * scale))
 
 
 def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, NamedTuple
+from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 
@@ -14,7 +15,6 @@ from rpim_opt.data.measurements.camera import INTRINSICS, eye_in_hand, pixels
 from rpim_opt.data.measurements.contact import revisit
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.linear import Machine, require_robot
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.closed_forms import transformed
@@ -24,8 +24,8 @@ from rpim_opt.robot.parameter_names import tool_prefix
 
 SOME = 128
 """Configurations of a box, or of all joint ranges, that are always looked at; and those of all that move farthest."""
-ALL, DRAWN = 2048, 4096
-"""Configurations that stand for a box, or all joint ranges; drawn at once to find those, up to 16 times."""
+ALL, DRAWN, ROUNDS = 2048, 4096, 16
+"""Configurations that stand for a box, or all joint ranges; drawn at once to find those, and how often at most."""
 
 
 class Predicted(NamedTuple):
@@ -35,90 +35,88 @@ class Predicted(NamedTuple):
     slope: Array
 
 
-def predicted(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
-    """Return where a reflector is at q (N, dof) [rad or m] to first order; ``torque`` (N, dof) [Nm]."""
-    here = _there(machine, q, marker, torque)
-    x = np.zeros(len(machine.parameters.free)) if machine.at is None else machine.at
+def predicted(
+    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, at: Array | None = None
+) -> Predicted:
+    """Return where a reflector is at q (N, dof) [rad or m] to first order about ``at`` (n,) [SI]; torques [Nm]."""
+    here = _there(problem, q, marker, torque)
+    x = np.zeros(len(problem.parameters.free)) if at is None else at
     position = here.modelled(x)[0]
     slope = here.jacobian(x).reshape(len(position), 3, -1)
     return Predicted(position - slope @ x, slope)
 
 
-def moved(machine: Machine, q: Array, marker: str | None = None, torque: Array | None = None) -> Predicted:
+def moved(
+    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, at: Array | None = None
+) -> Predicted:
     """Return by how much the robot's own parameters move a reflector, frames where they are; arguments as before."""
-    own = ~machine.parameters.free.of_frames
-    at = None if machine.at is None else machine.at * own
-    found = predicted(replace(machine, at=at), q, marker, torque)
-    nominal = _there(machine, q, marker, torque).modelled(np.zeros(len(own)))[0]
+    own = ~problem.parameters.free.of_frames
+    found = predicted(problem, q, marker, torque, None if at is None else at * own)
+    nominal = _there(problem, q, marker, torque).modelled(np.zeros(len(own)))[0]
     return Predicted(found.position - nominal, found.slope * own)
 
 
-def _there(machine: Machine, q: Array, marker: str | None, torque: Array | None) -> CalibrationProblem:
+def _there(
+    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None
+) -> CalibrationProblem:
     """Return the problem whose measurements are the positions of a reflector."""
     q = np.atleast_2d(np.asarray(q, dtype=float))
-    robot = require_robot(machine)
-    if not np.isfinite(q).all() or q.shape[1] != robot.dof:
+    if not np.isfinite(q).all() or q.shape[1] != problem.robot.dof:
         found = f"joint values of shape {q.shape}"
-        raise InputError("positions", found, f"finite numbers (N, {robot.dof}) [rad or m]")
-    return CalibrationProblem(robot, machine.parameters, machine.data).measuring(q, marker=marker, torque=torque)
+        raise InputError("positions", found, f"finite numbers (N, {problem.robot.dof}) [rad or m]")
+    return problem.measuring(q, marker=marker, torque=torque)
 
 
-def markers(machine: Machine) -> list[str]:
+def markers(problem: CalibrationProblem) -> list[str]:
     """Return the reflectors that were measured, in the order of the data."""
-    return list(dict.fromkeys(marker for block in machine.data.blocks for marker in block.markers))
+    return list(dict.fromkeys(marker for block in problem.data.blocks for marker in block.markers))
 
 
-def within_ranges(machine: Machine) -> Array:
-    """Return configurations (N, dof) of all joint ranges that stand for them."""
-    return _standing(machine, random_candidates(require_robot(machine), ALL))
+@lru_cache(maxsize=SOME)
+def _in_box(problem: CalibrationProblem, box: tuple[tuple[float, float], ...], marker: str | None) -> Array:
+    """Return configurations (N, dof) with the nominal reflector in a box, which is asked for at every iteration."""
+    low, high = np.array(box).T
+    found = np.zeros((0, problem.robot.dof))
+    for seed in range(ROUNDS):
+        q = random_candidates(problem.robot, DRAWN, seed)
+        at = in_base(problem, q, marker)
+        found = np.concatenate([found, q[((at >= low) & (at <= high)).all(axis=1)]])
+        if len(found) >= ALL:
+            break
+    if len(found) == 0:
+        accepted = "a box within reach, in the robot's base frame (not the instrument's)"
+        raise InputError("the box", "no configuration of the joint ranges that reaches into it", accepted)
+    return found[:ALL]
 
 
-def within_box(machine: Machine, lower: Array, upper: Array) -> Array:
-    """Return configurations (N, dof) with the nominal reflector between corners (3,) [m] of the base frame."""
-    robot = require_robot(machine)
-    key = (robot, machine.parameters.nominal.tobytes(), tuple(lower), tuple(upper))
-    if key not in _FOUND:
-        inside = [np.zeros((0, robot.dof))]
-        for seed in range(16):
-            q = random_candidates(robot, DRAWN, seed)
-            at = in_base(machine, q)
-            inside.append(q[((at >= lower) & (at <= upper)).all(axis=1)])
-            if sum(map(len, inside)) >= ALL:
-                break
-        found = np.concatenate(inside)[:ALL]
-        if len(found) == 0:
-            raise InputError(
-                "box",
-                "no configuration of the joint ranges that reaches into it",
-                "a box within reach, in the base frame",
-            )
-        if len(_FOUND) >= SOME:
-            _FOUND.clear()
-        _FOUND[key] = found
-    return _standing(machine, _FOUND[key])
+def within(problem: CalibrationProblem, box: Array | None = None, marker: str | None = None) -> Array:
+    """Return configurations (N, dof) that stand for all joint ranges, or those with the nominal reflector in a box.
+
+    Its corners are (3, 2) [m] in the base frame.
+    """
+    if box is None:
+        return random_candidates(problem.robot, ALL)
+    return _in_box(problem, tuple(map(tuple, box.tolist())), marker)
 
 
-_FOUND: dict[Any, Array] = {}
-"""Configurations of boxes, which are asked for at every iteration; a robot is the same object all the while."""
-
-
-def _standing(machine: Machine, q: Array) -> Array:
-    """Return some configurations, and those of all that move farthest: bounds at some would be kept there alone."""
-    if machine.farthest is None or len(q) <= 2 * SOME:
+def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | None) -> Array:
+    """Return some of `within`, and those of all that move farthest: bounds at some would be kept there alone."""
+    q = within(problem, box)
+    if farthest is None or len(q) <= 2 * SOME:
         return q[: 2 * SOME]
-    own = ~machine.parameters.free.of_frames
-    here = _there(machine, q[SOME:], None, None)
-    movement = here.modelled(machine.farthest * own)[0] - here.modelled(np.zeros(len(own)))[0]
-    farthest = np.argsort(-np.linalg.norm(movement, axis=1), kind="stable")[:SOME]
-    return np.concatenate([q[:SOME], q[SOME:][farthest]])
+    own = ~problem.parameters.free.of_frames
+    here = _there(problem, q[SOME:], None)
+    movement = here.modelled(farthest * own)[0] - here.modelled(np.zeros(len(own)))[0]
+    order = np.argsort(-np.linalg.norm(movement, axis=1), kind="stable")[:SOME]
+    return np.concatenate([q[:SOME], q[SOME:][order]])
 
 
-def in_base(machine: Machine, q: Array, marker: str | None = None) -> Array:
+def in_base(problem: CalibrationProblem, q: Array, marker: str | None = None) -> Array:
     """Return where the nominal reflector is in the robot's base frame, (N, 3) [m]; arguments as for `predicted`."""
-    whole = machine.parameters
-    nominal = np.where([name.startswith("base_") for name in whole.names], 0.0, whole.nominal)
-    at_base = replace(machine, parameters=replace(whole, nominal=nominal), at=None, farthest=None)
-    return _there(at_base, q, marker, None).modelled(np.zeros(len(whole.free)))[0]
+    p = problem.parameters
+    nominal = np.where([name.startswith("base_") for name in p.names], 0.0, p.nominal)
+    at_base = problem.with_parameters(replace(p, nominal=nominal))
+    return _there(at_base, q, marker).modelled(np.zeros(len(p.free)))[0]
 
 
 DRAWS = 200
@@ -143,27 +141,10 @@ def postures_at(
 ) -> Array:
     """Return joint values (N, dof) [rad or m] at which the tool is at N points.
 
-    From random configurations by Newton's steps (`Target`), all the way within the joints' limits.
-
-    Parameters
-    ----------
-    problem
-        Gives robot, tools and what its joints bear; its measurements do not matter.
-    points
-        (N, 3) in the robot's base frame [m].
-    seed
-        Of the random postures, or a generator to draw from.
-    x
-        (n,) deviations of the identified parameters [SI]; nominal by default.
-    share
-        Which part of every joint's range is used, from 0 to 1.
-    marker
-        The tool, where there are several; that of the data's first row by default.
-
-    Raises
-    ------
-    InputError
-        For a joint without limits, and a point that none of `DRAWS` random postures leads to.
+    From random configurations, as `random_candidates` draws them, by Newton's steps (`Target`), all the way within the
+    joints' limits. Of the problem robot, tools and what the joints bear count. ``points`` are (N, 3) in the robot's
+    base frame [m]; ``x`` (n,) deviations of the identified parameters [SI], nominal by default; ``marker`` the tool,
+    that of the data's first row by default. InputError for a point that none of `DRAWS` random postures leads to.
 
     Examples
     --------
@@ -272,8 +253,8 @@ def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Arr
     return min(centres, key=lambda centre: float(np.sum((centre - middle) ** 2)))
 
 
-DRAWN, TIMES = 4096, 100
-"""Configurations that are drawn at once to find some in which the board is in sight, and how often."""
+TIMES = 100
+"""How often configurations are drawn to find some in which the board is in sight."""
 MARGIN = 0.04
 """Part of the image along its edges in which no point appears."""
 LARGE = 0.15
@@ -293,27 +274,9 @@ def postures_in_sight(
 ) -> Array:
     """Return joint values (count, dof) [rad or m] at which a camera sees all of its board, large and upright enough.
 
-    Parameters
-    ----------
-    problem
-        With rows of a camera, whose frames and intrinsics count.
-    points
-        (P, 3) of the board [m].
-    count
-        How many.
-    seed
-        Of the draws, or a generator to draw from.
-    x
-        (n,) deviations at which frames and intrinsics are taken [SI]; nominal by default.
-    share
-        Which part of every joint's range is used, from 0 to 1.
-    image
-        Width and height [px].
-
-    Raises
-    ------
-    InputError
-        For a problem without a camera, joints without limits, and a board that is hardly ever in sight.
+    They are drawn as by `random_candidates`. Frames and intrinsics are those of the problem's camera, at deviations
+    ``x`` (n,) [SI], nominal by default; ``points`` are (P, 3) of the board [m], ``image`` is width and height [px].
+    InputError for a problem without a camera, and a board that is hardly ever in sight.
 
     Examples
     --------

@@ -15,7 +15,7 @@ from rpim_opt.basics import threads
 from rpim_opt.calibration import words
 from rpim_opt.convex.trust import Squares, trusted
 from rpim_opt.problem import blocks as parts_module
-from rpim_opt.problem.blocks import PartitionedProblem, in_parts, on_cluster, whole_configurations
+from rpim_opt.problem.blocks import PartitionedProblem, in_parts, whole_configurations
 
 
 def thirds(problem: ro.CalibrationProblem) -> list[np.ndarray]:
@@ -217,7 +217,6 @@ def test_threads_and_pickled_tasks_give_the_same(whole: ro.CalibrationProblem) -
     np.testing.assert_array_equal(ro.calibrate(apart(whole, compute=elsewhere), ro.tikhonov, 1.0).x, there)
     with ThreadPoolExecutor(3) as pool:
         np.testing.assert_array_equal(ro.calibrate(apart(whole, compute=pool.map), ro.tikhonov, 1.0).x, there)
-    assert callable(on_cluster)
 
 
 @pytest.mark.usefixtures("too_many")
@@ -293,7 +292,7 @@ def test_rows_that_fit_are_those_of_one_table(whole: ro.CalibrationProblem) -> N
     assert len(np.unique(here.group)) == len(np.unique(there.group))
 
 
-@pytest.mark.parametrize("count", [2, 7])
+@pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("formulation", "rule"),
     [("minimax", "l_curve"), ("sum_of_norms", "leave_one_out"), ("lasso", "k_fold"), ("robust", "two_step"),

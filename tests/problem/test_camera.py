@@ -263,7 +263,11 @@ def test_a_board_that_is_never_in_sight_is_said(monkeypatch) -> None:
     ("change", "said"),
     [
         (lambda b: replace(b, q=b.q * [1, 1, -1, 1, 1, 1]), "write sign = -1 for joint 3"),
-        (lambda b: replace(b, q=b.q[:, :, [0, 2, 1, 3, 4, 5]]), "exchange the names of the columns q2 and q3"),
+        pytest.param(
+            lambda b: replace(b, q=b.q[:, :, [0, 2, 1, 3, 4, 5]]),
+            "exchange the names of the columns q2 and q3",
+            marks=pytest.mark.slow,
+        ),
         (lambda b: replace(b, q=np.radians(b.q)), "q1_rad"),
         (lambda b: replace(b, measurement=MEASUREMENTS["eye_to_hand"]), 'measurement = "eye_to_hand"'),
     ],

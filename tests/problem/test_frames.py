@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.registration.closed_forms import hand_eye, register
+from rpim_opt.problem.registration.closed_forms import register
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.robot.kinematics import numeric_frame
 from tests.simulate import ARM, simulated
@@ -66,25 +66,6 @@ def test_mirrored_points_get_a_proper_rotation() -> None:
 def test_degenerate_points_are_refused(points: np.ndarray, found: str) -> None:
     with pytest.raises(ro.InputError, match=found):
         register(points, points)
-
-
-@pytest.mark.parametrize("seed", range(5))
-def test_hand_eye_finds_base_and_tool(seed: int) -> None:
-    flange = ro.robot.forward_kinematics(ARM, np.random.default_rng(seed).uniform(-2, 2, (6, 6)))
-    Z, X = transform(seed), transform(seed + 100, 0.2)
-    base, tool = hand_eye(flange, Z @ flange @ X)
-    assert np.abs(base - Z).max() < 1e-9
-    assert np.abs(tool - X).max() < 1e-9
-
-
-def test_hand_eye_refuses_turns_about_one_axis() -> None:
-    q = np.zeros((6, 6))
-    q[:, 0] = np.linspace(-1, 1, 6)
-    flange = ro.robot.forward_kinematics(ARM, q)
-    with pytest.raises(ro.InputError, match="rotations about one axis only"):
-        hand_eye(flange, transform(1) @ flange @ transform(2))
-    with pytest.raises(ro.InputError, match="poses: found 2"):
-        hand_eye(flange[:2], flange[:2])
 
 
 @pytest.mark.parametrize("turn", [0.0, np.pi / 2, np.pi])

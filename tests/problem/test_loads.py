@@ -50,6 +50,23 @@ def test_compliance_is_identified_without_torques() -> None:
     assert np.abs((result.x - truth) / problem.parameters.free.scale).max() < 1e-8
 
 
+def test_predictions_know_the_side_from_which_a_joint_came() -> None:
+    problem, _ = simulated(("base_*",), configurations=12)
+    side = np.random.default_rng(0).choice([-1.0, 1.0], (12, 6))
+    block = replace(problem.data.blocks[0], approach=side[:, None])
+    problem = problem.on(replace(problem.data, blocks=(block,)))
+    problem = problem.with_parameters(problem.parameters.identify(["base_*", "backlash[23]"]))
+    truth = np.array([2e-4 if name.startswith("backlash") else 0.0 for name in problem.parameters.free.names])
+    block = replace(block, y=problem.modelled(truth)[0])
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(block,))), ro.tikhonov, 1e-10)
+    q = problem.data.q
+    there = result.predict(q, columns={"approach": side}).position
+    assert np.abs(there - block.y).max() < 1e-8
+    assert np.abs(result.predict(q).position - there).max() > 1e-5
+    other = result.forward(q, columns={"approach": -side})[:, :3, 3]
+    assert np.abs(other - there).max() > 1e-5
+
+
 def test_measured_torques_go_before_those_of_gravity() -> None:
     problem, _ = simulated(("compliance?",), configurations=5)
     x = np.full(6, 1e-5)

@@ -18,7 +18,7 @@ from rpim_opt.data.noise import declared_noise
 from rpim_opt.problem.blocks import partitions
 from rpim_opt.problem.registration.camera import posed, starting_camera
 from rpim_opt.problem.registration.frames import locate
-from rpim_opt.problem.workspace import Machine, postures_at, touched_place, within_box
+from rpim_opt.problem.workspace import postures_at, touched_place, within
 from tests.problem.test_camera import BOARD, LENS, SIGMA, world
 from tests.simulate import ARM
 
@@ -54,11 +54,6 @@ def straight() -> np.ndarray:
     return motions
 
 
-def limited() -> Machine:
-    own = ro.load("position").problem
-    return Machine(own.robot, own.parameters, own.data)
-
-
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a known distance of nothing": (lambda: KnownDistance(("A", "B"), 0.0, 1e-5), "a length greater than zero"),
     "a known distance without a deviation": (lambda: KnownDistance(("A", "B"), 0.3, 0.0), "sigma 0"),
@@ -92,7 +87,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: locate(ARM, ro.load("distance").problem.data, {"": (0.0,) * 6}), '"auto" without positions or poses'
     ),
     "a box out of reach": (
-        lambda: within_box(limited(), np.full(3, 50.0), np.full(3, 51.0)), "no configuration of the joint ranges"
+        lambda: within(ro.load("position").problem, 50.0 + np.eye(3)[:, :2]), "no configuration of the joint ranges"
     ),
     "a point out of reach": (
         lambda: postures_at(ro.load("position").problem, np.array([[9.0, 0, 0]])), "(9000, 0, 0) mm, out of reach"

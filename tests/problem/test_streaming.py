@@ -17,7 +17,7 @@ import rpim_opt as ro
 from rpim_opt.calibration import words
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import blocks as streaming
-from rpim_opt.problem.blocks import PartitionedProblem, on_cluster, partitions, reduced
+from rpim_opt.problem.blocks import PartitionedProblem, partitions, reduced
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 
@@ -111,7 +111,6 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     assert again.spread.noise_variance == pytest.approx(fixed.spread.noise_variance, rel=1e-9)
     assert 0.9 < again.spread.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
-    assert again.certificate.gradient == pytest.approx(0.0, abs=1e-8)
 
 
 TWICE = ro.Formulation("twice", loss=lambda r: 2 * cp.sum_squares(r), penalty=ro.tikhonov.penalty)
@@ -206,7 +205,11 @@ def test_files_threads_and_a_cluster(whole: CalibrationProblem, parts: list[ro.D
             LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
-            problem = PartitionedProblem(whole.robot, whole.parameters, parts[0], readers, on_cluster(client))
+
+            def compute(task, each):
+                return client.gather(client.map(task, list(each), pure=False))
+
+            problem = PartitionedProblem(whole.robot, whole.parameters, parts[0], readers, compute)
             np.testing.assert_allclose(ro.calibrate(problem, ro.tikhonov, 1.0).x, wanted, rtol=0, atol=1e-13)
     with pytest.raises(ro.InputError, match="no file"):
         partitions([], whole.robot, {"position_mm": 0.05})

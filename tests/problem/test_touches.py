@@ -358,14 +358,9 @@ def test_designed_postures_tell_more_than_drawn_ones() -> None:
     assert information(design.chosen) > max(drawn)
 
 
-def test_inspect_says_what_a_known_distance_adds() -> None:
-    problem = ro.load("contact").problem
-    said = " ".join(ro.problem.inspect(problem).contact)
+def test_inspect_says_what_touches_show() -> None:
+    said = " ".join(ro.problem.inspect(ro.load("contact").problem).contact)
     assert "60 touches of 10 points" in said
-    with_it, without = (
-        float(part.split(" mm")[0]) for part in said.split("known to ")[1:2] + said.split("and to ")[1:2]
-    )
-    assert with_it < 0.1 * without
     assert ro.problem.inspect(ro.load("paper_arm").problem).contact == ()
 
 

@@ -85,7 +85,7 @@ def chains(seed: int, tips: list[str]) -> dict[str, tuple[str, str]]:
     return found
 
 
-SEEDS = [pytest.param(seed, marks=[] if seed < 8 else pytest.mark.slow) for seed in range(40)]
+SEEDS = [pytest.param(seed, marks=[] if seed < 4 else pytest.mark.slow) for seed in range(40)]
 
 
 @pytest.mark.parametrize("seed", SEEDS)

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from collections.abc import Sequence
-from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import solve_triangular
@@ -14,8 +13,8 @@ from scipy.special import chdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, hand_eye, proper, rigid
-from rpim_opt.problem.registration.relaxation import Smallest, lifted, nearest, smallest
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, proper, rigid
+from rpim_opt.problem.registration.relaxation import Smallest, lifted, smallest
 
 GAP = 1e-3
 """What cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer."""
@@ -55,16 +54,6 @@ class CertifiedStart:
     Angles are in rad; ``bound`` and ``radius`` are proven. Where outliers are left out, the bound is that of the sum of
     squares of the others. ``certified`` says that the optimum is global, the only one and determined, and, where
     outliers were expected, that so many measurements agree with it that no other can have as many.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> arm = ro.load("paper_arm").problem
-    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
-    >>> start = ro.problem.certified_hand_eye(flange, flange)
-    >>> bool(start.gap < 1e-6), bool(np.abs(start.tool - np.eye(4)).max() < 1e-6)
-    (True, True)
     """
 
     base: Array  # (4, 4) transform of the robot's base in the instrument's frame [m]
@@ -100,25 +89,13 @@ def certified_hand_eye(
     over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t. The translations are eliminated exactly; the
     rotations are relaxed to a moment matrix (`relaxation.relax`).
 
-    Parameters
-    ----------
-    flange
-        (N, 4, 4) transforms of the flange in the robot's base [m].
-    measured
-        (N, 4, 4) of the tool in the instrument's frame, NaN for rotations that were not measured; or positions (N, 3).
-    sigma
-        Standard deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of
-        the robot, which differs from the nominal one.
-    expected, spread
-        (3,) where the tool is in the flange frame [m], and the standard deviation of that [m]. A direction that the
-        measurements do not show stays there in any case.
-    loss
-        "squares", or "truncated", which leaves outliers out.
-
-    Raises
-    ------
-    InputError
-        For fewer than three measurements, and what is no transform.
+    ``flange`` (N, 4, 4) are transforms of the flange in the robot's base [m], ``measured`` (N, 4, 4) of the tool in the
+    instrument's frame, NaN for rotations that were not measured; or positions (N, 3). ``sigma`` are the standard
+    deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of the robot,
+    which differs from the nominal one. The tool is ``expected`` (3,) in the flange frame [m] with the standard
+    deviation ``spread`` [m]; a direction that the measurements do not show stays there in any case. The loss is
+    "squares", or "truncated", which leaves outliers out. InputError for fewer than three measurements, and what is no
+    transform.
 
     Examples
     --------
@@ -137,19 +114,25 @@ def certified_hand_eye(
     (True, 1)
     """
     flange, measured, turned = _checked(flange, measured, loss)
-    deviations = np.stack([np.broadcast_to(np.asarray(each, dtype=float), len(flange)) for each in sigma], axis=1)
+    N = len(flange)
+    deviations = np.stack([np.broadcast_to(np.asarray(each, dtype=float), N) for each in sigma], axis=1)
     if not (np.isfinite(deviations).all() and (deviations > 0).all()):
         raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
-    loops = _loops(flange, measured, turned, deviations, np.asarray(expected, dtype=float)[:3], spread, loss)
-    candidates = []
-    if turned.all():
-        with suppress(InputError):
-            Z, X = hand_eye(flange, measured)
-            candidates.append(np.stack([Z[:3, :3], X[:3, :3].T]))
-    if loss == "truncated":
-        solved = _truncated(loops, candidates)
+    equations = np.where(turned, 6, 3)
+    beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
+    expected = np.asarray(expected, dtype=float)[:3]
+    loops = _Loops(*_equations(flange, measured, turned, deviations, expected, spread), beyond)
+    several = False  # whether other measurements than those of full weight may be as many that agree
+    if loss == "squares":
+        solved = loops.weighted(np.ones(N))
     else:
-        solved = loops.weighted(np.ones(len(flange)), candidates)
+        pairs = _compatible(flange, measured, turned, deviations[:, 1], beyond)
+        solved = _truncated(loops, pairs)
+        agreeing = solved.weights > 0
+        count = int(np.sum(agreeing))
+        if count < N // 2 + 2:  # no majority: none of the others is in a core of that size but what a good one may be
+            strange = ~agreeing & (solved.squares > chdtri(equations, SURPRISE))
+            several = count < 2 or bool((_core(pairs, count) & strange).any())
     best = solved.smallest
     first, *last = best.rotations
     t, u = solved.v[:LINEAR].reshape(2, 3)
@@ -159,15 +142,14 @@ def certified_hand_eye(
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
     radius = best.radius(float(chdtri(LINEAR + 3 * len(best.rotations), AS_WELL)))
     full = int(np.sum(solved.weights))
-    several = solved.weights.min() < 1 and not solved.alone
     causes = {
         f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
             uncertainty > UNKNOWN
         ),
         f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
         f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell": radius > FAR,
-        "the weights of the loss did not converge": not solved.settled,
-        f"{full} of {len(solved.weights)} measurements agree, and as many others may agree with another start": several,
+        "the weights of the loss did not converge": not np.array_equal(solved.squares <= beyond, solved.weights),
+        f"{full} of {N} measurements agree, and as many others may agree with another start": several,
     }
     cause = next((text for text, true in causes.items() if true), "")
     return CertifiedStart(
@@ -219,43 +201,71 @@ def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, n
 # --- closed loops -------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class _Loops:
-    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first.
+def _equations(
+    flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float
+) -> tuple[Array, Array]:
+    """Return the loops ``measured = base flange tool``, and what is expected of t, as equations of v (`_Loops`).
 
-    ``first`` and ``second`` (N, 3, 3) are orientations B_i = Z A_i X up to errors of ``sigma`` (N,) [rad], where
-    ``turned`` (N,) says that they were measured: A_i'A_j and B_i'B_j turn by the same angle. ``beyond`` (N,) are the
-    c^2 of the loss min(r^2, c^2), infinite for the sum of squares.
+    ::
+
+        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
+        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
+
+    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
     """
+    N = len(flange)
+    eye = np.eye(3)
+    A = flange[:, :3, :3]
+    one = LINEAR
+    of_base = slice(LINEAR + 1, LINEAR + 10)
+    J = np.zeros((N, 12, LINEAR + 1 + 9 * (1 + turned.any())))
+    J[:, :3, :3] = -A
+    J[:, :3, 3:6] = -eye
+    J[:, :3, one] = -flange[:, :3, 3]
+    J[:, :3, of_base] = np.einsum("nb,ac->nabc", measured[:, :3, 3], eye).reshape(N, 3, 9)
+    if turned.any():
+        J[:, 3:, of_base] = -np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
+        J[:, 3:, of_base.stop :] = np.einsum("nai,bj->nabij", measured[:, :3, :3], eye).reshape(N, 9, 9)
+    J[:, :3] /= sigma[:, 0, None, None]
+    J[:, 3:] *= (turned / (np.sqrt(2) * sigma[:, 1]))[:, None, None]
+    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2))))
+    prior = np.zeros((3, J.shape[2]))
+    prior[:, :3] = certainty * eye
+    prior[:, one] = -certainty * expected
+    return J, prior
+
+
+class _Solved(NamedTuple):
+    """Where a loss of closed loops is least."""
+
+    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
+    smallest: Smallest  # of the last weighted problem
+    weights: Array  # (N,) that the loss gives the measurements; one for a square
+    squares: Array  # (N,) squared residuals
+    cost: float  # the loss, summed, and what is expected of translations
+
+
+class _Loops(NamedTuple):
+    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first."""
 
     rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
     prior: Array  # (3, n) residuals of what is expected of t
-    equations: Array  # (N,) of a measurement: 3 of a position, 6 of a pose
-    first: Array
-    second: Array
-    sigma: Array
-    turned: np.ndarray
-    beyond: Array
+    beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
 
-    def triangle(self, weights: Array) -> Array:
-        """Return T (n, n), upper, with |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2."""
+    def weighted(self, weights: Array, start: Array | None = None, bounded: bool = True) -> _Solved:
+        """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps alone.
+
+        With T (n, n), upper, |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2: its last rows are the least over
+        translations (a Schur complement), its first ones say which these are.
+        """
         n = self.rows.shape[2]
         rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
-        return np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
-
-    def at(self, triangle: Array, rotations: Array) -> tuple[Array, Array]:
-        """Return v (n,) of rotations (k, 3, 3) with the translations that are best for them, and |J_i v|^2 (N,)."""
-        x = lifted(rotations)
-        T = triangle[:LINEAR]
-        v = np.concatenate([solve_triangular(T[:, :LINEAR], -T[:, LINEAR:] @ x), x])
-        return v, np.sum((self.rows @ v) ** 2, axis=1)
-
-    def weighted(self, weights: Array, candidates: Sequence[Array] = (), near: Array | None = None) -> _Solved:
-        """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps from rotations."""
-        triangle = self.triangle(weights)
-        L = triangle[LINEAR:, LINEAR:]  # |L x|^2 is the least over translations (a Schur complement)
-        best = smallest(L, candidates) if near is None else nearest(L, near)
-        v, squares = self.at(triangle, best.rotations)
+        T = np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
+        L = T[LINEAR:, LINEAR:]
+        best = smallest(L, start, bounded)
+        x = lifted(best.rotations)
+        v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
+        squares = np.sum((self.rows @ v) ** 2, axis=1)
         cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
         return _Solved(v, best, weights, squares, cost)
 
@@ -264,14 +274,12 @@ class _Loops:
         for _ in range(100):
             weights = (solved.squares <= self.beyond).astype(float)
             same = np.array_equal(weights, solved.weights)
-            bounded = bool(np.isfinite(solved.smallest.bound))
-            if weights.sum() < FEWEST or (same and bounded):
+            if weights.sum() < FEWEST or (same and np.isfinite(solved.smallest.bound)):
                 break
-            near = None if same else solved.smallest.rotations
-            solved = self.weighted(weights, [solved.smallest.rotations], near)
+            solved = self.weighted(weights, solved.smallest.rotations, bounded=same)
         if not np.isfinite(solved.smallest.bound):
-            solved = self.weighted(solved.weights, [solved.smallest.rotations])
-        return replace(solved, settled=np.array_equal(solved.squares <= self.beyond, solved.weights))
+            solved = self.weighted(solved.weights, solved.smallest.rotations)
+        return solved
 
     def graduated(self, among: np.ndarray) -> _Solved:
         """Return a least of the truncated loss by graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127).
@@ -286,52 +294,38 @@ class _Loops:
             weights = among * np.clip(between, 0.0, 1.0)
             if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
                 break
-            solved = self.weighted(weights, near=solved.smallest.rotations)
+            solved = self.weighted(weights, solved.smallest.rotations, bounded=False)
             mu *= 1.6
         return self.repeated(solved)
 
 
-def _loops(
-    flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float, loss: str
-) -> _Loops:
-    """Return the loops ``measured = base flange tool`` of flanges A and measured poses B with their positions y.
+def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
+    """Return the least of the truncated loss min(r^2, c^2) of r = |J_i v|, c^2 being a quantile of chi-squared.
 
-    ::
-
-        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
-        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
-
-    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
+    It begins with the largest core of measurements that turn alike, of which ``pairs`` (N, N) can agree, and if not all
+    of that agree, with all of them and with parts of it.
     """
-    N = len(flange)
-    eye = np.eye(3)
-    A = flange[:, :3, :3]
-    B = measured[:, :3, :3]
-    one = LINEAR
-    of_base = slice(LINEAR + 1, LINEAR + 10)
-    J = np.zeros((N, 12, LINEAR + 1 + 9 * (1 + turned.any())))
-    J[:, :3, :3] = -A
-    J[:, :3, 3:6] = -eye
-    J[:, :3, one] = -flange[:, :3, 3]
-    J[:, :3, of_base] = np.einsum("nb,ac->nabc", measured[:, :3, 3], eye).reshape(N, 3, 9)
-    if turned.any():
-        J[:, 3:, of_base] = -np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
-        J[:, 3:, of_base.stop :] = np.einsum("nai,bj->nabij", B, eye).reshape(N, 9, 9)
-    J[:, :3] /= sigma[:, 0, None, None]
-    J[:, 3:] *= (turned / (np.sqrt(2) * sigma[:, 1]))[:, None, None]
-    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2))))
-    prior = np.zeros((3, J.shape[2]))
-    prior[:, :3] = certainty * eye
-    prior[:, one] = -certainty * expected
-    equations = np.where(turned, 6, 3)
-    beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
-    return _Loops(J, prior, equations, A, B, sigma[:, 1], turned, beyond)
+    first = _likeliest(pairs)
+    found = [loops.graduated(first)]
+    if not np.array_equal(found[0].weights > 0, first):
+        found.append(loops.graduated(np.ones(len(pairs), dtype=bool)))
+    most = max(each.weights.sum() for each in found)
+    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
+        members = np.flatnonzero(first)
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
+        parts = [_likeliest(some) for some in around]
+        if len(members) <= FEW:  # turning alike, one may be wrong all the same
+            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
+        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
+        found += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
+    least = min(each.cost for each in found)
+    return next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
 
 
 # --- which measurements can agree ---------------------------------------------------------------------------------
 
 
-def _compatible(loops: _Loops) -> np.ndarray:
+def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:
     """Return which two measurements (N, N) can both have squared residuals up to c^2, for some frames.
 
     ::
@@ -340,20 +334,19 @@ def _compatible(loops: _Loops) -> np.ndarray:
 
     |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
     """
-    N = len(loops.beyond)
+    N = len(beyond)
     if N > MOST_PAIRED:
         return np.ones((N, N), dtype=bool)
     angles = []
     rough = np.zeros(N)
-    for given in (loops.first, loops.second):
+    for given in (flange[:, :3, :3], measured[:, :3, :3]):
         rotations = proper(given)
         rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
         flat = rotations.reshape(-1, 9)
         angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
-    chord = loops.sigma * np.sqrt(loops.beyond) / 2 + rough / np.sqrt(8)
+    chord = sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
     off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
-    known = np.outer(loops.turned, loops.turned)
-    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~known
+    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~np.outer(turned, turned)
 
 
 def _core(pairs: np.ndarray, count: int) -> np.ndarray:
@@ -374,55 +367,3 @@ def _likeliest(pairs: np.ndarray) -> np.ndarray:
     """Return the core (N,) of the largest count that leaves any."""
     counts = range(len(pairs) + 2)
     return _core(pairs, bisect_left(counts, True, key=lambda count: not _core(pairs, count).any()) - 1)
-
-
-# --- losses -------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class _Solved:
-    """Where a loss of closed loops is least."""
-
-    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
-    smallest: Smallest  # of the last weighted problem
-    weights: Array  # (N,) that the loss gives the measurements; one for a square
-    squares: Array  # (N,) squared residuals
-    cost: float  # the loss, summed, and what is expected of translations
-    settled: bool = True  # whether the weights are those of the residuals
-    alone: bool = True  # whether no other measurements than those of full weight can be as many that agree
-
-
-def _truncated(loops: _Loops, candidates: Sequence[Array]) -> _Solved:
-    """Return the least of the truncated loss min(r^2, c^2) of r = |J_i v|, c^2 being a quantile of chi-squared.
-
-    It begins with the largest core of measurements that turn alike, and if not all of that agree, with all of them and
-    parts of them; it is followed from candidates (k, 3, 3), too, so that none of them is better.
-    """
-    every = np.ones(len(loops.rows), dtype=bool)
-    pairs = _compatible(loops)
-    first = _likeliest(pairs)
-    found = [loops.graduated(first)]
-    for rotations in candidates:
-        near = loops.at(loops.triangle(every), rotations)[1] <= loops.beyond
-        if near.sum() >= FEWEST:
-            found.append(loops.repeated(loops.weighted(near.astype(float), [rotations])))
-    if not np.array_equal(found[0].weights > 0, first):
-        found.append(loops.graduated(every))
-    most = max(each.weights.sum() for each in found)
-    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
-        members = np.flatnonzero(first)
-        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
-        parts = [_likeliest(some) for some in around]
-        if len(members) <= FEW:  # turning alike, one may be wrong all the same
-            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
-        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
-        found += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
-    least = min(each.cost for each in found)
-    best = next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
-    # as many others cannot agree if fewer are left over, or none is in a core of that size but what a good one may be
-    agreeing = best.weights > 0
-    count = int(np.sum(agreeing))
-    if count >= len(agreeing) // 2 + 2:
-        return best
-    strange = ~agreeing & (best.squares > chdtri(loops.equations, SURPRISE))
-    return replace(best, alone=count > 1 and not (_core(pairs, count) & strange).any())

@@ -1,9 +1,8 @@
-"""Closed forms of registration: point sets, hand and eye (AX = ZB)."""
+"""Registration of point sets in closed form, and transforms."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import scipy
@@ -48,45 +47,6 @@ def register(source: Array, target: Array) -> Array:
     p, r = source.mean(axis=0), target.mean(axis=0)
     R = proper((target - r).T @ (source - p))
     return rigid(R, r - R @ p)
-
-
-def hand_eye(flange: Array, measured: Array) -> tuple[Array, Array]:
-    """Return base Z and tool X, (4, 4) each, with measured_i = Z flange_i X: the problem A X = Z B, A = flange^-1.
-
-    Rotations by the Kronecker product and one singular value decomposition (Shah 2013, J. Mechanisms and
-    Robotics 5:031007), translations by linear least squares, of the least norm.
-
-    ``flange`` and ``measured`` are (N, 4, 4) transforms of the flange in the base, and of the tool in the instrument's
-    frame. Refused are fewer than three poses, and rotations about one axis only.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> arm = ro.load("paper_arm").problem
-    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
-    >>> base, tool = np.eye(4), np.eye(4)
-    >>> base[:3, 3], tool[:3, 3] = [2.0, 0.0, 0.5], [0.0, 0.02, 0.06]
-    >>> Z, X = ro.problem.hand_eye(flange, base @ flange @ tool)
-    >>> bool(np.abs(Z - base).max() < 1e-9), bool(np.abs(X - tool).max() < 1e-9)
-    (True, True)
-    """
-    N = len(flange)
-    if N < 3:
-        raise InputError("poses", f"{N}", "three or more")
-    RA, RB = flange[:, :3, :3], measured[:, :3, :3]
-    # R_B = R_Z R_A R_X, so that sum_i R_B kron R_A maps vec(R_X') to N vec(R_Z)
-    K = np.einsum("nij,nkl->ikjl", RB, RA).reshape(9, 9)
-    U, s, Vt = np.linalg.svd(K)
-    if s[1] > (1 - 1e-6) * s[0]:
-        raise InputError("poses", "rotations about one axis only", "poses turned about two axes")
-    V, W = U[:, 0].reshape(3, 3), Vt[0].reshape(3, 3)  # R_Z and R_X', up to one common factor
-    sign = np.sign(np.linalg.det(V))
-    Z, X = proper(sign * V), proper(sign * W).T
-    A = np.concatenate([np.hstack([Z @ R, np.eye(3)]) for R in RA])
-    b = measured[:, :3, 3] - flange[:, :3, 3] @ Z.T
-    t: Any = np.linalg.lstsq(A, b.ravel(), rcond=1e-6)[0]
-    return rigid(Z, t[3:]), rigid(X, t[:3])
 
 
 def proper(M: Array) -> Array:

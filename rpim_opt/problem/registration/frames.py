@@ -241,21 +241,12 @@ def starting_parameters(
 ) -> Parameters:
     """Return the model's parameters with closed-form values for what is not stated; none identified yet.
 
-    Parameters
-    ----------
-    robot, data
-        The nominal robot and what was measured.
-    base
-        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
-    tools
-        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
-    own
-        Values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
-        parameters is stated is located from the nominal robot.
-    temperature
-        At which lengths are nominal [K], where the data state temperatures; their mean by default.
-    sessions
-        Names of sessions that are not among the data, where these are the first of several parts.
+    ``base`` (6,) is the robot's in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.
+    ``tools`` are reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
+    ``own`` are values [SI] of the measurements' own parameters by name; a fixture (anchor, plane, sphere) none of whose
+    parameters is stated is located from the nominal robot. Lengths are nominal at a ``temperature`` [K], where the data
+    state temperatures; their mean by default. ``sessions`` are not among the data, where these are the first of several
+    parts.
 
     Examples
     --------

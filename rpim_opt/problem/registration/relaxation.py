@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import import_module
@@ -125,14 +124,10 @@ class Smallest:
         return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
 
 
-def nearest(L: Array, rotations: Array) -> Smallest:
-    """Return the stationary rotations near some, of which nothing is known."""
-    best = _refined(L, rotations)
-    return Smallest(best, _value(L, best))
+def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smallest:
+    """Return the best of what the relaxation and a start (k, 3, 3) lead to, with the relaxation's bound.
 
-
-def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
-    """Return the best of what the relaxation and candidates (k, 3, 3) lead to, with the relaxation's bound.
+    If that is not wanted, the stationary rotations near the start, of which nothing is known.
 
     ::
 
@@ -142,6 +137,9 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
     The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
+    near = [] if start is None else [_refined(L, start)]
+    if near and not bounded:
+        return Smallest(near[0], _value(L, near[0]))
     Q = L.T @ L
     moments = relax(Q)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
@@ -152,8 +150,8 @@ def smallest(L: Array, candidates: Iterable[Array] = ()) -> Smallest:
         normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
         drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
         lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
-    starts = [proper(lift[1:].reshape(-1, 3, 3)) for lift in lifts]
-    best = min((_refined(L, start) for start in (*starts, *candidates)), key=lambda R: _value(L, R))
+    found = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
+    best = min([*found, *near], key=lambda R: _value(L, R))
     value = _value(L, best)
     x = lifted(best)
     C = rotation_constraints(len(best))
