@@ -237,7 +237,7 @@ def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False,
     with console.progress() as say:
         from rpim_opt.calibration.lack_of_fit import foreseen
         from rpim_opt.problem.design import observe
-        from rpim_opt.problem.diagnosis import identifiable_sentences, inspect
+        from rpim_opt.problem.diagnosis import inspect
         from rpim_opt.store.instances import load
 
         say("reading the problem")
@@ -256,7 +256,7 @@ def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False,
         document |= {name: part.content()} if name else part.content()
         text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
     if together is not None:
-        text += f"\n\nAll together: {identifiable_sentences(together)}"
+        text += f"\n\nAll together: {together}"
     document["lack_of_fit"] = None
     if lacking is not None:
         document["lack_of_fit"] = lacking.content()

@@ -24,26 +24,17 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import CONFIDENCE, Requirement
-from rpim_opt.problem.design import random_candidates
-from rpim_opt.problem.linear import Machine, identified_of, require_robot
-from rpim_opt.problem.workspace import in_base, markers
-from rpim_opt.robot.parameter_names import own_name
+from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.workspace import in_base, markers, within
 
 Verdict = Literal["accepted", "rejected", "undecided"]
-DECISIVE = 0.5
-"""What knowing a part of the robot leaves of the bound where that part decides it."""
 FEWEST = 5
 """Held-out rows below which they say too little of the intervals."""
 MOST = 3
 """Joints or rows that a reason names."""
 STATED = 1e9
 """Degrees of freedom of an uncertainty that is stated."""
-DRAWN, ROUNDS = 4096, 16
-"""Configurations that are drawn at once, and how often at most."""
-ENOUGH = 2048
-"""How many represent a region."""
 WORST, BESIDE = 16, 16
 """The search for the largest bound goes on from so many, at so many beside each."""
 STEPS = (0.1, 0.05, 0.025, 0.0125)
@@ -57,16 +48,16 @@ LEAST = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A machine whose joint limits are those of the region, a box (3, 2) [m] in its base frame, and the reflector."""
+    """A problem whose joint limits are those of the region, a box (3, 2) [m] in its base frame, and the reflector."""
 
-    machine: Machine
+    problem: CalibrationProblem
     box: Array | None
     marker: str
 
     @property
     def limits(self) -> Array:
         """Least and largest value (dof, 2) of every joint [rad or m]."""
-        return require_robot(self.machine).limits
+        return self.problem.robot.limits
 
     def inside(self, q: Array, slack: float = 0.0) -> np.ndarray:
         """Return which configurations (N, dof) are in the region, (N,), or beyond it by so many parts of its ranges."""
@@ -74,23 +65,13 @@ class Region:
         spare = slack * (high - low)
         found = ((q >= low - spare) & (q <= high + spare)).all(axis=1)
         if self.box is not None and found.any():
-            at = in_base(self.machine, q[found], self.marker)
+            at = in_base(self.problem, q[found], self.marker)
             found[found] = ((at >= self.box[:, 0]) & (at <= self.box[:, 1])).all(axis=1)
         return found
 
     def drawn(self) -> Array:
         """Return configurations (N, dof) that represent the region; InputError where none reaches into the box."""
-        kept: list[Array] = []
-        for seed in range(ROUNDS):
-            q = random_candidates(require_robot(self.machine), DRAWN, seed)
-            kept.append(q[self.inside(q)])
-            if sum(map(len, kept)) >= ENOUGH:
-                break
-        found = np.concatenate(kept)[:ENOUGH]
-        if not len(found):
-            accepted = "one within reach, in the robot's base frame (not the instrument's)"
-            raise InputError("the box", "no configuration of the joint ranges that reaches into it", accepted)
-        return found
+        return within(self.problem, self.box, self.marker)
 
 
 def region_of(result: Outcome, requirement: Requirement) -> Region:
@@ -105,14 +86,12 @@ def region_of(result: Outcome, requirement: Requirement) -> Region:
             raise InputError("acceptance", f"joint {joint}", f"1 to {len(limits)}")
         limits[joint - 1] = side
     sample = problem.sample()
-    machine = identified_of(replace(problem.robot, limits=limits), sample.parameters, sample.data).machine
-    if machine is None:
-        raise InputError("acceptance", "no robot", "a calibration of one robot")
-    known = markers(machine)
+    known = markers(sample)
     marker = requirement.marker or known[0]
     if marker not in known:
         raise InputError("acceptance", f"reflector '{marker}'", ", ".join(known))
-    return Region(machine, None if requirement.box is None else np.array(requirement.box), marker)
+    limited = replace(sample, robots=replace(problem.robot, limits=limits))
+    return Region(limited, None if requirement.box is None else np.array(requirement.box), marker)
 
 
 @dataclass(frozen=True, eq=False)
@@ -351,8 +330,6 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
                 f"robot's repeatability would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment "
                 "--count 10` names the configurations that help most."
             )
-        if scatter < mapped.largest:
-            lacking += decisive(result, mapped)
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "undecided"
@@ -441,36 +418,6 @@ def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: fl
         if np.isfinite(mean).all():
             found[i] = float(distance_quantile(reached - mean, each.freedom, confidence)[0])
     return found[0], found[1]
-
-
-def decisive(result: Calibration, found: Workspace) -> list[str]:
-    """Say which part of the robot decides the largest bound: by C given that part, C - C_k C_kk^-1 C_k'."""
-    free = result.problem.parameters.free
-    names = [own_name(name) for name in free.names]
-    parts = {
-        "the place of the reflector (tool_x, tool_y, tool_z)": [name.startswith("tool_") for name in names],
-        "the base": [name.startswith("base_") for name in names],
-        "the transmission errors": free.of_curves,
-    }
-    parts["the links and joint offsets"] = ~np.any(list(parts.values()), axis=0)
-    q = found.q[-1:]
-    J = result.problem.sample().measuring(q, position, found.region.marker).jacobian(result.x)
-    C = result.covariance
-    whole = result.predict(q, found.region.marker).covariance
-    left = {}
-    for part, members in parts.items():
-        k = np.flatnonzero(members)
-        G = J @ C[:, k]
-        known = whole - G @ np.linalg.pinv(C[np.ix_(k, k)], hermitian=True) @ G.T
-        left[part] = float(distance_quantile(known, result.freedom, found.requirement.confidence)[0])
-    part = min(left, key=left.__getitem__)
-    if not left[part] < DECISIVE * found.largest:
-        return []
-    text = f"The bound rests on {part}: known exactly, it would be {1e3 * left[part]:.3f} mm."
-    if "reflector" in part:
-        text += ' State what is known of it ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]), or measure with the wrist'
-        text += " turned further."
-    return [text]
 
 
 def _unmodelled(result: Calibration, region: Region) -> list[str]:

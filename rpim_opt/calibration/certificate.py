@@ -29,19 +29,17 @@ TINY = 1e-300
 class Certificate(NamedTuple):
     """How well the conditions of a solution are met.
 
-    ``gradient`` is that of the nonlinear problem (data, penalty, and multipliers of the bounds) relative to the data's
-    at nominal; None where the objective has none or other constraints hold. ``step`` is how far the convex program at
-    the solution would still go, relative to 1 + |z|; ``violation`` by how much the constraints are missed, in units of
-    the scales; ``decrease`` what that step promises, relative to the objective, or None where it is not known.
+    ``step`` is how far the convex program at the solution would still go, relative to 1 + |z|; ``violation`` by how
+    much the constraints are missed, in units of the scales; ``decrease`` what that step promises, relative to the
+    objective, or None where it is not known.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.bounded, weight=1e-3)
     >>> evidence = result.certificate
-    >>> evidence.holds(result.z), evidence.decrease < 1e-9, evidence.violation, evidence.gradient < 1e-6
-    (True, True, 0.0, True)
+    >>> evidence.holds(result.z), evidence.decrease < 1e-9, evidence.violation
+    (True, True, 0.0)
     """
 
-    gradient: float | None
     step: float
     violation: float
     decrease: float | None = None
@@ -54,7 +52,6 @@ class Certificate(NamedTuple):
 def certified(
     formulation: Formulation,
     model: LinearModel,
-    slope: float,
     z: Array,
     weight: float,
     floor: float = 0.0,
@@ -63,10 +60,10 @@ def certified(
 ) -> Certificate:
     """Return the evidence that z (n,) minimizes the nonlinear problem: the formulation's functions are asked anew.
 
-    ``model`` is the problem linearized at z, anew; ``slope`` the norm of the data's gradient where the loop began;
-    ``floor`` the objective below which one has vanished. Where ``residual`` gives the whitened residual b - A z at
-    z (n,), the model's derivative is compared with its differences, and replaced by them where it is not theirs. What
-    CVXPY made of the functions of the program ``before`` serves again where they answer the same.
+    ``model`` is the problem linearized at z, anew; ``floor`` the objective below which one has vanished. Where
+    ``residual`` gives the whitened residual b - A z at z (n,), the model's derivative is compared with its differences,
+    and replaced by them where it is not theirs. What CVXPY made of the functions of the program ``before`` serves again
+    where they answer the same.
     """
     if residual is not None:
         model = _differentiated(model, residual, z)
@@ -76,23 +73,15 @@ def certified(
         program = before.anew(formulation, model, z)  # where a minimum is looked for first proves nothing
     objective = program.objective(z, weight)
     violation = program.violation(z)
-    relative = None
-    gradient = program.gradient(z, weight) if program.quadratic else None
-    if gradient is not None and program.box is not None:  # off the bounds that hold it, relative to that at nominal
-        lower, upper = program.box
-        at_low = np.isfinite(lower) & (z <= lower + 1e-9)
-        at_high = np.isfinite(upper) & (z >= upper - 1e-9)
-        held = (at_low & (gradient > 0)) | (at_high & (gradient < 0))
-        relative = float(np.linalg.norm(gradient[~held]) / max(slope, TINY))
     try:
         best = program.inside(program.solve(weight).z, z, weight)
     except NoSolutionFound:
-        return Certificate(relative, float("inf"), violation, None)
+        return Certificate(float("inf"), violation)
     step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))
     promised = objective - program.objective(best, weight)
     if not np.isfinite(promised):
-        return Certificate(relative, step, violation, None)
-    return Certificate(relative, step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
+        return Certificate(step, violation)
+    return Certificate(step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
 
 
 def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: Array) -> LinearModel:

@@ -42,8 +42,6 @@ NOTABLE = 0.5
 """Effect of a joint's compliance over the largest, below which wrong masses explain its sign."""
 SURE = 3.0
 """Standard deviations by which a compliance is below zero before a joint is said to bend upwards."""
-UNIDENTIFIABLE = 1e-10
-"""Relative singular value of an unidentifiable direction of the geometry."""
 RARE = 1e-3
 """Probability that residuals exceed the scatter of repeated readings by chance."""
 PERMUTATIONS = 300
@@ -82,16 +80,6 @@ EXTENSIONS = {
 }
 
 
-class Effect(NamedTuple):
-    """An extension that the model has: by how much -2 ln L falls with it, and the RMS [m] that no geometry can imitate.
-
-    The RMS is None where too few equations are left over to tell.
-    """
-
-    gain: float
-    rms: float | None
-
-
 class Autocorrelation(NamedTuple):
     """Correlation of the residuals of nearest configurations, and its z-score among permutations."""
 
@@ -122,7 +110,7 @@ class LackOfFit:
     gain, share
         By how much -2 ln L falls with them, and the share of the mean square residual that they would explain.
     present
-        Extensions of the model that the data support.
+        Extensions of the model that the data support, and by how much -2 ln L falls with each.
     alike
         Autocorrelation of the residuals of the model with all that `missing` names; None for too few.
     upward
@@ -147,7 +135,7 @@ class LackOfFit:
     parameters: tuple[str, ...] = ()
     gain: float = 0.0
     share: float = 0.0
-    present: Mapping[str, Effect] = field(default_factory=dict)
+    present: Mapping[str, float] = field(default_factory=dict)
     alike: Autocorrelation | None = None
     upward: tuple[int, ...] = ()
     repeated: float | None = None
@@ -184,11 +172,8 @@ class LackOfFit:
             if self.joint > NEGLIGIBLE * self.robot:
                 parts[-1] += f", of it {_size(self, self.joint)} from the joints"
         lines = [f"{rms} ({', '.join(parts)})."]
-        for family, effect in self.present.items():
-            size = ""
-            if effect.rms is not None:
-                size = f": {_size(self, effect.rms)} RMS beyond what geometry can imitate"
-            lines.append(f"{EXTENSIONS[family].effect}{size} (-2 ln L falls by {effect.gain:.0f}).")
+        for family, gain in self.present.items():
+            lines.append(f"{EXTENSIONS[family].effect}: -2 ln L falls by {gain:.0f}.")
         if self.missing:
             what = joined([EXTENSIONS[family].name for family in self.missing])
             lines.append(
@@ -224,9 +209,6 @@ class LackOfFit:
         """Return the same as a document [mm, mrad or px]."""
         unit, si = UNITS[self.dimension]
         lengths = ("left", "instrument", "position", "joint", "repeatable", "excess")
-        present = {}
-        for family, effect in self.present.items():
-            present[family] = {"gain": effect.gain, f"rms_{unit}": None if effect.rms is None else effect.rms / si}
         return {
             "configurations": self.configurations,
             "equations": self.equations,
@@ -238,7 +220,7 @@ class LackOfFit:
             "identify": list(self.parameters),
             "gain": self.gain,
             "share": self.share,
-            "present": present,
+            "present": dict(self.present),
             "alike": None if self.alike is None else self.alike._asdict(),
             "upward": list(self.upward),
             "alarming": self.alarming,
@@ -276,7 +258,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         members = np.isin(group, terms)
         gain = compared.rise_without(members) if members.any() else 0.0
         if gain > SPEAK:
-            present[family] = Effect(gain, _beyond_geometry(compared, members))
+            present[family] = gain
     again, freedom = _repeated(problem, result.x, dimension)
     excess = 0.0
     if again is not None:
@@ -345,29 +327,7 @@ def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
     return {kind: float(np.sqrt(total / compared.rows)) for kind, total in squares.items()}
 
 
-def _beyond_geometry(compared: Comparison, members: np.ndarray) -> float | None:
-    """Return the RMS of a row that some parameters (n,) move and geometry and frames cannot.
-
-    What the projection leaves is divided by the equations that the others leave over, so that many of them do not make
-    it small.
-    """
-    model = compared.plain
-    X = model.evidence.data.X[compared.equations]
-    terms = {term for terms in OWNED.values() for term in terms}
-    extension = np.array([family_of(name) in terms for name in model.names])
-    moved = X[:, members] @ model.point.z[members]
-    geometry = X[:, ~extension]
-    geometry = geometry / np.maximum(np.linalg.norm(geometry, axis=0), 1e-300)
-    U, s, _ = np.linalg.svd(geometry, full_matrices=False)
-    U = U[:, s > UNIDENTIFIABLE * s[0]]
-    spare = len(moved) - U.shape[1]
-    if spare < FEWEST:
-        return None
-    left = moved - U @ (U.T @ moved)
-    return float(np.sqrt(left @ left / spare * len(moved) / compared.rows))
-
-
-def _upward(compared: Comparison, present: Mapping[str, Effect]) -> tuple[int, ...]:
+def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ...]:
     """Return the joints that surely turn against gravity, where gravity is worth its parameters."""
     model = compared.best
     # signs of measured torques are the table's, and numbers of joints would not say of which robot

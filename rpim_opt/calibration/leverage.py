@@ -17,9 +17,9 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.trust import Squares
 from rpim_opt.data.record import CONFIDENCE
 from rpim_opt.problem.blocks import in_parts
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Machine, require_robot
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.workspace import moved, predicted, within_ranges
+from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameter_names import of_joint, own_name
 
@@ -335,12 +335,11 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     tools = np.array([name.startswith("tool_") for name in of_robot.names])
     nominal = np.where(tools, 0.0, of_robot.nominal)
     at = np.where(tools[of_robot.identified], 0.0, result.x[columns])
-    data = problem.alone(robot).data
-    machine = Machine(problem.arms[robot], replace(of_robot, nominal=nominal), data, at=at)
-    q = within_ranges(machine)
-    p = predicted(machine, q).position
+    there = CalibrationProblem(problem.arms[robot], replace(of_robot, nominal=nominal), problem.alone(robot).data)
+    q = bounding(there, None, None)
+    p = predicted(there, q, None, at=at).position
     J = np.zeros((len(p), 3, len(result.x)))
-    J[:, :, columns] = moved(machine, q).slope
+    J[:, :, columns] = moved(there, q, None, at=at).slope
     D = J.reshape(-1, J.shape[2])
     p = p - p.mean(axis=0)
     turning = np.zeros((len(p), 3, 3))
@@ -348,7 +347,7 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     turning[:, [0, 1, 2], [2, 0, 1]] = -p[:, [1, 2, 0]]
     values = dict(zip(of_robot.names, nominal, strict=True))
     base = numeric_frame([values[f"base_{c}"] for c in FRAME])
-    along = base[:3, :3] @ forward_kinematics(require_robot(machine), q)[:, :3, :3]
+    along = base[:3, :3] @ forward_kinematics(there.robot, q)[:, :3, :3]
     fitting = np.concatenate([np.tile(np.eye(3), (len(p), 1, 1)), turning, along], axis=2).reshape(-1, 9)
     U = np.linalg.qr(fitting)[0]
     D = D - U @ (U.T @ D)

@@ -20,8 +20,8 @@ from rpim_opt.convex.select import Selector
 from rpim_opt.convex.structure import in_blocks
 from rpim_opt.convex.trust import Squares, trusted
 from rpim_opt.problem.blocks import Source, in_parts
-from rpim_opt.problem.linear import LinearModel, around
-from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.problem import CalibrationProblem, around
 
 GAIN_GOOD, GAIN_POOR = 0.75, 0.25
 """Gain ratios (actual over promised decrease) above which damping shrinks, and below which it grows."""
@@ -118,8 +118,7 @@ class State:
 
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2; ``idle``
     and ``refused`` count iterations in a row that promised, and steps that lowered, nothing. ``outcome`` says why the
-    loop ended (``"rest"``, ``"stuck"``), ``slope`` is the norm of the data's gradient where it began, and ``floor``
-    what vanishing objectives are compared with.
+    loop ended (``"rest"``, ``"stuck"``), and ``floor`` is what vanishing objectives are compared with.
     """
 
     z: Array
@@ -127,7 +126,6 @@ class State:
     choice: WeightChoice
     merit: float
     size: Array
-    slope: float = 0.0
     floor: float = 0.0
     damping: float = 0.0
     history: tuple[Iteration, ...] = ()
@@ -174,10 +172,12 @@ class Loop:
     def chosen(self, state: State) -> State:
         """Ask the rule for the weight, unless it is settled."""
         choice = state.choice
-        if not choice.answers and self.options.max_iterations > FEW:
-            choice = choice.begun()
-        if not choice.settled:
-            choice = choice.asked(self._judged(state))
+        if choice.settled:
+            return state
+        if choice.robust and not choice.answers and self.options.max_iterations > FEW:
+            # where weight 1 leads: at nominal the answer would be about outliers that no fit has shown yet
+            return state.weighted(replace(choice, weight=1.0, settled=True))
+        choice = choice.asked(self._judged(state))
         return state.weighted(choice)
 
     def confirmed(self, state: State) -> State:
@@ -209,7 +209,13 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; rest where it promises nothing, else step to its minimum, or damp."""
-        straight, promised = self._promised(state)
+        # the first linearization is good for a rough minimum, unless that promises too little to judge by
+        rough = 0.0 if state.history or state.refused or self.options.solver else FIRST_ACCURACY
+        straight = self._solved(state.program, state, rough)
+        promised = state.merit - merit(state.program, straight, state.choice.weight)
+        if rough and promised <= 10 * rough * abs(state.merit):
+            straight = self._solved(state.program, state)
+            promised = state.merit - merit(state.program, straight, state.choice.weight)
         length = state.relative(float(np.linalg.norm(straight - state.z)))
         short = length <= self.options.tolerance
         accuracy, best = self._accuracy(state)
@@ -234,7 +240,14 @@ class Loop:
         gain = 1.0
         if promised > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
             gain = fall / promised
-        damping = _damping(state, gain, promised, z)
+        effect = float(np.sum((state.size * (z - state.z)) ** 2))
+        damping = state.damping
+        if gain < GAIN_POOR and effect > 0 and promised > 0:
+            damping = DAMPING_GROWTH * damping if damping else DAMPING_FIRST * promised / effect
+        elif gain > GAIN_GOOD:
+            damping = DAMPING_SHRINK * damping
+            if damping * effect <= DAMPING_LEAST * promised:
+                damping = 0.0
         state = replace(state, damping=damping, evaluations=state.evaluations + 1)
         if after <= state.merit + rounding:
             return self._accepted(state, candidate, z, after, short)
@@ -247,18 +260,6 @@ class Loop:
         if damping > DAMPING_MOST or not np.isfinite(damping):
             return replace(state, outcome="stuck")
         return state
-
-    def _promised(self, state: State) -> tuple[Array, float]:
-        """Return the minimum (n,) of the convex program, and by how much it lowers the objective."""
-        accuracy = FIRST_ACCURACY
-        if state.history or state.refused or self.options.solver:
-            accuracy = 0.0
-        z = self._solved(state.program, state, accuracy)
-        promised = state.merit - merit(state.program, z, state.choice.weight)
-        if accuracy and promised <= 10 * accuracy * abs(state.merit):
-            z = self._solved(state.program, state)
-            promised = state.merit - merit(state.program, z, state.choice.weight)
-        return z, promised
 
     def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
         weight = state.choice.weight
@@ -332,21 +333,6 @@ def merit(program: Program, z: Array, weight: float) -> float:
     if excess == 0:
         return objective
     return objective + EXCESS_COST * (1 + abs(objective)) * excess
-
-
-def _damping(state: State, gain: float, promised: float, z: Array) -> float:
-    """Return the damping that a gain ratio asks for, of a step to z (n,)."""
-    effect = float(np.sum((state.size * (z - state.z)) ** 2))
-    damping = state.damping
-    if gain < GAIN_POOR and effect > 0 and promised > 0:
-        if damping == 0:
-            return DAMPING_FIRST * promised / effect
-        return DAMPING_GROWTH * damping
-    if gain > GAIN_GOOD:
-        damping = DAMPING_SHRINK * damping
-        if damping * effect <= DAMPING_LEAST * promised:
-            return 0.0
-    return damping
 
 
 # --- the loop ---------------------------------------------------------------------------------------------------------
@@ -424,9 +410,7 @@ def _certified(
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)
     try:
-        found = certified(
-            formulation, model, state.slope, state.z, state.choice.weight, state.floor, residual, state.program
-        )
+        found = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
     except NoSolutionFound as error:
         raise error.naming(_labels(loop.source)) from None
     return Ended(state, loop.scale * state.z, found)
@@ -480,9 +464,8 @@ def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Arr
         program.beginning(z)
     choice = replace(choice, robust=loop.reweigh is not None or program.separable)
     objective = merit(program, z, choice.weight)
-    slope = float(np.linalg.norm(2 * model.A.T @ model.b))
     floor = VANISHING * abs(objective) if np.isfinite(objective) else 0.0
-    return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), slope, floor)
+    return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), floor)
 
 
 def require_start(start: Array, count: int) -> Array:

@@ -169,8 +169,8 @@ class Outcome:
     ) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
 
-        Base, robot and tool, gears and joints' elasticity included, joints in the middle of their backlash; of `robot`
-        alone: `forward_kinematics`.
+        Base, robot and tool, gears and joints' elasticity included, joints in the middle of their backlash unless
+        `columns` say otherwise; of `robot` alone: `forward_kinematics`.
 
         Parameters
         ----------
@@ -183,7 +183,8 @@ class Outcome:
         payload
             Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
         columns
-            What terms of your own see, by name, (N,) each [SI].
+            What terms of your own see, by name, (N,) each [SI]; "approach", (N, dof), is the direction in which each
+            joint came, -1 or 1, where backlash was identified.
 
         Examples
         --------

@@ -9,7 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import Tabled, table
+from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.covariance import coverage_factor, position_noise, scattered
@@ -58,6 +58,9 @@ class Uncertainty(Tabled):
     True
     >>> uncertainty.intervals().shape
     (34, 2)
+    >>> frame = uncertainty.to_frame()
+    >>> list(frame.columns)
+    ['parameter', 'unit', 'value', 'u_noise', 'u_prior', 'u', 'U', 'held_back']
     """
 
     result: Outcome
@@ -98,32 +101,11 @@ class Uncertainty(Tabled):
             factor = coverage_factor(found.freedom, self.confidence)[:, None]
         return found._replace(coverage_factor=factor)
 
-    def budget(self) -> str:
-        """Return the parameters with their uncertainties as a table (GUM: value, standard, expanded uncertainty).
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> lines = ro.calibration.Uncertainty(result).budget().splitlines()
-        >>> print(lines[0])
-         parameter   unit       value   u, noise   u, prior   u, combined   U, k = 1.99
-        >>> print(lines[7])
-         a2            mm     -0.2622     0.0069     0.0005        0.0069        0.0138
-        """
-        rows: list[list[str]] = []
-        for row, of_curve in zip(self._frame_rows(), self.result.problem.parameters.free.of_curves, strict=True):
-            if of_curve:
-                continue
-            name = row["parameter"] + (" *" if row["held_back"] else "")
-            rows.append([name, row["unit"], *(f"{row[key]:.4f}" for key in ("value", "u_noise", "u_prior", "u", "U"))])
-        expanded = f"U, k = {self.coverage_factor:.2f}"
-        head = ["parameter", "unit", "value", "u, noise", "u, prior", "u, combined", expanded]
-        return "\n".join([table(head, rows), *self._notes()])
-
     def _short(self) -> str:
         return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return the budget: values, standard uncertainties u by what causes them, and U = k u."""
+        """Return the budget in GUM's terms: values, standard uncertainties u by what causes them, and U = k u."""
         free = self.result.problem.parameters.free
         spread = self.result.spread
         noise, prior, both = (np.sqrt(np.diag(C)) for C in (spread.noise, spread.prior, spread.covariance))
@@ -133,10 +115,8 @@ class Uncertainty(Tabled):
             unit, si = display(free.dimensions[i])
             row: dict[str, Any] = {"parameter": name, "unit": unit, "value": float(values[i] / si)}
             row |= {"u_noise": float(noise[i] / si), "u_prior": float(prior[i] / si), "u": float(both[i] / si)}
-            row |= {
-                "U": float(self.coverage_factor * both[i] / si),
-                "held_back": bool(both[i] == 0) or name in self.result.held_back,
-            }
+            row["U"] = float(self.coverage_factor * both[i] / si)
+            row["held_back"] = bool(both[i] == 0) or name in self.result.held_back
             rows.append(row)
         return rows
 
@@ -146,7 +126,7 @@ class Uncertainty(Tabled):
             f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
         ]
         if any(row["held_back"] for row in self._frame_rows()):
-            lines.append("* at an active bound or held by a constraint: the interval is conditional on it.")
+            lines.append("Held back at an active bound or by a constraint: the interval is conditional on it.")
         return lines
 
 

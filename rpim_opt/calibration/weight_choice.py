@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -16,8 +17,6 @@ SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this share of the solution, then stays."""
 SAME = 0.01
 """Two weights are the same when their logarithms differ by no more."""
-NEUTRAL = 1.0
-"""The weight that takes stated noise and scales at their word."""
 SAME_SEARCH = float(np.log(SAME_WEIGHT))
 """The same of weights from a search."""
 SAME_ROBUST = 1e-6
@@ -43,15 +42,6 @@ class WeightChoice:
     final: bool = False
     note: str = ""
     robust: bool = False
-
-    def begun(self) -> WeightChoice:
-        """Return the choice at the start: of a robust loss, a rule is asked where weight 1 leads.
-
-        At nominal its answer would be about outliers that no fit has shown yet.
-        """
-        if self.settled or not self.robust:
-            return self
-        return replace(self, weight=NEUTRAL, settled=True)
 
     def asked(self, program: Program) -> WeightChoice:
         """Return what the rule makes of a program, unless the weight is settled."""
@@ -98,20 +88,15 @@ class WeightChoice:
         """Settle a rule that alternates, or never comes to rest, on the safer of its answers."""
         turns = [self.answers[0]]
         turns += [b for a, b in zip(self.answers, self.answers[1:], strict=False) if not _same(a, b)]
-        last = turns[-4:]
-        if len(last) == 4 and _same(last[0], last[2]) and _same(last[1], last[3]):
-            return self._settled_between(last[2], last[3])
-        if self.robust and len(self.answers) >= 4 and not _same(self.answers[-2], self.answers[-1], SAME_ROBUST):
-            a, b, c, d = self.answers[-4:]
-            if _same(a, c, SAME_ROBUST) and _same(b, d, SAME_ROBUST):  # closer to each other than `SAME`
-                return self._settled_between(c, d)
-        if self.settled and len(last) >= 3 and _same(last[-1], last[-3], SAME_SEARCH):  # leads where it led before
-            return self._settled_between(last[-2], last[-1])
-        if len(turns) >= MOST_ANSWERS:
-            return self._settled_between(last[-2], last[-1])
-        return self
-
-    def _settled_between(self, one: float, other: float) -> WeightChoice:
+        ended = _alternate(turns, SAME) or len(turns) >= MOST_ANSWERS
+        if self.settled and len(turns) >= 3:  # leads where it led before
+            ended = ended or _same(turns[-1], turns[-3], SAME_SEARCH)
+        last: Sequence[float] = turns
+        if not ended and self.robust:  # closer to each other than `SAME`
+            ended, last = _alternate(self.answers, SAME_ROBUST), self.answers
+        if not ended:
+            return self
+        one, other = last[-2:]
         low, high = sorted((one, other))
         name = self.selection.name if self.selection else "selector"
         weight, which = high, "the larger one is used"
@@ -122,6 +107,13 @@ class WeightChoice:
         if not _same(one, other):
             note = f"The rule {name} alternates between {one:.2g} and {other:.2g}: {which}."
         return replace(self, weight=weight, settled=True, final=True, note=note)
+
+
+def _alternate(answers: Sequence[float], apart: float) -> bool:
+    if len(answers) < 4:
+        return False
+    a, b, c, d = answers[-4:]
+    return _same(a, c, apart) and _same(b, d, apart) and not _same(c, d, apart)
 
 
 def _same(one: float, other: float, apart: float = SAME) -> bool:

@@ -224,7 +224,7 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         notes.insert(0, summary.workspace_sentence(map_))
     yield "text", notes
     box = None if map_.region.box is None else 1e3 * map_.region.box
-    at = 1e3 * in_base(map_.region.machine, map_.q, map_.region.marker)
+    at = 1e3 * in_base(map_.region.problem, map_.q, map_.region.marker)
     frame = "" if box is None else " The frame is the box of the requirement."
     drawn = []
     for view, (across, up) in plot.VIEWS.items():
@@ -386,10 +386,10 @@ def _flagged(result: Calibration) -> Block:
 def _convergence(result: Calibration) -> Iterator[Block]:
     try:
         c = result.certificate
-        parts = [f"next step of the convex program {c.step:.1e}", f"constraint violation {c.violation:.1e}"]
-        if c.gradient is not None:
-            parts.insert(0, f"gradient of the nonlinear problem {c.gradient:.1e} of that at nominal")
-        text = f"Certificate, computed anew at the solution: {', '.join(parts)} (in prior scales)."
+        text = (
+            f"Certificate, computed anew at the solution: next step of the convex program {c.step:.1e}, constraint "
+            f"violation {c.violation:.1e} (in prior scales)."
+        )
     except RpimError as error:
         text = f"No certificate. {error}"
     yield "text", [result.message, text]

@@ -144,15 +144,14 @@ def workspace_sentence(found: Workspace) -> str:
 
 def inconclusive(result: Calibration, found: Workspace | None) -> str:
     """Say that the position reached is less certain than the nominal robot's error; empty where it is not."""
-    from rpim_opt.calibration.acceptance import decisive
-
     nominal = rms(headline_errors(result)[1])
     if found is None or not _of_positions(result) or not found.typical > nominal:
         return ""
-    advice = decisive(result, found) or ["Measure more configurations (rpim-opt design --augment)."]
     return (
         f"Inconclusive: the median U over the region, {mm(1e3 * found.typical)} mm, is above the nominal robot's error "
-        f"of {mm(1e3 * nominal)} mm RMS on the {headline_errors(result)[0]} rows. {' '.join(advice)}"
+        f"of {mm(1e3 * nominal)} mm RMS on the {headline_errors(result)[0]} rows. Measure "
+        "more configurations (rpim-opt design --augment), the wrist turned further, or state what is known of the "
+        'reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
 
 

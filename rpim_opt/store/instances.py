@@ -30,7 +30,6 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record
 from rpim_opt.data.tables.reading import read_data, robodk_columns
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.linear import identified_of
 from rpim_opt.problem.multi_robot import together
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
@@ -293,7 +292,7 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
     formulation = named_formulation(stated.table.formulation, stated.path)
     own = stated.table.constraints.all(problem.robot, problem.data)
     formulation = replace(formulation, constraints=(*formulation.constraints, *own))
-    parameters = identified_of(problem.robot, problem.parameters, problem.data)
+    parameters = problem.identified
     for constraint in formulation.constraints:
         if isinstance(constraint, Box):
             constraint.bounds(parameters)

@@ -33,9 +33,8 @@ from rpim_opt.data.dataset import Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import READY
 from rpim_opt.data.record import Record
-from rpim_opt.problem.linear import around
 from rpim_opt.problem.noise import Scatter
-from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.problem import CalibrationProblem, around
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.origins import Carried, carried_by, displaced
@@ -244,7 +243,7 @@ class Stored:
     x: Array
     """Deviations of the identified parameters [SI]."""
     certificate: Certificate
-    """Optimality gap, violation, gradient."""
+    """Optimality gap and violation."""
     trust: Trust | None
     """Equations that a script's loss downweighted or left out."""
     held: tuple[Held, ...]

@@ -78,10 +78,10 @@ def test_a_derivative_that_is_not_the_residuals_certifies_nothing() -> None:
     z = result.z
     for _ in range(30):
         z = ro.convex.pose(ro.tikhonov, wrong(z)).solve(1.0).z
-    assert certified(ro.tikhonov, wrong(z), 1.0, z, 1.0).holds(z)  # by its own derivative
-    assert not certified(ro.tikhonov, wrong(z), 1.0, z, 1.0, residual=residual).holds(z)
+    assert certified(ro.tikhonov, wrong(z), z, 1.0).holds(z)  # by its own derivative
+    assert not certified(ro.tikhonov, wrong(z), z, 1.0, residual=residual).holds(z)
     right = problem.linearize(result.x)
-    assert certified(ro.tikhonov, right, 1.0, result.z, 1.0, residual=residual).holds(result.z)
+    assert certified(ro.tikhonov, right, result.z, 1.0, residual=residual).holds(result.z)
 
 
 @pytest.mark.parametrize("name", ["paper_arm", "rank_deficient", "pose", "distance"])

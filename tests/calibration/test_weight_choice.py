@@ -230,19 +230,12 @@ def test_a_weight_of_zero_is_an_answer() -> None:
 
 def test_of_a_robust_loss_a_rule_is_first_asked_where_weight_one_leads() -> None:
     seen: Any = SimpleNamespace(closed_form=False)
-    robust = replace(weight_choice(rule(5.0), True), robust=True)
-    begun = robust.begun()
-    assert (begun.weight, begun.settled, begun.final, begun.answers) == (1.0, True, False, ())
-    first = begun.confirmed(seen)
+    begun = {"robust": True, "weight": 1.0, "settled": True}
+    first = replace(weight_choice(rule(5.0), True), **begun).confirmed(seen)
     assert (first.weight, first.final, first.answers) == (5.0, False, (5.0,))
-    same = replace(weight_choice(rule(1.0), True), robust=True).begun().confirmed(seen)  # its own answer, to be shown
+    same = replace(weight_choice(rule(1.0), True), **begun).confirmed(seen)  # its own answer, to be shown
     assert (same.weight, same.final) == (1.0, False)
     assert same.selection is not None
-
-
-def test_other_programs_are_asked_at_once() -> None:
-    for choice in (weight_choice(rule(5.0), True), weight_choice("reml", True), weight_choice(3.0, True)):
-        assert choice.begun() is choice
 
 
 @pytest.mark.parametrize("passes", [2, 50])

@@ -115,7 +115,7 @@ def test_a_weight_is_said_with_where_it_came_from() -> None:
 
 @pytest.mark.parametrize(("count", "said"), [(0, "0 iterations"), (1, "1 iteration"), (2, "2 iterations")])
 def test_passes_are_counted(count: int, said: str) -> None:
-    good, bad = Certificate(None, 0.0, 0.0, 0.0), Certificate(None, 0.0, 0.0, 0.5)
+    good, bad = Certificate(0.0, 0.0, 0.0), Certificate(0.0, 0.0, 0.5)
     before = state(history=(None,) * count, outcome="rest")
 
     def said_of(at: State, evidence: Certificate = good, most: int = 500) -> str:

@@ -39,7 +39,6 @@ def test_a_loaded_result_is_the_same_to_the_last_bit(tmp_path: Path, name: str) 
     assert np.array_equal(again.covariance, result.covariance)
     assert np.array_equal(again.nominal_errors(), result.nominal_errors())
     assert again.history == result.history
-    assert again.certificate.gradient == result.certificate.gradient
     assert again.certificate.decrease < 1e-12  # of a solver's run of its own
     assert str(again) == str(result)
     assert np.array_equal(again.robot.mdh, result.robot.mdh)
