@@ -14,8 +14,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display
 from rpim_opt.convex.expressions import cp
-from rpim_opt.convex.given import Given, every_movement, given, machine_of, places, whole
-from rpim_opt.problem.workspace import within_box, within_ranges
+from rpim_opt.convex.given import Given, every_movement, given, places, problem_of, whole
+from rpim_opt.problem.workspace import bounding
 from rpim_opt.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -414,14 +414,12 @@ class Parsed:
             known = {place.name: place for place in self.where}
             q: list[Array] = []  # joint values (N, dof) at which movements are bounded
             for name in self.demanded.places:
-                if name == WORKSPACE and name not in known:
-                    q.append(within_ranges(machine_of(p)))
-                    continue
-                if name not in known:
+                if name not in (*known, WORKSPACE):
                     raise self._wrong(f"place '{name}'", choices(name, [*known, WORKSPACE]))
-                numbers = np.array(known[name].numbers)
-                is_box = known[name].is_box
-                q.append(within_box(machine_of(p), numbers[:, 0], numbers[:, 1]) if is_box else numbers)
+                numbers = np.array(known[name].numbers) if name in known else None
+                if numbers is None or known[name].is_box:
+                    numbers = bounding(problem_of(p), numbers, p.farthest)
+                q.append(numbers)
             found = every_movement(p, np.concatenate(q))
             size = np.linalg.norm(found.slope, axis=(1, 2))
             moving = size > 0

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.convex.expressions import cp
-from rpim_opt.problem.linear import Identified, Machine
+from rpim_opt.problem.problem import CalibrationProblem, Identified
 from rpim_opt.problem.workspace import Predicted, markers, moved, predicted
 from rpim_opt.robot.parameters import Parameters
 
@@ -98,7 +98,7 @@ class Given(Identified):
         >>> there.shape, there.is_affine()
         ((2, 3), True)
         """
-        return _expression(predicted(machine_of(self), q, marker, torque), self)
+        return _expression(predicted(problem_of(self), q, marker, torque, self.at), self)
 
     def movements(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
         """Return by how much the robot's own parameters move the reflector (N, 3) [m]; arguments as for `positions`.
@@ -117,27 +117,27 @@ class Given(Identified):
         >>> print(f"{1e3 * np.linalg.norm(there - before):.3f} mm")
         1.000 mm
         """
-        return _expression(moved(machine_of(self), q, marker, torque), self)
+        return _expression(moved(problem_of(self), q, marker, torque, self.at), self)
 
 
 def whole(p: Given) -> Parameters:
-    """Return all parameters of the machine; of a table alone those that it has."""
-    return p if p.machine is None else p.machine.parameters
+    """Return all parameters of the problem; of a table alone those that it has."""
+    return p if p.problem is None else p.problem.parameters
 
 
-def machine_of(p: Given) -> Machine:
-    """Return the machine of some parameters; InputError where there is none."""
-    if p.machine is None:
+def problem_of(p: Given) -> CalibrationProblem:
+    """Return the problem of some parameters, that positions are predicted from; InputError where there is none."""
+    if p.problem is None:
         found = "parameters of no problem"
         raise InputError("positions", found, "those that a problem's linear model has (`CalibrationProblem`)")
     p.asked.append("positions")
-    return p.machine
+    return p.problem
 
 
 def every_movement(p: Given, q: Array) -> Predicted:
     """Return `Given.movements` of every reflector, one after the other: (M, 3) [m] and their slopes (M, 3, n) by z."""
-    machine = machine_of(p)
-    found = [moved(machine, q, marker) for marker in markers(machine)]
+    problem = problem_of(p)
+    found = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]
     slope = np.concatenate([each.slope for each in found])
     return Predicted(np.concatenate([each.position for each in found]), slope * p.scale)
 
@@ -149,7 +149,7 @@ def _expression(found: Predicted, p: Given) -> cp.Expression:
 
 
 def given(z: Any, parameters: Parameters) -> Given:
-    """Return what constraint functions get: parameters, those of a linear model with the machine, that know z (n,).
+    """Return what constraint functions get: parameters, those of a linear model with its problem, that know z (n,).
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("paper_arm").problem.parameters.free
@@ -158,6 +158,4 @@ def given(z: Any, parameters: Parameters) -> Given:
     """
     if isinstance(parameters, Given):
         return replace(parameters, z=z)
-    table = {each.name: getattr(parameters, each.name) for each in fields(Parameters)}
-    machine = parameters.machine if isinstance(parameters, Identified) else None
-    return Given(**table, machine=machine, z=z)
+    return Given(**{each.name: getattr(parameters, each.name) for each in fields(parameters)}, z=z)

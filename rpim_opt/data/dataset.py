@@ -216,11 +216,11 @@ class Dataset(Tabled):
         for name, part in parts.items():
             if any(part.robot):
                 raise InputError(f"data of '{name}'", "rows of several robots", "those of one")
-        return cls._of_parts(list(parts.values()), list(parts), robots=list(parts))
+        return cls.concatenated(list(parts.values()), list(parts), robots=list(parts))
 
     @classmethod
-    def _of_parts(cls, parts: Sequence[Dataset], names: Sequence[str], robots: Sequence[str] = ()) -> Dataset:
-        """Return the rows of several datasets, each with configurations of its own."""
+    def concatenated(cls, parts: Sequence[Dataset], names: Sequence[str], robots: Sequence[str] = ()) -> Dataset:
+        """Return the rows of several datasets, each with configurations of its own; names precede double labels."""
         rows = np.cumsum([0, *(len(part) for part in parts)])
         first = np.cumsum([0, *(int(part.configuration.max()) + 1 for part in parts)])
         blocks = tuple(
@@ -402,7 +402,7 @@ class Dataset(Tabled):
         >>> len(twice), twice.label[0], len(set(twice.configuration))
         (18, 'morning:T2-1', 9)
         """
-        whole = cls._of_parts(parts, names)
+        whole = cls.concatenated(parts, names)
         stop = np.unique(whole.q, axis=0, return_inverse=True)[1].reshape(-1)
         first = np.full(len(whole), len(whole))
         np.minimum.at(first, stop, whole.configuration)  # of rows at equal joint values

@@ -31,16 +31,9 @@ class LaserTracker:
 
         C = (range + range_ppm D)^2 u u' + (transverse + angle D)^2 (1 - u u')
 
-    Parameters
-    ----------
-    range, transverse
-        Standard deviations along and across the beam at zero distance [m].
-    range_ppm
-        Growth along the beam per metre [1]: 1e-6 for 1 ppm.
-    angle
-        Growth across the beam [rad].
-    x, y, z
-        The tracker's place in the instrument's frame [m]; its origin by default.
+    ``range`` and ``transverse`` are standard deviations along and across the beam at zero distance [m], ``range_ppm``
+    (1e-6 for 1 ppm) [1] and ``angle`` [rad] how they grow; ``x``, ``y``, ``z`` the tracker's place in the instrument's
+    frame [m], its origin by default.
 
     Examples
     --------

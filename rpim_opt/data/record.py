@@ -25,24 +25,12 @@ CONFIDENCE = 0.95
 class Requirement:
     """A limit on how far the robot may miss, and the region where it has to be kept.
 
-    Parameters
-    ----------
-    limit
-        Of the distance between the position that is reached and the one that the model says [m].
-    box
-        Sides (low, high) along x, y, z [m] in the robot's base frame, where the nominal reflector is to be; anywhere by
-        default.
-    joints
-        Sides (low, high) of joints [rad or m], by their number from 1; of the others what was measured.
-    marker
-        The reflector; the only one, or the first, by default.
-    confidence
-        Probability with which the limit is to be kept at every configuration of the region.
-
-    Raises
-    ------
-    InputError
-        For a limit or a confidence that nothing can keep, and sides that are not (low, high).
+    The ``limit`` is that of the distance between the position that is reached and the one that the model says [m], kept
+    with probability ``confidence`` at every configuration of the region: the nominal reflector in a ``box``, sides
+    (low, high) along x, y, z [m] in the robot's base frame, anywhere by default; ``joints`` within sides (low, high)
+    [rad or m], by their number from 1, the others within what was measured. ``marker`` is the reflector; the only one,
+    or the first, by default. InputError for a limit or a confidence that nothing can keep, and sides that are not
+    (low, high).
 
     Examples
     --------
@@ -89,19 +77,11 @@ class HeldOut:
     They validate the procedure: data, model, formulation and weight rule. The parameters that are delivered come from
     all rows.
 
-    Parameters
-    ----------
-    label
-        N labels of the held-out rows.
-    used
-        How many rows the parameters that were judged came from.
-    nominal, error
-        (N,) errors before and after [m]; NaN for rows that measure no length.
-    sigmas, allowed
-        (N,) as of `Validation`: the residual in standard deviations of its prediction, and what of it is allowed; NaN
-        where there is no covariance.
-    coverage
-        Share of the lengths that lay in the 95 % interval of a reading; None without covariance.
+    ``label`` are N held-out rows, ``used`` is how many rows the parameters that were judged came from; ``nominal`` and
+    ``error`` (N,) are errors before and after [m], NaN for rows that measure no length. ``sigmas`` and ``allowed`` (N,)
+    are as of `Validation`: the residual in standard deviations of its prediction, and what of it is allowed; NaN where
+    there is no covariance. ``coverage`` is the share of the lengths that lay in the 95 % interval of a reading; None
+    without covariance.
 
     Examples
     --------

@@ -235,7 +235,6 @@ def test_large_errors_converge_to_the_same_answer(size: float) -> None:
     near = ro.calibrate(problem, ro.tikhonov, 1e-3, start=truth, max_iterations=60)
     scale = problem.parameters.free.scale
     assert np.abs((result.x - near.x) / scale).max() < 1e-5
-    assert result.certificate.gradient < 1e-6
 
 
 def test_damping_costs_nothing_where_full_steps_work() -> None:

@@ -274,7 +274,10 @@ def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.Monke
             LocalCluster(n_workers=1, threads_per_worker=2, processes=False, dashboard_address=None) as cluster,
             Client(cluster) as client,
         ):
-            compute = ro.problem.on_cluster(client)
+
+            def compute(task, each):
+                return client.gather(client.map(task, list(each), pure=False))
+
             parted = ro.problem.PartitionedProblem(problem.robot, problem.parameters, problem.data, blocks, compute)
             for rule in SELECTORS:
                 whole, found = calibrated(problem, formulation, rule), calibrated(parted, formulation, rule)

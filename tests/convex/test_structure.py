@@ -89,8 +89,6 @@ def test_the_same_quadratic_gives_the_same_answer_and_all_that_follows(
     assert np.abs(difference).max() < 1e-6 * np.abs(in_scales(want.covariance, problem)).max()
     q = problem.data.q[:3]
     assert result.predict(q).standard == pytest.approx(want.predict(q).standard, rel=1e-5)
-    assert result.certificate.gradient is not None
-    assert result.certificate.gradient < 1e-7
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)

@@ -172,25 +172,11 @@ def read_board(source: Any) -> dict[str, Array]:
 
 
 def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: str = "eye_in_hand") -> Dataset:
-    """Return what a camera saw of a board, view by view.
+    """Return what a camera saw of a board's P points, view by view, at joint values q (V, dof) [rad or m].
 
-    Parameters
-    ----------
-    q
-        (V, dof) joint values of the controller in every view [rad or m].
-    board
-        Its P points by name.
-    uv
-        (V, P, 2) where they appear [px]; NaN for points that were not found.
-    sigma
-        One standard deviation [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2].
-    measurement
-        ``"eye_in_hand"``, or ``"eye_to_hand"`` where the robot carries the board.
-
-    Raises
-    ------
-    InputError
-        For shapes that do not fit together, and a measurement that is no camera's.
+    The points appear at ``uv`` (V, P, 2) [px], NaN for those that were not found; ``sigma`` is one standard deviation
+    [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2]; ``measurement`` is ``"eye_to_hand"`` where the
+    robot carries the board. InputError for shapes that do not fit together, and a measurement that is no camera's.
 
     Examples
     --------

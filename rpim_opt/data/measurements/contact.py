@@ -206,18 +206,10 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
 
 
 def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool = False) -> Dataset:
-    """Return touches of unmeasured points or planes.
+    """Return touches of unmeasured points or planes at joint values q (N, dof) of the controller [rad or m].
 
-    Parameters
-    ----------
-    q
-        (N, dof) joint values of the controller at every touch [rad or m].
-    point
-        N names: rows with the same one touched the same point.
-    sigma
-        Standard deviation of a touch [m], or covariances (3, 3) or (N, 3, 3) [m^2].
-    planes
-        Whether planes were touched.
+    Rows with the same one of N names touched the same ``point``, or the same plane if ``planes``; ``sigma`` is the
+    standard deviation of a touch [m], or covariances (3, 3) or (N, 3, 3) [m^2].
 
     Examples
     --------

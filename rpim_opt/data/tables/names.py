@@ -61,7 +61,7 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
 )  # fmt: skip
 """What else a column may be called, in lower case and with underscores, what it means, and why unless that is usual."""
-DIALECTS = {
+IN_SI = {
     r"%?field\..*|/.*|(?:pose|transform)\.\w+\.\w|position\[\d\]": "ROS: SI units (REP 103)",
     r"(?:actual|target)_q_\d": "Universal Robots' RTDE: SI units",
 }
@@ -94,11 +94,6 @@ MOST_PREFIXES = 6
 """Words before a name that is known."""
 VALUE = frozenset({"position", "pos", "angle", "value"})
 """What may stand behind the name of a joint for its value."""
-
-
-def in_si(name: str) -> str:
-    """Return why a column without a unit is in rad or m; nothing where its name does not say it."""
-    return next((why for pattern, why in DIALECTS.items() if re.fullmatch(pattern, name)), "")
 
 
 def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
@@ -134,12 +129,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
 
 
 def endings(stem: str) -> Iterator[tuple[str, str]]:
-    """Yield what may stand before a known name, and the rest: ``robot1_joint_2`` is ``joint_2`` of ``robot1``.
-
-    >>> from rpim_opt.data.tables.names import endings
-    >>> list(endings("robot1_joint_2"))
-    [('robot1_', 'joint_2'), ('robot1_joint_', '2')]
-    """
+    """Yield what may stand before a known name, and the rest: ``robot1_joint_2`` is ``joint_2`` of ``robot1``."""
     for match in islice(re.finditer(r"[\s._/:\-]+", stem), MOST_PREFIXES):
         yield stem[: match.end()], stem[match.end() :]
 

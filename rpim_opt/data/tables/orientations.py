@@ -19,6 +19,7 @@ ENTRIES = re.compile(r"(?:m|t|h|mat|matrix|tf|pose)[_ \[]*(\d{1,2})\]?")
 SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 """Rows and columns of a matrix by its number of entries."""
 EULER = re.compile(r"(?:extrinsic|intrinsic) ([xyz])(?!\1)([xyz])(?!\2)[xyz]")
+"""Three turns about axes that stand still, or that turn with it."""
 ROUNDED = 1e-6
 """The last row of a matrix is 0 0 0 1 within this."""
 Place = tuple[int, int]
@@ -87,13 +88,6 @@ def quaternion_columns(read: Readings, dof: int) -> list[str]:
             if prefix != "q" or counted:
                 return [columns[i] for i in sorted(columns)]
     return []
-
-
-def require_rotation(stated: str) -> None:
-    """Refuse a rotation that is neither a vector nor three turns about axes that stand still or turn with it."""
-    if stated not in ("", "vector") and not EULER.fullmatch(stated):
-        accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
-        raise InputError("--rotation", f"'{stated}'", accepted)
 
 
 def quaternions(angles: np.ndarray, rotation: str) -> dict[str, list[str]]:

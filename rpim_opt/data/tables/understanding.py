@@ -19,17 +19,17 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.columns import number_columns, text_columns
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import (
+    IN_SI,
     JOINTS,
     TURNS,
     UR_JOINTS,
     Reading,
     Readings,
     endings,
-    in_si,
     recognize,
     ur_joint,
 )
-from rpim_opt.data.tables.orientations import numbered, quaternion_columns, quaternions, require_rotation
+from rpim_opt.data.tables.orientations import EULER, numbered, quaternion_columns, quaternions
 from rpim_opt.robot.mdh import Robot
 
 TURNED = ("rx", "ry", "rz")
@@ -117,7 +117,9 @@ def understand(
     raw = source if isinstance(source, RawTable) else read_raw(source, options)
     stated = options.units
     options = replace(options, units={**raw.units, **stated})
-    require_rotation(options.rotation)
+    if options.rotation not in ("", "vector") and not EULER.fullmatch(options.rotation):
+        accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
+        raise InputError("--rotation", f"'{options.rotation}'", accepted)
     known = number_columns(robot, kind)
     try:
         read, rotation = _readings(raw, robot, kind, options, joints, targets)
@@ -385,12 +387,7 @@ def _under_our_names(
 
 
 def meaning(stem: str) -> str:
-    """Return what a column of ours is, in words.
-
-    >>> from rpim_opt.data.tables.understanding import meaning
-    >>> [meaning(stem) for stem in ("q2", "x", "u95_z", "qw", "r12", "to_q1")]
-    ['joint 2', 'measured x', 'U95 of z', 'quaternion w', 'rotation matrix 1,2', 'second point: joint 1']
-    """
+    """Return what a column of ours is, in words: ``U95 of z``, ``second point: joint 1``."""
     if stem.startswith("to_") and stem not in MEANINGS:
         return f"second point: {meaning(stem.removeprefix('to_'))}"
     matches = ((re.fullmatch(pattern, stem), words) for pattern, words in MEANINGS.items())
@@ -411,10 +408,9 @@ def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[s
         return units[dimension], "--units"
     if dimension == "pixel":
         return "px", "the only unit"
-    why = in_si(name)
-    if why and dimension in ("angle", "length"):
-        return ("rad" if dimension == "angle" else "m"), why
-    return "", ""
+    why = next((why for pattern, why in IN_SI.items() if re.fullmatch(pattern, name)), "")
+    unit = {"angle": "rad", "length": "m"}.get(dimension, "")
+    return (unit, why) if unit and why else ("", "")
 
 
 def _values(cells: Sequence[Any], name: str) -> np.ndarray:
