@@ -17,11 +17,11 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import counted, progress_bar
+from rpim_opt.study import replicates
 from rpim_opt.study.methods import USUAL, Method, answer_of, measure, methods_of, metrics_of
 from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
-from rpim_opt.study.provenance import package_code, provenance
 from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED, WITH_FIGURES, Summary, figures, summarize
-from rpim_opt.study.replicates import Row, require_package, run_cases
+from rpim_opt.study.replicates import Row, content_hash, require_package, run_cases
 
 MOST_DRAWS = 100_000
 """Each is a calibration of its own, and is listed before the first begins."""
@@ -90,7 +90,8 @@ def compare(
     journal
         A file that every finished replicate is written to at once. A call with the same code and arguments goes on
         with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is refused, and
-        so is an argument whose content cannot be hashed. Files that a function reads are not known to it.
+        so is an argument whose content cannot be hashed. Code is that of the Python files that are loaded; other files
+        that a function reads are not known to it.
     resume
         False to begin the journal anew; None refuses to drop what an interrupted run has computed.
     progress
@@ -132,7 +133,7 @@ def compare(
             replicate, sources[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case
         )
 
-    made = provenance()
+    made = replicates.provenance()
     cases: list[Row] = []
     for source, split, count, factor in product(sources.values(), ways.values(), sizes, factors):
         drawn = source.drawn or split.label != FOLDER or factor > 1  # what no seed changes is there once
@@ -157,10 +158,9 @@ def compare(
     code: dict[str, str] = {}
     if path is not None:
         require_package("joblib", "journal")
-        from rpim_opt.study.content_hash import content_hash
-
         stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
-        code = package_code() | {f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}
+        hashes = {f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}
+        code = replicates.package_code() | replicates.script_code() | hashes
         with refused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:

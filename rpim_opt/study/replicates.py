@@ -1,20 +1,32 @@
-"""Replicates: computed here, in processes or on a Dask cluster, and kept in a SQLite database when they are done."""
+"""Replicates: computed here, in processes or on a Dask cluster, kept in a SQLite database; what made them."""
 
 from __future__ import annotations
 
 import json
+import platform
 import signal
 import sqlite3
+import subprocess
+import sys
+import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError
 from contextlib import ExitStack, closing, contextmanager, suppress
+from dataclasses import fields, is_dataclass
+from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
+from types import FunctionType, MappingProxyType
 from typing import Any
+
+import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, RpimError
 from rpim_opt.basics.files import LARGEST_DATA, parse_json, refused, require_file
+from rpim_opt.basics.text import version_of
+from rpim_opt.data.record import PACKAGES
+from rpim_opt.store.problem_file import problems_folder
 
 Row = dict[str, Any]
 """A case with its figures."""
@@ -22,12 +34,20 @@ Work = Callable[[], Row]
 """Computation of a replicate; it travels to wherever it is computed."""
 Progress = Callable[[int, int], None]
 """Called with how many replicates of how many are done."""
+PACKAGE = Path(__file__).resolve().parents[1]
+LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
+"""Where Python files lie that the versions of packages stand for."""
+SHORT = 12
+"""Digits of a digest that a reader compares by eye."""
 SCHEMA = """
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS code (part TEXT PRIMARY KEY, digest TEXT);
 CREATE TABLE IF NOT EXISTS replicates (key TEXT PRIMARY KEY, found TEXT, digest TEXT);
 COMMIT;
 """
+
+
+# --- a run -----------------------------------------------------------------------------------------------------------
 
 
 def run_cases(
@@ -127,6 +147,9 @@ def require_package(name: str, where: str) -> None:
         raise InputError(where, f"no package {name}", "pip install 'rpim-opt[studies]'")
 
 
+# --- who computes ----------------------------------------------------------------------------------------------------
+
+
 def compute(tasks: Sequence[tuple[str, Work]], workers: int, scheduler: Any) -> Iterator[tuple[str, Row]]:
     """Return an iterator of keys with what was computed, as it is finished.
 
@@ -186,3 +209,144 @@ def _on_cluster(tasks: Sequence[tuple[str, Work]], scheduler: Any) -> Iterator[t
         except (KilledWorker, CancelledError) as error:  # whoever computes it dies, or the scheduler has
             said = next(iter(str(error).splitlines()), type(error).__name__)
             raise RpimError(f"Dask gave a replicate up: {said} Finished replicates are kept.") from None
+
+
+# --- what made them --------------------------------------------------------------------------------------------------
+
+
+def package_code() -> dict[str, str]:
+    """Return digests of the package and of its problems, and the versions of what computes."""
+    digests = {}
+    for name, folder, pattern in (("package", PACKAGE, "**/*.py"), ("set of problems", problems_folder(), "*/*.*")):
+        content = sha256()
+        for file in sorted(folder.glob(pattern)):
+            content.update(sha256(str(file.relative_to(folder)).encode()).digest())
+            content.update(sha256(file.read_bytes()).digest())
+        digests[name] = content.hexdigest()
+    return {**digests, "set of versions": versions()}
+
+
+def versions() -> str:
+    """Return the versions of what computes."""
+    packages = ", ".join(f"{package} {version_of(package)}" for package in PACKAGES)
+    return f"{platform.python_implementation()} {platform.python_version()}, {packages}"
+
+
+def file_state(path: Path) -> str:
+    """Return a file's name with its digest and its commit."""
+    return f"{path.name} with SHA-256 {sha256(path.read_bytes()).hexdigest()[:SHORT]} ({commit(path.parent, path)})"
+
+
+def package_state() -> str:
+    """Return the package's version, its digest, and its commit where there is one."""
+    checkout = (PACKAGE.parent / "pyproject.toml").is_file()
+    state = commit(PACKAGE.parent, PACKAGE, problems_folder()) if checkout else "installed"
+    return f"rpim-opt {version_of('rpim-opt')}, SHA-256 {package_code()['package'][:SHORT]} ({state})"
+
+
+def commit(folder: Path, *paths: Path) -> str:
+    """Return the commit that paths are of, and whether it lacks them (``untracked``) or has others (``dirty``).
+
+    Results of studies do not count.
+    """
+
+    def git(*arguments: str) -> str:
+        command = ["git", "-C", str(folder), *arguments]
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+
+    try:
+        said = f"commit {git('describe', '--always').strip()}"
+        changes = git(
+            "status", "--porcelain", "--untracked-files=all", "--", *map(str, paths), ":(exclude,glob)**/results/**"
+        )
+    except (OSError, subprocess.CalledProcessError):
+        return "in no repository"
+    if "??" in {line[:2] for line in changes.splitlines()}:
+        return f"{said}, untracked"
+    return f"{said}, dirty" if changes else said
+
+
+def provenance() -> dict[str, str]:
+    """Return script, package, versions and time of a comparison."""
+    file = getattr(sys.modules.get("__main__"), "__file__", None)
+    script = "none: an interactive session"
+    if file is not None and Path(file).name in ("rpim-opt", "__main__.py"):
+        script = "rpim-opt " + " ".join(sys.argv[1:])
+    elif file is not None and Path(file).is_file():
+        script = file_state(Path(file).resolve())
+    made = datetime.now(UTC).isoformat(timespec="seconds")
+    return {"Script": script, "Package": package_state(), "Versions": versions(), "Made": made}
+
+
+# --- what a comparison's replicates follow from ---------------------------------------------------------------------
+
+
+def script_code() -> dict[str, str]:
+    """Return digests of the Python files that are loaded besides installed ones, and of what a script was called with.
+
+    Together they stand for the code of a script's functions, and for the globals that these read.
+    """
+    found = {}
+    for module in list(sys.modules.values()):
+        file = Path(getattr(module, "__file__", None) or "")
+        own = PACKAGE not in file.parents and not any(folder in file.resolve().parents for folder in LIBRARIES)
+        if file.suffix == ".py" and own and file.is_file():
+            found[f"file {file.name} ({module.__name__})"] = sha256(file.read_bytes()).hexdigest()
+            if module.__name__ == "__main__":
+                found["set of arguments of the script"] = repr(sys.argv[1:])
+    return found
+
+
+def content_hash(thing: Any, where: str) -> str:
+    """Return the SHA-256 of a value or an object by joblib, which hashes what can be pickled.
+
+    Functions count by their names, defaults and closures: their code is that of `script_code`. InputError names what
+    has no content that can be hashed, such as a generator, and functions of an interactive session, which has no file.
+    """
+    from joblib.hashing import NumpyHasher
+
+    class Hasher(NumpyHasher):
+        def save(self, obj: Any) -> None:
+            if isinstance(obj, MappingProxyType):
+                obj = dict(obj)
+            elif isinstance(obj, frozenset):
+                obj = (frozenset, sorted(content_hash(each, where) for each in obj))
+            elif isinstance(obj, np.ndarray):  # joblib tells layouts apart, and sees no mask
+                obj = np.ascontiguousarray(obj) if type(obj) is np.ndarray else (type(obj), obj.__reduce__())
+            try:
+                super().save(obj)
+            except InputError:
+                raise
+            except Exception as error:  # of any library's own making
+                found = f"a {type(obj).__module__}.{type(obj).__qualname__}, whose content cannot be hashed ({error})"
+                accepted = "arguments that joblib can hash by their content, or no journal"
+                raise InputError(where, found, accepted) from None
+
+        def reducer_override(self, thing: Any) -> Any:
+            if isinstance(thing, FunctionType):
+                if thing.__module__ == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
+                    raise InputError(where, f"{thing.__qualname__} of an interactive session", "functions of a file")
+                content: Any = (thing.__module__, thing.__qualname__, thing.__defaults__, thing.__kwdefaults__)
+                content += (_closure(thing), dict(vars(thing)))
+            elif type(thing).__module__.startswith("rpim_opt.") and is_dataclass(thing) and not isinstance(thing, type):
+                content = {each.name: getattr(thing, each.name) for each in fields(thing)}  # without what it cached
+            else:
+                return NotImplemented
+            return _Content, (type(thing).__qualname__,), content  # as a state: circles end
+
+    return str(Hasher("sha256").hash(thing))
+
+
+class _Content:
+    """Stands for a thing of which the content follows."""
+
+    def __init__(self, kind: str) -> None:
+        self.kind = kind
+
+
+def _closure(function: FunctionType) -> dict[str, Any]:
+    found = {}
+    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
+        with suppress(ValueError):  # it holds nothing yet
+            found[name] = cell.cell_contents
+    return found

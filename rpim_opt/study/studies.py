@@ -19,8 +19,8 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import LARGEST_DATA, json_text, read_json, refused, require_file, write_files
-from rpim_opt.study.provenance import SHORT, commit, file_state, package_code, package_state, versions
-from rpim_opt.study.replicates import Progress, Row, remove_journal, require_package, run_cases
+from rpim_opt.study import replicates
+from rpim_opt.study.replicates import Progress, Row, commit, require_package, run_cases
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 """What a study has: a text, a `Metric` for each figure that is held, and three functions."""
@@ -198,10 +198,10 @@ def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> st
         root = path.parent.parent
         source = f" ({commit(root, *(root / name for name in ('rpim_opt', 'studies', 'problems')))})"
     else:
-        source = f", {file_state(path)}, with {package_state()}"
-    digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
+        source = f", {replicates.file_state(path)}, with {replicates.package_state()}"
+    digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[: replicates.SHORT]
     known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"
-    return f"Made by `{command}`{source}: {count} replicates, {versions()}. {known}."
+    return f"Made by `{command}`{source}: {count} replicates, {replicates.versions()}. {known}."
 
 
 # --- a run -----------------------------------------------------------------------------------------------------------
@@ -257,7 +257,7 @@ def run_study(
     cases = study.cases(quick)
     files = files_of(path, study)
     made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
-    code = {**{f"file {file}": digest for file, digest in files.items()}, **package_code()}
+    code = {**{f"file {file}": digest for file, digest in files.items()}, **replicates.package_code()}
     journal = folder / f"{REPLICATES}.sqlite"
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, scheduler, progress, journal, code, resume)
     report = study.report(rows)
@@ -266,7 +266,7 @@ def run_study(
     stream = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
     write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})
-    remove_journal(journal)
+    replicates.remove_journal(journal)
     return report, folder
 
 

@@ -289,12 +289,12 @@ def test_a_journal_of_other_arguments_is_not_resumed(tmp_path: Path, change: dic
 
 
 def test_a_journal_knows_the_package_that_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rpim_opt.study import comparison
+    from rpim_opt.study import replicates
 
     journal = tmp_path / "journal.sqlite"
     ro.compare("position", selectors=1.0, journal=journal, progress=False)
-    other = {**comparison.package_code(), "package": "0" * 64}
-    monkeypatch.setattr(comparison, "package_code", lambda: other)
+    other = {**replicates.package_code(), "package": "0" * 64}
+    monkeypatch.setattr(replicates, "package_code", lambda: other)
     with pytest.raises(ro.InputError, match="replicates of another package"):
         ro.compare("position", selectors=1.0, journal=journal, progress=False)
 
