@@ -1,10 +1,10 @@
-"""The program: an interrupt is one word, also while the commands are loaded."""
+"""Entry point of the program; an interrupt ends it with one word, even while it is starting."""
 
 import sys
 
 
 def main() -> None:
-    """Load the commands and run the one that was asked for."""
+    """Run the command line."""
     try:
         from rpim_opt.cli import main as run
 

@@ -1,4 +1,4 @@
-"""What every floor needs and knows no robot."""
+"""Shared utilities without robotics: errors, units, files, tables, text and threads."""
 
 import lazy_loader
 

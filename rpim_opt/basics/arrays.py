@@ -11,7 +11,7 @@ Array = NDArray[np.float64]
 
 
 def statistics(errors: Array, unit: Literal["mm", "mrad"] = "mm") -> dict[str, Any]:
-    """Return mean, RMS, largest [mm or mrad] and number of errors [m or rad]; None where none is a number."""
+    """Return mean, RMS, maximum [mm or mrad] and count of errors [m or rad]; None if all are NaN."""
     of = 1e3 * errors[np.isfinite(errors)]
     if not len(of):
         return {f"mean_{unit}": None, f"rms_{unit}": None, f"max_{unit}": None, "count": 0}

@@ -1,4 +1,4 @@
-"""Errors: each names the culprit, what was found, what is accepted, and the remedy."""
+"""Exceptions, whose messages name the place, the value found, the accepted values and the remedy."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ LONGEST_COMPARED = 200
 
 
 class RpimError(Exception):
-    """Base of every error that this package raises on purpose.
+    """Base class of all exceptions of this package.
 
     >>> import rpim_opt as ro
     >>> try:
@@ -27,7 +27,7 @@ class RpimError(Exception):
 
 
 class InputError(RpimError):
-    """Something a user wrote cannot be used.
+    """Invalid input: an argument, a file, a key, a column or a row.
 
     Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes.
 
@@ -57,22 +57,22 @@ class InputError(RpimError):
         super().__init__(f"{place}: found {self.found}, accepted: {self.accepted}.")
 
     def within(self, file: object) -> InputError:
-        """Return the same error with the file it occurred in, unless it names one already."""
+        """Return the error with the file added, unless it already names one."""
         return self if self.file else InputError(self.where, self.found, self.accepted, file)
 
 
 def _one_line(text: str) -> str:
-    """Return a part of a sentence: what files say may have lines, and be of any length."""
+    """Return a text on one line, shortened: text from a file may have line breaks and any length."""
     line = " ".join(text.splitlines())
     return line if len(line) <= LONGEST else f"{line[:LONGEST]}..."
 
 
 class NotDelivered(InputError):
-    """A calibration whose verdict is against it is to be used; where it was forced, files say so."""
+    """The robot of a failed calibration was requested; ``despite_verdict=True`` writes it with a note."""
 
 
 class RowError(InputError):
-    """A row of a table (from 0) is wrong, and the table's reader knows what the row is called.
+    """Invalid value in a row of a table (counted from 0); the table's reader adds the label of the row.
 
     >>> from rpim_opt.basics.exceptions import RowError
     >>> print(RowError(3, "a quaternion of norm 2", "norm 1").named("row P4"))
@@ -84,16 +84,16 @@ class RowError(InputError):
         self.row = row
 
     def named(self, where: str) -> InputError:
-        """Return the same error with the row's name."""
+        """Return the error with the label of the row."""
         return InputError(where, self.found, self.accepted)
 
 
 class Conflict(NamedTuple):
-    """By how much bounds of parameters [SI] or of configurations [sigma] would have to give way.
+    """Contradiction between constraints and measurements, and the loosening of bounds that resolves it.
 
-    Each of the two alone makes the program feasible, with the least sum; empty where it cannot. ``constraints`` are
-    those that cannot hold together, of which any one less would do; ``stated`` says by how much [SI] statements in
-    words would have to give way.
+        Each of the two alone makes the program feasible, with the least sum; empty where it cannot. ``constraints`` are
+        those that cannot hold together, of which any one less would do; ``stated`` says by how much [SI] statements in
+    Loosening either ``parameters`` [SI] or ``configurations`` [standard deviations] by these amounts, of smallest
     """
 
     parameters: dict[str, float]
@@ -102,18 +102,18 @@ class Conflict(NamedTuple):
     stated: Mapping[str, float] = MappingProxyType({})
 
     def __str__(self) -> str:
-        """Return it as a sentence, empty where nothing is known."""
+        """Return the contradiction as a sentence; empty if there is none."""
         parts = []
         if self.constraints:
             parts.append(f"these constraints contradict each other: {', '.join(self.constraints)}")
         bounds = _by(self.parameters)
-        rows = ", ".join(f"{name} by {v:.3g} sigmas" for name, v in self.configurations.items())
+        rows = ", ".join(f"{name} by {v:.3g} standard deviations" for name, v in self.configurations.items())
         if bounds and rows:
-            parts.append(f"bounds contradict measurements: loosening {bounds} would do, and so would loosening {rows}")
+            parts.append(f"bounds contradict measurements: loosen {bounds}, or else {rows}")
         elif bounds or rows:
-            parts.append(f"loosening {bounds or rows} would do")
+            parts.append(f"loosen {bounds or rows}")
         if self.stated:
-            parts.append(f"loosening {_by(self.stated)} would do")
+            parts.append(f"loosen {_by(self.stated)}")
         return "; ".join(parts)
 
 
@@ -122,18 +122,18 @@ def _by(bounds: Mapping[str, float]) -> str:
 
 
 class NoSolutionFound(RpimError):
-    """A convex program was not solved; its parameters, kept as attributes, are the evidence.
+    """A convex program has no solution, or the solver found none.
 
     Parameters
     ----------
     formulation, weight
-        Its name, and the weight at which it was to be solved.
+        Name of the formulation, and the regularization weight.
     status
-        How the solver ended, ``"infeasible"`` for instance.
+        Status of the solver, such as ``"infeasible"``.
     conflict
-        What contradicts what; None where that is not known.
+        The contradicting constraints; None if unknown.
     advice
-        What may help, where nothing contradicts anything.
+        A remedy, if there is no contradiction.
 
     Examples
     --------
@@ -156,13 +156,17 @@ class NoSolutionFound(RpimError):
         self.status = status
         self.conflict = conflict
         self.advice = advice
-        why = (str(conflict) if conflict else "") or advice or "change the weight, or give it constraints"
+        why = (
+            (str(conflict) if conflict else "")
+            or advice
+            or "use another weight, or add constraints that bound the solution"
+        )
         super().__init__(
             f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; {why}."
         )
 
     def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
-        """Return the same error with names for the configurations' numbers.
+        """Return the error with labels in place of the numbers of configurations.
 
         >>> import rpim_opt as ro
         >>> from rpim_opt.basics.exceptions import Conflict
@@ -186,7 +190,7 @@ class NoSolutionFound(RpimError):
 
 
 def choices(found: str, known: Iterable[str], many: int = 24) -> str:
-    """List what is known; of more than ``many`` what resembles ``found``, and how many others there are."""
+    """Return the valid names as text; of more than ``many`` those similar to ``found`` and the number of the others."""
     names = list(known)
     found = found[:LONGEST_COMPARED]
     close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
@@ -200,7 +204,7 @@ def choices(found: str, known: Iterable[str], many: int = 24) -> str:
 
 
 def pick(known: Mapping[str, Named], name: str, where: str, file: object = None, also: str = "") -> Named:
-    """Return ``known[name]``, or list what there is."""
+    """Return ``known[name]``; InputError with the valid names if there is none."""
     if name not in known:
         raise InputError(where, f"'{name}'", also + choices(name, known), file)
     return known[name]

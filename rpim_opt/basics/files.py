@@ -1,4 +1,4 @@
-"""Files in and out: ordinary ones of a bounded size are read, and what is written is whole or as it was before."""
+"""Reading of regular files of bounded size, and atomic writing."""
 
 from __future__ import annotations
 
@@ -34,25 +34,27 @@ ENDING = ".part"
 
 
 def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> None:
-    """Refuse what is no ordinary file of at most ``largest`` bytes; a pipe or device would be read for ever."""
+    """Refuse anything but a regular file of at most ``largest`` bytes; a pipe or device may never end."""
     try:
         found = path.stat()
     except FileNotFoundError:
         near: list[str] = []
         with suppress(OSError):
             near = sorted(p.name for p in path.parent.iterdir() if p.suffix in endings)
-        raise InputError("the file", "nothing", choices(path.name, near) if near else "a file there", path) from None
+        raise InputError(
+            "the file", "nothing", choices(path.name, near) if near else "an existing file", path
+        ) from None
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         raise InputError("the file", str(error), "a readable file", path) from None
     if not stat.S_ISREG(found.st_mode):
         kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
-        raise InputError("the file", kind, "an ordinary file", path)
+        raise InputError("the file", kind, "a regular file", path)
     if found.st_size > largest:
         raise InputError("the file", f"{found.st_size} bytes", f"a file of at most {largest} bytes", path)
 
 
 def read_bytes(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> bytes:
-    """Return a file's content; errors as `require_file` has them."""
+    """Return the content of a file; errors as for `require_file`."""
     require_file(path, largest, endings)
     try:
         with path.open("rb") as stream:
@@ -65,7 +67,7 @@ def read_bytes(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] =
 
 
 def read_text(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> str:
-    """Return a file's text; errors as `require_file` has them, and for what is no UTF-8."""
+    """Return the text of a file; errors as for `require_file`, and for text that is not UTF-8."""
     content = read_bytes(path, largest, endings)
     try:
         return content.decode("utf-8-sig").replace("\r\n", "\n")
@@ -74,7 +76,7 @@ def read_text(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = 
 
 
 def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
-    """Return the path of a file that a folder names, which must lie in that folder.
+    """Return the path of a file in a folder; refuse names that lead out of it.
 
     A folder may come from somebody else: what it names elsewhere is neither read nor written, be it by an absolute
     path, by ``..`` or by a link. Errors have ``where`` and ``file`` as the place of the name.
@@ -97,7 +99,7 @@ def read_toml(path: Path) -> dict[str, Any]:
     """Return a TOML file's content; errors say line and column."""
     text = read_text(path, endings=[".toml"])
     if _DEEP.search(text):
-        raise InputError("the TOML text", "a key of more than a hundred parts", "shorter keys", path)
+        raise InputError("the TOML text", "a key of more than a hundred parts", "keys with fewer parts", path)
     try:
         return tomllib.loads(text)
     except (ValueError, RecursionError) as error:  # integers of thousands of digits; tables that deep
@@ -114,7 +116,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return what JSON says.
+    """Return the content of a JSON text.
 
     A ValueError is what is no JSON, is nested too deeply, states a key twice, or has half a surrogate pair, which no
     file of UTF-8 can hold.
@@ -146,7 +148,7 @@ def sha256_of(path: Path) -> str:
 
 @contextmanager
 def refused(path: object) -> Iterator[None]:
-    """Turn what the system refuses while ``path`` is written into a sentence."""
+    """Turn errors of the operating system during writing of ``path`` into an InputError."""
     try:
         yield
     except BrokenPipeError:  # of what is printed meanwhile, not of the file
@@ -156,12 +158,12 @@ def refused(path: object) -> Iterator[None]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write text so that ``path`` holds either the whole new text or what it held before."""
+    """Write text atomically: ``path`` holds either the whole new text or its previous content."""
     write_files({path: text.encode("utf-8")})
 
 
 def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes so that ``path`` holds either all of them or what it held before."""
+    """Write bytes atomically: ``path`` holds either all of them or its previous content."""
     write_files({path: data})
 
 
@@ -180,7 +182,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
                 continue
             place = Path(os.path.realpath(path))
             if place.is_dir():
-                raise IsADirectoryError(21, "a folder is there", str(place))
+                raise IsADirectoryError(21, "it is a folder", str(place))
             make_folder(place.parent, folders)
             made[place] = stack.enter_context(scratch_folder(place)) / "file"
             with made[place].open("xb") as stream:
@@ -205,14 +207,14 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
 
 @contextmanager
 def undoing() -> Iterator[ExitStack]:
-    """Collect what takes steps back; it is executed, the last first, only when what follows fails."""
+    """Collect undo steps, which run in reverse order only if the body of the ``with`` statement fails."""
     with ExitStack() as steps:
         yield steps
         steps.pop_all()
 
 
 def make_folder(folder: Path, steps: ExitStack) -> None:
-    """Make a folder and those above it; the steps take them back while nothing is in them."""
+    """Make a folder and its parents; the undo steps remove them while they are empty."""
     for each in reversed([folder, *folder.parents]):
         if not each.is_dir():
             with suppress(FileExistsError):  # somebody else just made it
@@ -226,13 +228,13 @@ def _remove_empty(folder: Path) -> None:
 
 
 def _keep_mode(handle: int, place: Path) -> None:
-    """Give a new file the mode and the owner of the one at a place."""
+    """Give a new file the mode and the owner of the file that it replaces."""
     try:
         known = place.stat()
     except OSError:
         return
     if not os.access(place, os.W_OK):
-        raise PermissionError(13, "the file there is write-protected", str(place))
+        raise PermissionError(13, "the existing file is write-protected", str(place))
     if hasattr(os, "fchown"):
         with suppress(OSError):  # only the owner's superuser may give a file away
             os.fchown(handle, known.st_uid, known.st_gid)
@@ -241,18 +243,18 @@ def _keep_mode(handle: int, place: Path) -> None:
 
 @contextmanager
 def scratch_folder(place: Path) -> Iterator[Path]:
-    """Make a folder beside ``place`` for what will be moved there, and remove it in the end."""
+    """Make a temporary folder beside ``place`` for files that will be moved there, and remove it at the end."""
     with tempfile.TemporaryDirectory(ENDING, f".{place.name}.", place.parent, ignore_cleanup_errors=True) as folder:
         yield Path(folder)
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write JSON so that ``path`` holds either the whole new content or what it held before."""
+    """Write JSON atomically: ``path`` holds either the whole new content or its previous content."""
     write_text(path, _json(content))
 
 
 def json_text(content: Any) -> str:
-    """Return any content as JSON: arrays as lists, paths as texts, what is not finite as null."""
+    """Return any content as JSON: arrays as lists, paths as strings, non-finite numbers as null."""
     from pydantic_core import to_jsonable_python
 
     return _json(to_jsonable_python(content, inf_nan_mode="null", fallback=lambda value: value.tolist()))

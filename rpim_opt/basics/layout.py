@@ -1,4 +1,4 @@
-"""Header and rows of a table among the cells of a file, its numbers without decimal commas, thousands and units."""
+"""Layout of raw tables: header, rows, units and number formats found among the cells of a file."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ READING = (
 
 @dataclass(frozen=True)
 class TableOptions:
-    """What a user states of raw tables; what is empty is found in the files.
+    """Options for reading raw tables; an empty option is detected from the files.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class TableOptions:
 
     @classmethod
     def stated(cls, texts: Mapping[str, str]) -> TableOptions:
-        """Return the options that texts state, as a problem file's ``[reading]`` has them."""
+        """Return the options from their texts, as in ``[reading]`` of a problem file."""
         for name in texts:
             if name not in READING:
                 raise InputError("key reading", f"'{name}'", choices(name, READING))
@@ -118,7 +118,7 @@ class TableOptions:
         return cls(**found)
 
     def texts(self) -> dict[str, str]:
-        """Return what is stated as texts."""
+        """Return the options that are set as texts."""
         said = {name: getattr(self, name) for name in READING}
         said["within"] = "" if self.within is None else repr(self.within)
         units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
@@ -128,7 +128,7 @@ class TableOptions:
 
 
 class Head(NamedTuple):
-    """What stands above a column: the name itself, what groups it, and its unit."""
+    """Head of a column: its name, the group above it, and its unit."""
 
     name: str
     group: str = ""
@@ -141,7 +141,7 @@ class Head(NamedTuple):
 
 
 class Column(NamedTuple):
-    """A column: its name, which no other one has, what stands above it, and its cells."""
+    """A column: its unique name, its head, and its cells."""
 
     name: str
     head: Head
@@ -150,7 +150,7 @@ class Column(NamedTuple):
 
 @dataclass(frozen=True)
 class RawTable:
-    """A table as its file has it, numbers as Python writes them.
+    """A table as in its file, with numbers in Python's notation.
 
     ``columns`` are cells by what stands above them (a name that is there again has its place behind it, ``X #7``),
     ``heads`` the same taken apart; ``notes`` say how it was read, and what was left out, a sentence each; ``units`` are
@@ -177,7 +177,7 @@ class RawTable:
 
 
 def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
-    r"""Return the table of a file as people have them: text of any kind, Excel, Parquet; or of columns of texts.
+    r"""Return the table of a raw file (text of any layout, Excel, Parquet), or of columns of texts.
 
     A column whose cells list several numbers, ``[1.5, 2, 3]``, becomes a column each; rows that hold one coordinate
     each, ``P1, X, 1.5``, become one.
@@ -209,12 +209,12 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
 
 
 def is_missing(cell: str) -> bool:
-    """Return whether a cell says that there is no value."""
+    """Return whether a cell marks a missing value."""
     return MISSING.fullmatch(cell.strip()) is not None
 
 
 def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str], dict[str, str]]:
-    """Return the table among the rows of a file, how it was read, and the units above its header."""
+    """Return the columns of the table in a file, notes on how it was read, and the units stated above its header."""
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
     if not grid.rows:
@@ -228,9 +228,11 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
     summing = [i for i in full if first[i].lower().rstrip(":") in SUMMARIES]
     columns, mark = _columns([grid.rows[i] for i in full if i not in summing], heads, options)
     notes = [*grid.notes, *_notes(grid, full, above, options)]
-    notes += [f"line {grid.lines[i]} is a total of others: left out '{first[i]}'." for i in summing]
+    notes += [f"line {grid.lines[i]} is a summary, not a row: '{first[i]}' left out." for i in summing]
     if mark == ",":
-        notes.append(f"decimal commas: {'as stated' if options.decimal else 'no comma can separate thousands'}.")
+        notes.append(
+            f"decimal commas: {'as requested' if options.decimal else 'no comma can be a thousands separator'}."
+        )
     units: dict[str, str] = {}
     lines = [" ".join(filter(None, row)) for row in grid.rows[: above[0] if above else 0]]
     for stated in filter(None, map(UNITS_LINE.fullmatch, lines)):
@@ -241,20 +243,20 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
 
 
 def _count(row: Sequence[str]) -> int:
-    """Return how many cells of a row are numbers, or say that there is none where one could be."""
+    """Return how many cells of a row are numbers or marks of a missing number."""
     numbers = sum(is_numeral(cell) or len(list_of_numbers(cell)) or _unit_of([cell]) != "" for cell in row)
     return numbers and numbers + sum(cell != "" and is_missing(cell) for cell in row)
 
 
 def _notes(grid: Grid, full: Sequence[int], above: Sequence[int], options: TableOptions) -> list[str]:
-    """Say where the header is, unless it is the first line alone, and which lines below it are no rows."""
+    """Return notes on a header that is not the first line alone, and on lines that are no rows of the table."""
 
     def lines(rows: Sequence[int]) -> str:
         return "line " + listed([str(grid.lines[i]) for i in rows])
 
     notes = []
     if options.columns:
-        notes.append("names of columns as stated" + (f", instead of {lines(above)}." if above else "."))
+        notes.append("column names as requested" + (f", instead of {lines(above)}." if above else "."))
     elif len(above) > 1:
         notes.append(f"the header has {len(above)} lines, from line {grid.lines[above[0]]}.")
     if above and above[0]:
@@ -267,9 +269,9 @@ def _notes(grid: Grid, full: Sequence[int], above: Sequence[int], options: Table
         notes.append(f"the header is repeated in {lines(again)}: left out.")
     for i in others[:MOST_NAMED]:
         text = ", ".join(filter(None, grid.rows[i]))
-        notes.append(f"line {grid.lines[i]} is no row of the table: left out '{text[:60]}'.")
+        notes.append(f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' left out.")
     if len(others) > MOST_NAMED:
-        notes.append(f"{len(others) - MOST_NAMED} more lines are no rows of the table: left out.")
+        notes.append(f"{len(others) - MOST_NAMED} more lines are not rows of the table: left out.")
     return notes
 
 
@@ -292,7 +294,7 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
 
 
 def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list[Head], list[int]]:
-    """Return what stands above every column, and the numbers of the rows of the header."""
+    """Return the head of every column, and the numbers of the header's rows."""
     width = Counter(len(grid.rows[i]) for i in full).most_common(1)[0][0]
     above = _header_rows(grid, full[0], width)
     if options.columns:
@@ -431,7 +433,7 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
 
 
 def _mark(cell: str) -> str:
-    """Return the decimal mark that a cell shows, a question mark where it may part thousands, or nothing."""
+    """Return the decimal mark of a cell, a question mark if it may separate thousands, or an empty text."""
     last = max(cell.rfind(","), cell.rfind("."))
     if last < 0 or not is_numeral(cell):
         return ""
@@ -445,7 +447,7 @@ def _mark(cell: str) -> str:
 
 
 def _unit_of(cells: Sequence[str]) -> str:
-    """Return the unit that stands behind all numbers; nothing where it is not so."""
+    """Return the unit that follows all numbers; empty if they differ or have none."""
     matches = [WITH_UNIT.fullmatch(cell) for cell in cells if not is_missing(cell)]
     units = {match[2] if match else "" for match in matches}
     unit = units.pop() if len(units) == 1 else ""
@@ -456,7 +458,7 @@ def _unit_of(cells: Sequence[str]) -> str:
 
 
 def _one_number_each(column: Column) -> list[Column]:
-    """Return the columns of one number each of a column whose cells list numbers; any other as it is."""
+    """Split a column whose cells list numbers into one column a number; return any other unchanged."""
     lists = [list_of_numbers(cell) for cell in column.cells if isinstance(cell, str) and not is_missing(cell)]
     counts = set(map(len, lists))
     if len(counts) != 1 or counts == {0}:
@@ -471,7 +473,7 @@ def _one_number_each(column: Column) -> list[Column]:
 
 
 def _parts(stem: str, count: int) -> Sequence[str]:
-    """Return what the numbers are called of which a column lists so many."""
+    """Return names for the numbers in a column whose cells list several."""
     turns = re.search(r"rot|orient|rpy|euler|quat", stem, re.IGNORECASE)
     if count == 3 and not re.search(r"joint|axes|angle", stem, re.IGNORECASE):
         return ("rx", "ry", "rz") if turns else "xyz"
@@ -514,7 +516,7 @@ def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
 
 
 def _points(letters: Sequence[str], keys: Sequence[Column]) -> list[dict[str, int]]:
-    """Return the rows of every point by coordinate; the first column whose names have three rows each tells them."""
+    """Return the row of every point's coordinates; points are named by the first column with three rows a name."""
     for key in keys:
         rows = list(zip((str(cell).strip() for cell in key.cells), letters, strict=True))
         points: dict[str, dict[str, int]] = {}

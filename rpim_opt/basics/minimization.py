@@ -1,4 +1,4 @@
-"""Minimization along a line without SciPy's optimizers, which take longer to import than a calibration takes."""
+"""Minimization of a function of one variable; importing SciPy's optimizers takes longer than a calibration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Point = tuple[float, float]
 
 
 def least(function: Callable[[float], float], low: float, high: float, accuracy: float) -> Point:
-    """Return where a function is least between two numbers, and its value there (Brent 1973).
+    """Return the minimizer of a function on an interval, and the minimum (Brent 1973).
 
     Each step goes to the vertex of the parabola through the three best points where steps shrink that way, and else
     divides the larger side by the golden section. A minimum at an end is found next to it, within ``accuracy``.

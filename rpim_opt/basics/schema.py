@@ -1,4 +1,4 @@
-"""Tables of files checked against a model: keys, types, and quantities that carry their unit."""
+"""Validation of TOML tables against models: keys, types, and quantities with units in their names."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ Model = TypeVar("Model", bound=BaseModel)
 
 
 class Misfit(ValueError):
-    """A key that a table cannot have: pydantic adds where it stands."""
+    """An invalid key of a table; pydantic adds its location."""
 
     def __init__(self, key: str, found: str, accepted: str):
         super().__init__(found)
@@ -38,7 +38,7 @@ class Table(BaseModel):
     @model_validator(mode="before")
     @classmethod
     def _to_si(cls, table: Any) -> Any:
-        """Return a table with its quantities [SI]; a stem may stand there once, whatever its unit."""
+        """Return a table with its quantities in SI; every quantity may occur once, in any unit."""
         if not isinstance(table, dict):
             return table
         every = {unit.dimension for unit in UNITS.values()}
@@ -66,7 +66,7 @@ def _scaled(value: Any, where: str, si: float) -> Any:
 
 
 def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
-    """Return ``content`` as ``model``, or raise an InputError for the first thing that does not fit."""
+    """Return ``content`` as an instance of ``model``; InputError for the first invalid key."""
     try:
         return model.model_validate(content)
     except ValidationError as error:

@@ -62,7 +62,7 @@ Columns = Mapping[str, Sequence[Any]]
 
 
 class Grid(NamedTuple):
-    """The rows of a file that are not blank, their lines (from 1), how it was read, and whether blanks part cells."""
+    """The non-blank rows of a file, their line numbers, notes on reading, and whether blanks separate cells."""
 
     rows: list[list[str]]
     lines: list[int]
@@ -87,7 +87,7 @@ def read_columns(source: Any) -> Columns:
         names = list(getattr(source, "column_names", getattr(source, "columns", source)))
         for name in names:
             if not isinstance(name, str):
-                raise InputError("the header", f"column {name!r}", "texts as names, every one once")
+                raise InputError("the header", f"column {name!r}", "unique names that are texts")
         _require_names(names)
         columns = {name.strip(): source[name] for name in names}
     if not columns:
@@ -120,7 +120,7 @@ def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
 
 
 def _require_names(header: Sequence[str]) -> None:
-    accepted = "every column once, with its name"
+    accepted = "a unique name for every column"
     if len(header) > WIDEST:
         raise InputError("the header", f"{len(header)} columns", f"at most {WIDEST}")
     for name in header:
@@ -169,7 +169,7 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
 
 
 def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
-    """Return the rows of a text or Excel file; the arguments are those of `TableOptions`."""
+    """Return the rows of a text or Excel file; arguments as in `TableOptions`."""
     known = (*TEXTS, *EXCEL, ".parquet")
     require_file(path, LARGEST_DATA, known)
     if path.suffix.lower() in EXCEL:
@@ -186,19 +186,21 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     notes = list(said)
     if mark != ",":
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
-        notes.append(f"cells are separated by {spelled}: {'as stated' if separator else 'it separates most numbers'}.")
+        notes.append(
+            f"cells are separated by {spelled}: {'as requested' if separator else 'it separates most numbers'}."
+        )
     return Grid(*_split(text, mark), tuple(notes), mark == " ")
 
 
 def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
-    """Return the text of a file with line feeds, and a sentence on its encoding unless that is UTF-8."""
+    """Return the decoded text of a file, and a note on its encoding unless it is UTF-8."""
     binary = InputError("the text", "bytes that are zero", "a text file, not a binary one")
     with path.open("rb") as stream:  # before it is in memory: a file may be one long hole
         while block := stream.read(2**20):
             if ZEROS in block:
                 raise binary
     data = read_bytes(path, LARGEST_DATA)
-    name, why = (encoding, "as stated") if encoding else _encoding(data)
+    name, why = (encoding, "as requested") if encoding else _encoding(data)
     try:
         text = data.decode(name)
     except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
@@ -210,7 +212,7 @@ def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
 
 
 def _encoding(data: bytes) -> tuple[str, str]:
-    """Return the encoding of a file, and why: what is no UTF-8 is practically never taken for it by chance."""
+    """Return the encoding of a file, and why; other encodings are practically never valid UTF-8 by chance."""
     for mark, name in BYTE_ORDER_MARKS:
         if data.startswith(mark):
             return name, "byte order mark"
@@ -226,12 +228,12 @@ def _encoding(data: bytes) -> tuple[str, str]:
 
 
 def is_numeral(cell: str) -> bool:
-    """Return whether a cell is a number, with whatever decimal mark: ``-1,5``, ``1.234,5``, ``2e-3``."""
+    """Return whether a cell is a number, with either decimal mark: ``-1,5``, ``1.234,5``, ``2e-3``."""
     return NUMERAL.fullmatch(cell) is not None
 
 
 def _separator(text: str) -> str:
-    """Return the separator that parts most numbers in rows of numbers; a comma where none does."""
+    """Return the separator between most numbers of the numeric rows; a comma if there is none."""
     lines = (line for line in io.StringIO(text[: SAMPLE_LINES * SAMPLE_CHARACTERS]) if line.strip())
     sample = "".join(islice(lines, SAMPLE_LINES))[:SAMPLE_CHARACTERS]
     rows = {mark: _split(sample, mark, strict=False)[0] for mark in SEPARATORS.values()}
@@ -246,13 +248,13 @@ def _separator(text: str) -> str:
 
 
 def _parted(row: Sequence[str]) -> int:
-    """Return how many numbers a row of numbers has; those of a cell that lists several count, too."""
+    """Return how many numbers a row has, including those of cells that list several."""
     numbers = [len(list_of_numbers(cell)) or is_numeral(cell) for cell in row if cell]
     return sum(numbers) if sum(numbers) >= ROW_OF_NUMBERS * len(numbers) else 0
 
 
 def list_of_numbers(cell: str) -> list[str]:
-    """Return the numbers of a cell that lists several, in brackets; none for any other cell.
+    """Return the numbers of a cell that lists several in brackets; empty for any other cell.
 
     >>> from rpim_opt.basics.tables import list_of_numbers
     >>> list_of_numbers("[1.5, 2, -3e-2]"), list_of_numbers("((1 2) (3 4))"), list_of_numbers("1.5")
@@ -266,7 +268,7 @@ def list_of_numbers(cell: str) -> list[str]:
 
 
 def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], list[int]]:
-    """Return the rows that are not blank, and their lines."""
+    """Return the non-blank rows and their line numbers."""
     kept: list[list[str]] = []
     lines: list[int] = []
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, strict=strict, skipinitialspace=True)
@@ -292,7 +294,7 @@ def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], 
 
 
 def _with_lists(row: list[str], mark: str) -> list[str]:
-    """Return a row in which numbers between brackets are one cell, whatever stands between them."""
+    """Return a row in which each bracketed list of numbers is one cell, whatever separates its numbers."""
     if not any(map(LIST_OPENS.match, row)):
         return row
     whole: list[str] = []
@@ -344,7 +346,7 @@ def _excel(path: Path, sheet: str) -> Grid:
         raise
     except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
         raise InputError("the file", _first_line(error), "a readable Excel workbook (.xlsx)") from None
-    how = "as stated" if sheet else "the first with cells; another one, or several, by --sheet"
+    how = "as requested" if sheet else "the first with cells; another one, or several, by --sheet"
     notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
 
@@ -354,7 +356,7 @@ def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
     sheet.reset_dimensions()  # what the file says of them would fill every row up
     for number, row in enumerate(sheet.iter_rows(values_only=True), start=1):
         if number > EXCEL_ROWS:
-            raise InputError("the sheet", f"more than {EXCEL_ROWS} rows", "as many as Excel has")
+            raise InputError("the sheet", f"more than {EXCEL_ROWS} rows", "at most as many as Excel supports")
         cells = ["" if value is None else str(value).strip() for value in row]
         while cells and not cells[-1]:
             cells.pop()
@@ -379,7 +381,7 @@ def _first_line(error: Exception) -> str:
 
 
 def numbers(cells: Sequence[Any], column: str, labels: Sequence[str] = ()) -> np.ndarray:
-    """Return cells as finite numbers (N,), or name the row whose cell is none."""
+    """Return cells as finite numbers (N,); InputError names the first invalid row."""
     try:
         values = np.asarray(cells)
         if values.dtype.kind in "iuf" and np.isfinite(values).all():
@@ -410,7 +412,7 @@ def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:
 
 
 def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
-    """Return a table as CSV; a text that a spreadsheet would compute gets an apostrophe, which reading takes away."""
+    """Return a table as CSV; text that a spreadsheet would evaluate gets an apostrophe (`read_columns` removes it)."""
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
     writer.writerow(_with_apostrophe(name) for name in header)
@@ -429,7 +431,7 @@ def _with_apostrophe(cell: Any) -> Any:
 
 
 def frame_of(rows: Sequence[dict[str, Any]]) -> Any:
-    """Return rows as a data frame of pandas, or of polars where that is missing."""
+    """Return rows as a pandas data frame, or polars if pandas is not installed."""
     with contextlib.suppress(ImportError):
         return import_module("pandas").DataFrame(list(rows))
     with contextlib.suppress(ImportError):

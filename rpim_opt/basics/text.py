@@ -1,4 +1,4 @@
-"""Text: tables, lists and figures as people read them, objects in one line or as a table, and progress."""
+"""Text for readers: tables, lists, rounded figures, one-line representations of objects, and progress bars."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def visible(text: str) -> str:
-    r"""Return a text for a terminal: what is not printable but a line break is written out, ``\x1b`` for escape.
+    r"""Return a text that is safe for a terminal: non-printable characters are escaped, as in ``\x1b``.
 
     Titles, sources, labels and file names may come from somebody else, and a terminal obeys what they say.
     """
@@ -48,7 +48,7 @@ def visible(text: str) -> str:
 
 
 def listed(items: Sequence[str], most: int = 8, between: str = ", ") -> str:
-    """Return the first items in a line, and how many more there are."""
+    """Return the first items separated by commas, and the number of the others."""
     more = f" and {len(items) - most} more" if len(items) > most else ""
     return between.join(items[:most]) + more
 
@@ -73,7 +73,7 @@ def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequ
 
 
 def three_digits(value: float) -> str:
-    """Return a figure with three digits that count, and without an exponent where it is large.
+    """Return a number with three significant digits, and without an exponent if it is large.
 
     >>> from rpim_opt.basics.text import three_digits
     >>> three_digits(0.53712), three_digits(-44.26), three_digits(852677.3)
@@ -105,7 +105,7 @@ def shortened(text: str) -> str:
 
 
 def version_of(package: str) -> str:
-    """Return the version of an installed package; this one need not be installed, a checkout will do."""
+    """Return the version of an installed package, or of this package in a checkout."""
     return str(sys.modules["rpim_opt"].__version__) if package == "rpim-opt" else metadata.version(package)
 
 
@@ -113,7 +113,7 @@ def version_of(package: str) -> str:
 
 
 class Brief:
-    """What says what it is in one short line; `_short` is that line without the class's name."""
+    """Base class with a one-line representation; `_short` returns that line without the class name."""
 
     def _short(self) -> str:
         raise NotImplementedError
@@ -124,21 +124,21 @@ class Brief:
 
 
 class Tabled(Brief):
-    """What is a table besides: `_frame_rows` are its rows by column, whose names carry units."""
+    """Base class of objects with a table: `_frame_rows` returns its rows by column names with units."""
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         raise NotImplementedError
 
     def _shown_rows(self) -> list[dict[str, Any]]:
-        """Return the rows for a notebook, where they are others."""
+        """Return the rows that a notebook shows."""
         return self._frame_rows()
 
     def _notes(self) -> Sequence[str]:
-        """Return sentences below the table."""
+        """Return the sentences below the table."""
         return ()
 
     def to_frame(self) -> Any:
-        """Return its table as a data frame (pandas, or polars where that is missing).
+        """Return the table as a data frame (pandas, or polars if pandas is not installed).
 
         >>> import rpim_opt as ro
         >>> frame = ro.load("position").problem.parameters.to_frame()
@@ -150,7 +150,7 @@ class Tabled(Brief):
         return frame_of(self._frame_rows())
 
     def _repr_html_(self) -> str:
-        """Return the table for a notebook; columns without any value are left out."""
+        """Return the table for a notebook, without empty columns."""
         rows = self._shown_rows()
         notes = list(self._notes())
         if len(rows) > MOST:
@@ -181,7 +181,7 @@ Progress = Callable[[int, int], None]
 
 @contextmanager
 def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress]:
-    """Give what receives how many of how many are done.
+    """Provide a function that shows the progress, called with the number done and the total.
 
     That is a bar on stderr, where it is wanted and that is a terminal or a notebook with widgets; or a function of
     one's own.

@@ -1,4 +1,4 @@
-"""Threads and time: all cores for blocks of rows, one thread for small matrices, and seconds by phase."""
+"""Threads and timing: all cores for blocks of rows, one BLAS thread for small matrices, seconds by phase."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ _worker = threading.local()
 
 
 def cores() -> int:
-    """Return how many threads may work at once: the processor's cores that this process may use."""
+    """Return the number of processor cores that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> list[Answer]:
-    """Return the answers to items, in their order; as many are worked on at once as there are cores.
+    """Return a function's results for items, in their order, computed on all cores.
 
     What the items are does not depend on the number of cores, and so neither does any digit of the answers. Inside a
     thread of its own it works one by one. A second in each of several threads counts as one second of its phase.
@@ -72,7 +72,7 @@ def _controller() -> ThreadpoolController:
 
 
 def one_blas_thread(function: Function) -> Function:
-    """Let the function's matrix products and factorizations run on one thread each, and restore what was there.
+    """Limit BLAS to one thread while the function runs.
 
     On two cores that other work shares, LAPACK's QR of a few thousand rows took ten times as long with two threads as
     with one. Calls may be nested and may come from several threads; the last one out restores.
@@ -98,7 +98,7 @@ def one_blas_thread(function: Function) -> Function:
 
 
 class Clock:
-    """Seconds by phase; a phase inside another one counts for itself alone."""
+    """Seconds by phase; the time of a nested phase counts for that phase alone."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
@@ -106,7 +106,7 @@ class Clock:
         self.stack: list[str] = []
 
     def switch(self, phase: str | None) -> None:
-        """Begin a phase, or end the one that runs."""
+        """Begin a phase, or end the current one."""
         now = time.perf_counter()
         if self.stack:
             self.seconds[self.stack[-1]] += now - self._since
@@ -117,14 +117,14 @@ class Clock:
             self.stack.append(phase)
 
     def rows(self) -> list[tuple[str, float]]:
-        """Return the seconds of every phase, and what is left of the time since the clock was made."""
+        """Return the seconds of every phase, and the rest of the time since the clock was made."""
         other = time.perf_counter() - self.started - sum(self.seconds.values())
         return [*self.seconds.items(), ("other", other)]
 
 
 @contextmanager
 def clock() -> Iterator[Clock]:
-    """Measure what runs inside: ``with clock() as c: calibrate(...)``, then ``c.rows()``."""
+    """Time a block of code by phases: ``with clock() as c: calibrate(...)``, then ``c.rows()``."""
     running = Clock()
     token = _running.set(running)
     try:
@@ -135,7 +135,7 @@ def clock() -> Iterator[Clock]:
 
 @contextmanager
 def phase(name: str) -> Iterator[None]:
-    """Count what runs inside as a phase, if a clock runs: ``with phase("solve"): ...``."""
+    """Time a block of code as a phase, if a clock is running: ``with phase("solve"): ...``."""
     running = _running.get()
     if running is None:
         yield

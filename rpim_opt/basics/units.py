@@ -1,4 +1,4 @@
-"""Units and names at the border: a suffix states the unit (``d_mm``, ``q1_deg``), inside everything is SI."""
+"""Units and suffixed names: files and tables use names with units (``d_mm``, ``q1_deg``), the package uses SI."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 
 
 class Unit(NamedTuple):
-    """A unit's dimension, its size in SI, and what SI's number is where its own is zero."""
+    """A unit: its dimension, its size in SI, and its zero point in SI."""
 
     dimension: str
     si: float
@@ -87,18 +87,18 @@ LONGEST = 200
 
 @cache
 def accepted_units(dimension: str) -> tuple[str, ...]:
-    """Return the suffixes that a quantity of this dimension may carry."""
+    """Return the unit suffixes of a dimension."""
     return tuple(name for name, unit in UNITS.items() if unit.dimension == dimension)
 
 
 def display(dimension: str) -> tuple[str, float]:
-    """Return the unit for showing a dimension and its size in SI; no unit for the dimension ``""``."""
+    """Return the display unit of a dimension and its size in SI; no unit for the dimension ``""``."""
     name = DISPLAY[dimension] if dimension else ""
     return name, UNITS[name].si if name else 1.0
 
 
 def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
-    """Return the columns in which joint values are written, with their unit's size in SI.
+    """Return the columns for writing joint values, and the size of their units in SI.
 
     >>> from rpim_opt.basics.units import joint_columns
     >>> joint_columns(["angle", "length"])
@@ -109,7 +109,7 @@ def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
 
 
 def split_unit(name: str) -> tuple[str, Unit | None]:
-    """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None where there is none.
+    """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None if there is none.
 
     >>> from rpim_opt.basics.units import split_unit
     >>> split_unit("base_rx_mrad")[0], split_unit("label")
@@ -127,17 +127,17 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
 
 
 def with_unit(stem: str, dimension: str, count: int = 9) -> list[str]:
-    """Return the names that a quantity may have at the border: ``d_m, d_mm, d_um``; itself where it has no unit."""
+    """Return the names of a quantity with its units, ``d_m, d_mm, d_um``; the plain name if it has no unit."""
     return [f"{stem}_{unit}" for unit in accepted_units(dimension)[:count]] or [stem]
 
 
 def spelled(stem: str, dimensions: Iterable[str], count: int = 9) -> list[str]:
-    """Return the names of a quantity that may have one of several dimensions."""
+    """Return the names with units of a quantity that may have one of several dimensions."""
     return [name for dimension in dimensions for name in with_unit(stem, dimension, count)]
 
 
 def number(value: Any, where: str) -> float:
-    """Return a finite number, or say what stands in its place."""
+    """Return a finite number; InputError for anything else."""
     if isinstance(value, int | float) and not isinstance(value, bool):
         try:
             if math.isfinite(value):
@@ -148,7 +148,7 @@ def number(value: Any, where: str) -> float:
 
 
 def numeral(text: str) -> float:
-    """Return the finite number that a text in ASCII is, as Python writes it; NaN for every other text.
+    """Return the finite number that an ASCII text states in Python's notation; NaN for any other text.
 
     >>> from rpim_opt.basics.units import numeral
     >>> numeral("1.5e-3"), numeral("1_000"), numeral("inf")
@@ -182,7 +182,7 @@ def quantities(
             raise InputError(where or "the table", f"unknown key '{key}'", choices(key, [*also, *names]))
         unit = unit or Unit("", 1.0)
         if unit.dimension not in dimensions[stem]:
-            raise InputError(place, "no unit that fits", ", ".join(spelled(stem, dimensions[stem])))
+            raise InputError(place, "no unit of the right dimension", ", ".join(spelled(stem, dimensions[stem])))
         if (stem, unit.dimension) in result:
             raise InputError(place, "the same quantity twice", "one of them")
         result[stem, unit.dimension] = convert(value, place, unit.si)
@@ -191,16 +191,16 @@ def quantities(
 
 
 def _require_size(value: Any, where: str, unit: Unit) -> None:
-    """Refuse a value [SI], or one in a list, that no robot and no instrument has: its digits would be lost."""
+    """Refuse a value [SI], or one in a list, too large for any robot or instrument."""
     if isinstance(value, list):
         for each in value:
             _require_size(each, where, unit)
     elif not abs(value) <= LARGEST:
-        raise InputError(where, f"{value / unit.si:g}", f"a size of at most {LARGEST / unit.si:g}")
+        raise InputError(where, f"{value / unit.si:g}", f"a magnitude of at most {LARGEST / unit.si:g}")
 
 
 def fits(name: str, pattern: str) -> bool:
-    """Return whether a pattern (``d?``, ``theta[23]``, ``tool_*``) matches a name; one too long matches none."""
+    """Return whether a pattern (``d?``, ``theta[23]``, ``tool_*``) matches a name; an overlong one never does."""
     return len(pattern) <= LONGEST and fnmatchcase(name, pattern)
 
 
@@ -242,7 +242,7 @@ def dimension_of(unit: str) -> str:
 
 
 def parse_units(text: str) -> dict[str, str]:
-    """Return the units of ``"deg,mm"`` by dimension; those that are named, as in ``"q=rad"``, by the columns' stem.
+    """Return the units of ``"deg,mm"`` by dimension, and those of ``"q=rad"`` by column name.
 
     >>> from rpim_opt.basics.units import parse_units
     >>> parse_units("q=rad, deg, m")
@@ -256,14 +256,14 @@ def parse_units(text: str) -> dict[str, str]:
             raise InputError("--units", f"'{part}'", choices(part, [*UNITS, *FOREIGN]))
         key = stem or dimension_of(name)
         if key in units:
-            accepted = "one unit for each dimension; another one for joints alone as q=rad"
+            accepted = "one unit a dimension; a different one for joint values alone as q=rad"
             raise InputError("--units", f"{units[key]} and {part}", accepted)
         units[key] = name
     return units
 
 
 def split(name: str) -> tuple[str, str]:
-    """Return a column's name without its unit, and the unit, empty where there is none.
+    """Split a column name into the name without its unit and the unit, which may be empty.
 
     >>> from rpim_opt.basics.units import split
     >>> [split(name) for name in ("x_mm", "U(95) X [mm]", "J1 (°)", "z / µm", "y in inch", "position[0]")]

@@ -29,7 +29,7 @@ LOOKS = 4
 
 @dataclass(frozen=True, eq=False)
 class Found:
-    """What was estimated, ready for a fit at weight 1 from x (n,) [SI].
+    """Estimated hyperparameters, and the problem to fit at weight 1 from x (n,) [SI].
 
     The problem has local scales, noise and model extensions, without outliers; ``stated`` is the prior in its units.
     """
@@ -41,7 +41,7 @@ class Found:
 
 
 def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
-    """Return hyperparameters, model extensions and outliers of a problem, laid into it.
+    """Estimate hyperparameters, model extensions and outliers, and return them with the problem that has them applied.
 
     ``model`` is ``"geometry"``, or ``"auto"`` for the extensions that the marginal likelihood selects; ``start`` (n,)
     [SI] or None.
@@ -49,7 +49,7 @@ def estimate(problem: Source, estimator: Estimator, model: str, start: Array | N
     try:
         return _found(problem, estimator, model, start)
     except np.linalg.LinAlgError:
-        found = "equations, scales and noise too far apart to estimate hyperparameters"
+        found = "equations, scales and noise of too different magnitudes to estimate hyperparameters"
         raise InputError("data", found, "correct units, or a weight") from None
 
 
@@ -98,7 +98,7 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
 def _without_outliers(
     every: CalibrationProblem, estimator: Estimator, whole: Fit, model: str
 ) -> tuple[Fit, tuple[Trial, ...], dict[str, float]]:
-    """Return the fit without the rows that no model explains, the models compared, and those rows."""
+    """Return the fit without outliers, the models compared, and the outliers."""
 
     def explain(outliers: Mapping[str, float]) -> tuple[Fit, tuple[Trial, ...]]:
         fit = whole
@@ -127,7 +127,7 @@ def _without_outliers(
 
 
 def with_extensions(problem: Source, found: Found) -> Source:
-    """Return a problem with the model extensions that were selected, and all else as it was stated."""
+    """Return the problem with the selected model extensions, otherwise unchanged."""
     if found.learned.curves is not None:
         robots = {name: robot.model.curves for name, robot in found.problem.arms.items()}
         problem = problem.with_transmission(robots[""])

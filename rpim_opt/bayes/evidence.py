@@ -1,4 +1,4 @@
-"""Marginal likelihood of hyperparameters: restricted likelihood with Student-t priors, its derivatives and optima."""
+"""Marginal likelihood of hyperparameters: restricted likelihood with Student-t priors, derivatives and optima."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MOST_WIDENED = 100.0
 
 
 class Spectrum(NamedTuple):
-    """Prior variances of Fourier coefficients that stand for Gaussian processes with Matern's covariance (3/2).
+    """Prior variances of Fourier coefficients that represent Gaussian processes with Matern covariance (3/2).
 
     size^2 8 r^3 / (r^2 + w^2)^2 / measure with r = sqrt(3) / length; squared frequencies and measures are (c,).
     """
@@ -79,7 +79,7 @@ class Hierarchy:
 
     @property
     def geometry(self) -> np.ndarray:
-        """Numbers of the groups that have Student's tails."""
+        """Indices of the groups with Student-t priors."""
         return np.unique(self.group[self.heavy])
 
     @property
@@ -109,7 +109,7 @@ class Hierarchy:
         return variances, slopes, curvature
 
     def of(self, keep: np.ndarray) -> Hierarchy:
-        """Return the prior of some of the deviations (p,); all of a spectrum or none."""
+        """Return the prior of a subset of the deviations (p,) that contains all of a spectrum or none."""
         group = self.group[keep]
         used = np.unique(group[group >= 0])
         number = np.full(len(self.names) + 1, -1)
@@ -135,7 +135,7 @@ def scale_covariance(geometry: np.ndarray, base: np.ndarray) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class Linearized:
-    """Equations y ~ X z in SI, z (p,) in units of the scales, and what divides their noise by configuration."""
+    """Equations y ~ X z in SI, z (p,) in units of the scales, with the noise components of every configuration."""
 
     X: Array
     y: Array
@@ -152,7 +152,7 @@ class Whitened(NamedTuple):
 
 
 def whitened(data: Linearized, scatter: Scatter, noise: Mapping[str, float]) -> list[Whitened]:
-    """Return equations in units of their noise, with its derivatives by the logarithms of some of its parts."""
+    """Return whitened equations, with derivatives of the noise by the logarithms of its variance components."""
     found = []
     for stack in data.stacks:
         N, k = stack.index.shape
@@ -198,7 +198,7 @@ class Point:
     noise: Array
 
     def falls(self, M: Array) -> Array:
-        """Return by what tr(M C^-1) falls (s,), for a symmetric M (p, p)."""
+        """Return the decreases (s,) of tr(M C^-1) for a symmetric M (p, p)."""
         found = M.diagonal() @ self.own
         found[len(found) - len(self.noise) :] += np.einsum("aij,ij->a", self.noise, M)
         return np.asarray(found, dtype=float)
@@ -267,7 +267,7 @@ class Evidence:
         return replace(self.fixed, **dict(zip(self.noise, map(float, sizes), strict=True)))
 
     def at(self, logs: Array, near: Point | None = None, accuracy: float = SETTLED) -> Point:
-        """Return the marginal likelihood at (s,); local variances are looked for from those of a point on."""
+        """Return the marginal likelihood at (s,); the iteration for local variances starts from those of ``near``."""
         if near is not None and not len(self._heavy) and np.array_equal(logs, near.logs):
             return near
         prior = self.prior
@@ -336,7 +336,7 @@ class Evidence:
         )
 
     def optima(self, starts: Sequence[Array], accuracy: float = 1e-3, near: Point | None = None) -> list[Point]:
-        """Return the optima that are reached from some starts (s,), the best first.
+        """Return the local optima reached from some starts (s,), the best first.
 
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
         accuracy. A way that leads into an optimum that is known ends there. ``near`` is a known point near the starts.
@@ -375,7 +375,7 @@ class Evidence:
         return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
-        """Return where optima are looked for: all of it noise, prior medians, and large deviations.
+        """Return the starts of the search: all residuals noise, prior medians, and large deviations.
 
         The first one leads to the best optimum most often, where only one is used.
         """
@@ -385,7 +385,7 @@ class Evidence:
         return found[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
 
     def restricted(self, keep: np.ndarray) -> Evidence:
-        """Return the marginal likelihood of a model with some of the columns (p,)."""
+        """Return the marginal likelihood of a model with a subset of the columns (p,)."""
         return replace(self, data=replace(self.data, X=self.data.X[:, keep]), prior=self.prior.of(keep))
 
     # --- local variances ----------------------------------------------------------------------------------------
@@ -398,7 +398,7 @@ class Evidence:
     def _settled(
         self, H: Array, h: Array, size2: Array, v: Array, accuracy: float
     ) -> tuple[Array, Array, float, Array]:
-        """Return z, C, -ln|C| and v, which determine each other."""
+        """Return z, C, -ln|C| and v, which are solved jointly."""
         heavy = self._heavy
         local = v[heavy]
         v = size2.copy()
@@ -416,7 +416,7 @@ class Evidence:
         return *_posterior(H, h, own / v), v
 
     def _local(self, S: Array, g: Array, size2: Array, v: Array, accuracy: float) -> Array:
-        """Return the local variances of heavy deviations, a fixed point: S is the information on them, S z = g.
+        """Return the local variances of Student-t deviations, a fixed point: S is their information matrix, S z = g.
 
         By Newton's steps for ln v: d C_ij / d v_k = C_ik C_kj / v_k^2, d z_j / d v_k = C_jk z_k / v_k^2.
         """
@@ -439,7 +439,7 @@ class Evidence:
         return np.minimum(v, widest)
 
     def _log_variances(self, of_size: Array, direct: Array, follows: Array, size2: Array, v: Array) -> Array:
-        """Return the slopes (p, s) of ln v, which follow themselves where tails are heavy."""
+        """Return the derivatives (p, s) of ln v, an implicit equation for Student-t deviations."""
         heavy, tails = self._heavy, self.prior.tails
         found = of_size.copy()
         found[heavy] = 0.0
@@ -524,7 +524,7 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
 
 
 def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, tails: float) -> Array:
-    """Return D (p, h), with D D' what tails of deviations (h,) with scales tau (h,) add to the covariance C.
+    """Return D (p, h), where D D' widens the covariance C for Student-t deviations (h,) with scales tau (h,).
 
     The normal of variance v_j that stands for the t_nu of a deviation j has its curvature at the mean, not its width.
     What the data say of z_j, apart from that normal, has the precision p = 1 / C_jj - 1 / v_j and the mean

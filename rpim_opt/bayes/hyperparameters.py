@@ -1,4 +1,4 @@
-"""Estimated hyperparameters: prior scales and noise by marginal likelihood, alternated with relinearization."""
+"""Estimation of prior scales and noise by marginal likelihood, alternated with relinearization."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ class Size(NamedTuple):
 
 
 class Trial(NamedTuple):
-    """Model extensions, and -2 ln of the restricted likelihood with them."""
+    """A set of model extensions, and -2 ln of the restricted likelihood with them."""
 
     families: tuple[str, ...]
     value: float
@@ -76,7 +76,7 @@ class LeftOut(NamedTuple):
 
 
 class Transmitted(NamedTuple):
-    """Size and length scale [rad] of the joints' transmission errors, and by how much -2 ln L falls with them."""
+    """Standard deviation and length scale [rad] of the joints' transmission errors, and the decrease of -2 ln L."""
 
     size: Size
     length: Size
@@ -85,7 +85,7 @@ class Transmitted(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Learned(Brief):
-    """Hyperparameters that were estimated from the data.
+    """Hyperparameters estimated from the data.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ class Learned(Brief):
         return self.trials[0].families
 
     def gain(self, family: str) -> float | None:
-        """Return by how much -2 ln L falls where an extension is added to the best of the models without it."""
+        """Return the decrease of -2 ln L when an extension is added to the best model without it."""
         having = [t.value for t in self.trials if family in t.families]
         without = [t.value for t in self.trials if family not in t.families]
         if not having or not without:
@@ -153,7 +153,7 @@ class Learned(Brief):
 
 
 def sessions_spread(learned: Learned | None) -> float:
-    """Return the standard deviation of the logarithm of how far sessions lie apart; zero where it was not estimated."""
+    """Return the standard error of the logarithm of the session offsets' scale; zero if it was not estimated."""
     if learned is None:
         return 0.0
     return max((learned.sizes[name].spread for name in SESSIONS.values() if name in learned.sizes), default=0.0)
@@ -161,7 +161,7 @@ def sessions_spread(learned: Learned | None) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """A problem with hyperparameters laid into it, and where it was linearized.
+    """A problem with hyperparameters applied, and its linearization point.
 
     ``problem`` has its stated scales and the prior ``stated``; ``evidence`` is the last marginal likelihood, ``point``
     its optimum, ``others`` those that were reached from other sides. ``laid`` is the problem with local scales and
@@ -178,13 +178,13 @@ class Fit:
 
     @property
     def spare(self) -> float:
-        """Part of the equations that remains for the noise."""
+        """Fraction of the equations that remain as degrees of freedom of the noise."""
         used = float(np.sum(1 - np.diag(self.point.C) / self.point.v))
         return 1 - used / len(self.evidence.data.y)
 
     @property
     def unit(self) -> Array:
-        """(n,) what multiplies the deviations of the marginal likelihood [SI]."""
+        """Units (n,) [SI] of the deviations in the marginal likelihood."""
         return self.problem.parameters.free.scale * self.stated.scale
 
     @property
@@ -200,7 +200,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class Estimator:
-    """How the hyperparameters of problems are estimated: with which prior, and which parts of the noise.
+    """Estimator of hyperparameters, with a prior and the variance components to estimate.
 
     ``refit`` continues a Tikhonov fit at weight 1 from one linearization; without it the posterior mean stands for one.
     The coefficients of ``curves``, transmission errors of joints, are the last parameters of a problem.
@@ -219,7 +219,7 @@ class Estimator:
         J = problem.contrasts(jacobian)
         y = problem.contrasts(residual[:, None])[:, 0] + J @ x
         if not (np.isfinite(J).all() and np.isfinite(y).all()):
-            raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
+            raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
         unit = free.scale * stated.scale
         stacks = problem.stacks(joints="joint" in self.noise, at=parameter_values(problem, x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
@@ -249,7 +249,7 @@ class Estimator:
         return Evidence(data, hierarchy, noise, problem.scatter or Scatter())
 
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
-        """Return hyperparameters and deviations that agree with each other, after some linearizations at most.
+        """Alternate hyperparameters and deviations to a fixed point, with a limited number of linearizations.
 
         From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known.
         """
@@ -265,7 +265,7 @@ class Estimator:
         return fit
 
     def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, iterations: int) -> Fit:
-        """Return hyperparameters at one linearization, from known ones (s,) and from several sides, with a fit."""
+        """Estimate hyperparameters at one linearization, starting from given values (s,) and from several starts."""
         p = problem.parameters
         stated = self.prior.stated(p)
         evidence = self.evidence(problem, x, stated)
@@ -286,7 +286,7 @@ class Estimator:
 
 
 def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
-    """Return the prior variances of the coefficients of curves, the last of (n,) deviations in these units [SI]."""
+    """Return prior variances of curve coefficients, which are the last of the (n,) deviations in these units [SI]."""
     cycles = [np.tile(2 * np.pi / curve.period * np.arange(1, curve.harmonics + 1), 2) for curve in curves]
     periods = np.concatenate([np.full(2 * curve.harmonics, curve.period) for curve in curves])
     w = np.asarray(np.concatenate(cycles), dtype=float)
@@ -294,13 +294,13 @@ def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
 
 
 def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
-    """Return where the optimum is looked for: from several sides where configurations are few."""
+    """Return the starts of the search for the optimum; several if configurations are few."""
     few = len(np.unique(problem.data.configuration)) <= FEW
     return evidence.starts()[: None if few else 1]
 
 
 def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
-    """Return the problem with some of its configurations in memory: all, or so many at random, from every part."""
+    """Return the problem with all configurations in memory, or a random sample of them from every block."""
     if isinstance(problem, CalibrationProblem):
         return _drawn(problem, most).frozen()
     count = sum(1 for _ in problem.rows())
@@ -314,7 +314,7 @@ def _drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
 
 
 def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
-    """Return by how many of their scales deviations (n,) moved, RMS."""
+    """Return the RMS change of deviations (n,) in units of their scales."""
     return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
 
 
@@ -330,7 +330,7 @@ def parameter_values(problem: Source, x: Array) -> Array:
 
 
 def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
-    """Return the hyperparameters of a fit with their uncertainty; ``gain`` is that of curves.
+    """Return the hyperparameters of a fit with their standard errors; ``gain`` is the gain by transmission errors.
 
     Their covariance (s, s) is twice the inverse of the second derivatives of -2 ln L, and the variance V of a reading
     has Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three: of all of it, as what is not known of the
@@ -368,11 +368,11 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     vague = [i for i in prior.geometry if spread[i] > VAGUE]
     if vague:
         names = joined([prior.names[i] for i in vague])
-        factor = f"a factor of {np.exp(max(spread[vague])):.1f} either way, 1 sigma"
+        factor = f"standard uncertainty: a factor of {np.exp(max(spread[vague])):.1f}"
         notes.append(f"The data hardly identify the prior scale of {names} ({factor}).")
     m, n = evidence.data.X.shape
     if m < n:
-        rest = f"at least {n - m} parameter combinations rest on the prior alone."
+        rest = f"at least {n - m} parameter combinations are determined by the prior alone."
         notes.append(f"{m} equations for {n} parameters: {rest}")
     widening = tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)
     return Learned(

@@ -1,4 +1,4 @@
-"""Model extensions that the data support: which can be identified, and which the marginal likelihood selects."""
+"""Selection of the model extensions that the data support, by marginal likelihood."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ KNOWN = Prior(joint_offset=1.0, frames=1.0)
 
 
 class Candidate(NamedTuple):
-    """A model that was compared: what decides, its extensions, and what was found."""
+    """A candidate model: its price, its extensions, and its optimum."""
 
     price: float
     families: tuple[str, ...]
@@ -78,7 +78,7 @@ class Candidate(NamedTuple):
 
 
 def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
-    """Return the parameters of every extension that these data may identify and that are not identified yet.
+    """Return the parameters of every extension that the data may identify and that are not identified yet.
 
     Of harmonics those of joints that turned far enough.
     """
@@ -102,7 +102,7 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
 
 
 def extended(problem: CalibrationProblem, names: Sequence[str]) -> CalibrationProblem:
-    """Return the problem that identifies more parameters, at the scales that their effects suggest."""
+    """Return the problem with more identified parameters, with scales derived from their effects."""
     p = problem.parameters
     index = [p.names.index(name) for name in names]
     identified = p.identified.copy()
@@ -121,7 +121,7 @@ def named(problem: Source, x: Array) -> dict[str, float]:
 
 
 def deviations(problem: Source, known: Mapping[str, float]) -> Array:
-    """Return deviations (n,) from some by name; zero for others."""
+    """Return deviations (n,) from a mapping by name; zero for the others."""
     return np.array([known.get(name, 0.0) for name in problem.parameters.free.names])
 
 
@@ -129,7 +129,7 @@ def deviations(problem: Source, known: Mapping[str, float]) -> Array:
 
 
 class Models:
-    """Models of a problem with and without extensions, all at one linearization: the effects of extensions are small.
+    """Models with and without extensions at one linearization, since the effects of extensions are small.
 
     ``own`` are the parameters that the problem identifies, ``names`` (p,) those of all models, the ``columns`` of the
     marginal likelihood; ``known`` are deviations by name.
@@ -155,7 +155,7 @@ class Models:
         return np.isin(self.names, [*self.own, *self.added(families)])
 
     def compared(self, price: Callable[[tuple[str, ...]], Candidate]) -> list[Candidate]:
-        """Return the models that were compared, by what ``price`` says of each.
+        """Return the candidate models in the order of ``price``.
 
         Extensions of the arm are selected with all conditions in the model, which would stand for them else; then of
         the best one each condition is asked for.
@@ -178,7 +178,7 @@ class Models:
 
 
 def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]]:
-    """Return the fit of the model with the largest marginal likelihood, and the models compared, that one first."""
+    """Return the fit of the model with the largest marginal likelihood, and all candidates, the best first."""
     deviation = named(fit.problem, fit.x)
     models = Models(fit.problem, estimator, deviation)
     before = _hyperparameters(fit.evidence, fit.point)
@@ -201,7 +201,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
 
 
 def questions(families: Sequence[str]) -> int:
-    """Return how many questions a model answers: what it has of `CANDIDATES` is one, every other extension one more."""
+    """Return the complexity of a model: one for all of `CANDIDATES` that it has, one for every other extension."""
     others = sum(family in FURTHER or family in CONDITIONS for family in families)
     return others + (len(families) > others)
 
@@ -226,7 +226,7 @@ def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A model that was compared: extensions beside what the result identifies, its parameters, and its optimum."""
+    """A candidate model: its extensions beyond the result's parameters, all its parameters, and its optimum."""
 
     families: tuple[str, ...]
     names: tuple[str, ...]
@@ -235,7 +235,7 @@ class Judged:
 
 
 class Comparison(Models):
-    """Models with and without extensions, all at the linearization of one result, whatever its weight.
+    """Models with and without extensions at the linearization of one result, whatever its weight.
 
     Of large data `hyperparameters.MOST` configurations are used.
     """
@@ -269,7 +269,7 @@ class Comparison(Models):
 
     @cached_property
     def plain(self) -> Judged:
-        """The model that the result has."""
+        """The result's own model."""
         evidence = self.columns.restricted(self.members(()))
         starts = sides(self.problem, evidence)
         if self.result.learned is not None:
@@ -279,7 +279,7 @@ class Comparison(Models):
 
     @cached_property
     def best(self) -> Judged:
-        """The model that the data select, at a price of `SPEAK` an extension."""
+        """The selected model, at a price of `SPEAK` an extension."""
         learned = self.result.learned
         if learned is not None and learned.trials:  # it was selected then
             return self.plain
@@ -293,7 +293,7 @@ class Comparison(Models):
         return Candidate(model.point.value + SPEAK * len(families), families, model)
 
     def rise_without(self, members: np.ndarray) -> float:
-        """Return by how much -2 ln L would rise without some of the result's own parameters (n,)."""
+        """Return the increase of -2 ln L without a subset of the result's own parameters (n,)."""
         keep = np.isin(self.names, np.array(self.own)[~members])
         return self._fitted((), keep).point.value - self.plain.point.value
 

@@ -1,4 +1,4 @@
-"""Outliers: rows that the model cannot explain, singly and not as a cluster of neighbours."""
+"""Outliers: isolated rows that the model cannot explain; clusters of neighbours are a model error."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ UNDECIDED = 1e-5
 
 
 def by_block(problem: CalibrationProblem, values: Array) -> Iterator[tuple[Block, Array]]:
-    """Yield every block of a problem's data, with what some values (m, ...) of equations are there, (N, k, ...)."""
+    """Yield every block of a problem's data with its part (N, k, ...) of values (m, ...) of the equations."""
     start = 0
     for block in problem.data.blocks:
         end = start + len(block.row) * len(block.measurement.components)
@@ -51,7 +51,7 @@ def by_block(problem: CalibrationProblem, values: Array) -> Iterator[tuple[Block
 
 
 def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
-    """Return measured minus modelled position of every row (N, 3) [m] at deviations x (n,); NaN where none was."""
+    """Return measured minus modelled position of every row (N, 3) [m] at deviations x (n,); NaN without a position."""
     vectors = np.full((len(problem.data), 3), np.nan)
     for block, part in by_block(problem, problem.residual(x)):
         names = list(block.measurement.components)
@@ -61,7 +61,7 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
 
 
 def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
-    """Return every row's error over the median of its kind (N,), in multiples that are as rare as those of positions.
+    """Return error ratios (N,) to the median of the measurement type, scaled to the same false rate for every type.
 
     The larger of those of lengths and of angles, at the deviations x (n,) [SI].
     """
@@ -83,7 +83,7 @@ def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
 
 
 def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
-    """Return deviations (n,) [SI] that no few rows pull to themselves.
+    """Return deviations (n,) [SI] of a fit that is resistant to a few outliers.
 
     Huber's loss of the rows' errors over their own median, by reweighted squares of the linearization at x, with prior
     scales (n,) [SI]::
@@ -119,7 +119,7 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
 
 
 def suspects(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
-    """Return the rows that may be outliers, label to error over the median.
+    """Return the rows that may be outliers, as a mapping from label to error over the median.
 
     At deviations x (n,) of a squared fit, of prior scales (n,) [SI], that left over a part ``spare`` of the equations.
     """
@@ -134,7 +134,7 @@ def suspects(problem: CalibrationProblem, x: Array, scale: Array, spare: float) 
 
 
 def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
-    """Return which of some rows (r,) err as their neighbours in joint space do: those are physics, and no outliers."""
+    """Return which rows (r,) have errors like their neighbours in joint space: a model error, not outliers."""
     found = np.zeros(len(rows), dtype=bool)
     if len(rows) < NEIGHBOURS:
         return found
@@ -159,7 +159,7 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
 
 
 def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
-    """Return which of some rows (r,) are no outliers of their own: neighbours in joint space or in time err with them.
+    """Return which rows (r,) have errors correlated with neighbours in joint space or time, so are not outliers.
 
     In time that is a run of visits one after the other that chance makes once in a hundred sets of data.
     """
@@ -178,7 +178,7 @@ def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndar
 
 
 def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
-    """Return the rows that the noise of a fit x (n,) [SI] cannot explain, by the same false rate.
+    """Return the rows that the noise of a fit x (n,) [SI] cannot explain, at the same false rate.
 
     For so many measurements that no single one pulls the fit, and that are not all used to estimate hyperparameters.
     """
@@ -190,7 +190,7 @@ def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
 
 
 def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]) -> dict[str, float]:
-    """Return those of some excluded rows that a fit x (n,) without them, of covariance (n, n), cannot explain [SI]."""
+    """Return the excluded rows that a fit without them, x (n,) with covariance (n, n) [SI], cannot explain."""
     kept = dict(labels)
     residual, J = problem.slopes(x)
     parts = by_block(problem, np.column_stack([residual, J]))
@@ -208,7 +208,7 @@ def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels
 def contradicted(
     model: LinearModel, penalty: Quadratic | None, weight: float, width: Array, groups: np.ndarray
 ) -> np.ndarray:
-    """Return which of some configurations (g,) of these numbers the others contradict.
+    """Return which of some configurations (g,) are contradicted by the others.
 
     A robust loss may fit half of few equations at the expense of the other half, of which none is wrong. So all the
     possible outliers together are left out, and each is compared with what the rest predicts, by the false rate of

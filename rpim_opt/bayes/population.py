@@ -1,4 +1,4 @@
-"""Population prior: what several robots of one type have in common, by empirical Bayes."""
+"""Population prior of several robots of one type, by empirical Bayes."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ITERATIONS, SETTLED = 1000, 1e-6
 
 
 def random_effects(arms: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
-    """Return prior means and standard deviations (p,) of another robot, in generic widths: a model of random effects.
+    """Return prior means and standard deviations (p,) for another robot by a random-effects model, in generic scales.
 
     Of each robot are given rows (p, p) u - values (p,) ~ N(0, I). Deviations of robot k, in generic widths: what all
     share, and what is its own::
@@ -49,7 +49,7 @@ def random_effects(arms: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:
 
 
 def expectation(P: Array, q: Array, s2: Array, ratio: float) -> tuple[Array, Array, Array]:
-    """Return mean (n,) and covariance (n, n) of what robots share, and mean squares (K, n) of what is their own."""
+    """Return mean (n,) and covariance (n, n) of the common effects, and mean squares (K, n) of the individual ones."""
     s = np.sqrt(s2)
     eye = np.eye(len(s2))
     left = np.linalg.inv(eye + s[:, None] * P * s)  # in units of s: what the data leave open of a robot's own part
@@ -65,7 +65,7 @@ def expectation(P: Array, q: Array, s2: Array, ratio: float) -> tuple[Array, Arr
 
 
 def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[str, float], dict[str, float]]:
-    """Return prior means and standard deviations of another robot's parameters, by their names with a unit.
+    """Return prior means and standard deviations for another robot's parameters, by name with unit.
 
     From the data of several robots of one type (`random_effects`), without the priors that they were calibrated with,
     and with frames integrated out; arguments as for `Prior.from_population`.
@@ -75,7 +75,7 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
     else:
         named = {f"arm {i}": result for i, result in enumerate(results, start=1)}
     if len(named) < 2:
-        raise InputError("Prior.from_population", f"{len(named)} results", "those of two arms or more")
+        raise InputError("Prior.from_population", f"{len(named)} results", "results of two or more arms")
     tables = [each.problem.parameters for each in named.values()]
     every = [name for p in tables for name, frame in zip(p.free.names, p.free.of_frames, strict=True) if not frame]
     names = tuple(dict.fromkeys(every))
@@ -105,7 +105,7 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
 
 
 def of_data(result: Result) -> tuple[tuple[str, ...], Array, Array]:
-    """Return names (p), rows (p, p) [1/SI] and values (p,) of what a result's data alone say of the robot.
+    """Return names (p), rows (p, p) [1/SI] and values (p,) of the likelihood of a result's data alone.
 
     Frames have their default prior standard deviations and are integrated out.
     """
@@ -125,5 +125,7 @@ def _places(names: Sequence[str], some: Sequence[str]) -> np.ndarray:
     """Return where some parameters stand in a table."""
     for name in some:
         if name not in names:
-            raise InputError("Prior.from_population", f"parameter '{name}' that not all have", "arms of one type")
+            raise InputError(
+                "Prior.from_population", f"parameter '{name}', which some of them lack", "arms of one type"
+            )
     return np.array([names.index(name) for name in some])

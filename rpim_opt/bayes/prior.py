@@ -1,4 +1,4 @@
-"""The prior: what is assumed of the deviations before the data are seen."""
+"""The prior of the deviations from nominal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 
 @dataclass(frozen=True)
 class Prior:
-    """The prior of the deviations, before the data are seen.
+    """The prior of the deviations from nominal.
 
     By default deviations have the scales of the parameters and Student's t, joint offsets three times those scales,
     because they are set at assembly, and frames ten times. The data estimate a factor on them for each group: lengths,
@@ -101,7 +101,7 @@ class Prior:
 
     @classmethod
     def known(cls, text: str, value: float | None = None, *, sd: float | None = None) -> Prior:
-        """Return the prior that also knows a linear combination of parameters.
+        """Return the prior with a known linear combination of parameters added.
 
         Where prior scales and noise are estimated, the default, its standard deviation is absolute; with one weight,
         given or of a rule, the weight and the estimated noise multiply the statement as they do all of the prior.
@@ -130,7 +130,7 @@ class Prior:
         *,
         noise: float | None = None,
     ) -> Prior:
-        """Return the posterior of an earlier calibration as the prior of the next, in the place of its own scales.
+        """Return the posterior of an earlier calibration as a prior, replacing the scales of its parameters.
 
         Where the model is linear, calibrating with it at weight 1 equals calibrating with the data of both. It holds
         the earlier penalty already: of several results of one robot only the last one is to be taken. With estimated
@@ -167,7 +167,7 @@ class Prior:
 
     @classmethod
     def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
-        """Return the prior of another robot of the type of several that were calibrated: their centre and spread.
+        """Return a prior for another robot of a type from several calibrated ones: their mean and spread.
 
         By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where
         the marginal likelihood of another robot's data is against it, this prior is left out (``doubted``).
@@ -210,7 +210,7 @@ class Prior:
         return Prior(**both)
 
     def stated(self, parameters: Parameters, *, widened: bool = True) -> Stated:
-        """Return the prior of the identified parameters of a problem, in units of their scales.
+        """Return the prior of a problem's identified parameters, in units of their scales.
 
         Parameters
         ----------
@@ -283,6 +283,6 @@ class Prior:
 
 
 def family_of(name: str) -> str:
-    """Return the model extension of a parameter that is not geometry: ``ecc`` of ``ecc_cos3``."""
+    """Return the model extension of a non-geometric parameter: ``ecc`` for ``ecc_cos3``."""
     found = _FAMILY.match(own_name(name))
     return found[1] if found else own_name(name)

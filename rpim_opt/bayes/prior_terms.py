@@ -1,4 +1,4 @@
-"""A prior in numbers: statements about parameters, the prior of one problem, and the penalty that it amounts to."""
+"""The prior of one problem in numbers: known combinations of parameters, scales, and the equivalent penalty."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ FAR = 100.0
 
 
 def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, frames: float = FRAMES) -> Array:
-    """Return the prior standard deviations (P,) [SI] where nothing but the scales is stated."""
+    """Return the default prior standard deviations (P,) [SI], if only scales are stated."""
     offsets = np.array([is_joint_offset(name) for name in parameters.names])
     factor = np.where(offsets, joint_offset, 1.0)
     factor[parameters.placed] = frames
@@ -42,7 +42,7 @@ def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, f
 
 @dataclass(frozen=True, eq=False)
 class Stated:
-    """A prior of the n identified parameters of a problem, in units of their scales.
+    """Prior of the n identified parameters of a problem, in units of their scales.
 
     Independently of each other, with an estimated scale tau_g a group, unless a statement replaces it::
 
@@ -91,7 +91,7 @@ class Stated:
 
     @property
     def plain(self) -> bool:
-        """Whether it says no more than the parameters' scales."""
+        """Whether it consists of the parameters' scales alone."""
         said = self.centre.any() or len(self.rows) or self.replaced.any()
         return not said and bool((self.scale == 1).all())
 
@@ -102,7 +102,7 @@ class Stated:
         return replace(self, parameters=larger, centre=self.centre / size, scale=ones, rows=self.rows * size)
 
     def penalized(self, formulation: Formulation) -> Formulation:
-        """Return the formulation whose penalty is that of the prior; itself, where nothing is stated.
+        """Return the formulation with the prior's penalty; the formulation itself if no prior is stated.
 
         The penalty becomes, with zero in the place of what the statements replace::
 
@@ -222,7 +222,7 @@ class Statement:
 
     @property
     def where(self) -> str:
-        """What an error calls it."""
+        """Its name in error messages."""
         return f"prior '{self.text}'"
 
     def on(self, parameters: Parameters) -> tuple[Array, Array, np.ndarray]:
@@ -273,7 +273,7 @@ class Statement:
             turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
             if len(turned):  # angles of frames do not add up
                 found = f"'{some.names[turned[0]]}' relative to another nominal orientation"
-                accepted = "the frame's earlier nominal values; or no prior on a frame that was set up anew"
+                accepted = "the frame's earlier nominal values; or no prior on a frame that was set up again"
                 raise InputError(self.where, found, accepted)
             return
         rows = np.array(self.rows)[:, own]
@@ -283,11 +283,11 @@ class Statement:
             size = float(np.max(apart / np.where(norms > 0, norms, 1.0)))
             unit, si = display(parameters.dimensions[place[0]])
             found = f"a value {size / si:.4g} {unit} off nominal"
-            raise InputError(self.where, found, "one near it; '= nominal +- ...' where the nominal value is meant")
+            raise InputError(self.where, found, "a value near nominal; '= nominal +- ...' refers to the nominal value")
 
 
 def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array]:
-    """Return rows (k', p') and values (k',) of what a statement says of some parameters, whatever the others are.
+    """Return rows (k', p') and values (k',) of a statement marginalized to a subset of its parameters.
 
     Projected off the columns of the others.
     """
@@ -304,13 +304,13 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
 
 
 def known(text: str, value: float | None = None, sd: float | None = None) -> Statement:
-    """Return the statement that a combination of parameters has a value; arguments as for `Prior.known`."""
+    """Return the statement that a combination of parameters has a known value; arguments as for `Prior.known`."""
     from rpim_opt.convex.tolerances import combination  # texts are read where there are any
 
     said = combination(text)
     if said.sd is not None:
         if value is not None or sd is not None:
-            raise InputError(f"prior '{text}'", "a value or sd besides", "the text alone, or value and sd [SI]")
+            raise InputError(f"prior '{text}'", "a separate value or sd", "the text alone, or value and sd [SI]")
         value, sd = said.value, said.sd
     if sd is None or not (np.isfinite(sd) and sd > 0):
         raise InputError(f"prior '{text}'", f"sd {sd}", "a standard deviation above zero: '+- 0.05 mm', or sd [SI]")
@@ -327,7 +327,7 @@ def known(text: str, value: float | None = None, sd: float | None = None) -> Sta
 
 
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
-    """Return a matrix (k, p) as tuples, which are equal where their content is."""
+    """Return a matrix (k, p) as nested tuples, which compare by content."""
     return tuple(tuple(row) for row in matrix.tolist())
 
 
@@ -335,11 +335,11 @@ def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
 
 
 class Result(Protocol):
-    """What a prior or a comparison of models needs of a result: a `Calibration` has it."""
+    """Protocol of the attributes of a `Calibration` that priors and model comparison use."""
 
     @property
     def problem(self) -> Source:
-        """What was calibrated."""
+        """The calibrated problem."""
         ...
 
     @property
@@ -354,20 +354,20 @@ class Result(Protocol):
 
     @property
     def learned(self) -> Any:
-        """The hyperparameters (`Learned`), where they were estimated."""
+        """The estimated hyperparameters (`Learned`), or None."""
 
     @cached_property
     def flagged(self) -> Sequence[Any]:
-        """Outlying rows, each with a ``label``."""
+        """Outliers, each with a ``label``."""
         ...
 
     @cached_property
     def spread(self) -> Any:
-        """The equations and the penalty of the fit (`Spread`), or InputError without covariance."""
+        """The equations and the penalty of the fit (`Spread`); InputError for a fit without covariance."""
 
 
 def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:
-    """Return what a result says of its parameters; arguments as for `Prior.from_result`."""
+    """Return the posterior of a result's parameters; arguments as for `Prior.from_result`."""
     for name, value in (("inflate", inflate), ("noise", noise)):
         if value is not None and not (np.isfinite(value) and value > 0):
             raise InputError(f"Prior.from_result, {name}", f"{value}", "a number above zero")
@@ -384,7 +384,7 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     if without:
         kept = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
     if not len(kept):
-        raise InputError("Prior.from_result, without", "every parameter", "patterns that leave some")
+        raise InputError("Prior.from_result, without", "every parameter", "patterns that keep at least one")
     R = triangle_of(np.vstack(parts))
     if spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
         moved = R @ (spread.drift / free.scale[:, None])

@@ -1,4 +1,4 @@
-"""Transmission error of joints: a Gaussian process of each joint's own angle, a model extension with a spectrum.
+"""Transmission errors of joints: a model extension with a Gaussian process of each joint's angle.
 
 f(q) = sum_k c_k cos(w_k q) + s_k sin(w_k q), w_k = 2 pi k / period, stands for a process with Matern's covariance (3/2)
 where the coefficients have the variances of `Spectrum`.
@@ -47,13 +47,13 @@ LEAST = 2e-6
 
 
 def possible(problem: CalibrationProblem) -> bool:
-    """Return whether every equation is of one stop of the joints of one robot, so that curves may explain it."""
+    """Return whether every equation depends on a single configuration of one robot, as transmission errors require."""
     one_stop = all(block.q.shape[1] == 1 for block in problem.data.blocks)
     return len(problem.arms) == 1 and problem.touches is None and one_stop
 
 
 def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
-    """Return the columns (m, c) of all coefficients, from joint values and slopes by them (m, dof)."""
+    """Return the columns (m, c) of all coefficients, from joint values and derivatives by them (m, dof)."""
     found = [np.zeros((len(q), 0))]
     for joint, centre, period, count in curves:
         u = 2 * np.pi / period * np.clip(q[:, joint - 1] - centre, -period / 2, period / 2)
@@ -65,7 +65,7 @@ def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
 def admitted(
     estimator: Estimator, fit: Fit, stated: Sequence[str], trials: tuple[Trial, ...]
 ) -> tuple[Fit, tuple[Trial, ...], float] | None:
-    """Return the fit with curves, the models compared, and by how much -2 ln L falls; None where that is too little.
+    """Return the fit with transmission errors, the models compared, and the decrease of -2 ln L; None if too small.
 
     Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model.
     ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of

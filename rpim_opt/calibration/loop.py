@@ -485,7 +485,7 @@ def require_start(start: Array, count: int) -> Array:
 def require_finite(*arrays: Array) -> None:
     """Refuse residuals or slopes that are no numbers."""
     if not all(np.isfinite(values).all() for values in arrays):
-        raise InputError("data", "residuals or slopes that are not finite", "measurements and a model that are")
+        raise InputError("data", "non-finite residuals or derivatives", "measurements and a model that are")
 
 
 def _whitened(problem: CalibrationProblem, z: Array) -> Array:

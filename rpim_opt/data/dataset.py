@@ -363,7 +363,7 @@ class Dataset(Tabled):
             raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
         largest = max(np.abs(q).max(initial=0.0), np.abs(y).max(initial=0.0))
         if largest > LARGEST:
-            raise InputError("q and y", f"{largest:g}", f"sizes of at most {LARGEST:g} m or rad")
+            raise InputError("q and y", f"{largest:g}", f"magnitudes of at most {LARGEST:g} m or rad")
         k = len(measurement.components)
         rows = np.arange(N)
         covariance = np.array(sigma, dtype=float)

@@ -195,7 +195,7 @@ class Robot(Brief):
         require(right, "mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5)")
         n = len(mdh)
         largest = np.abs(mdh).max()
-        require(largest <= FARTHEST, "mdh", f"{largest:g}", f"sizes of at most {FARTHEST:g} m or rad")
+        require(largest <= FARTHEST, "mdh", f"{largest:g}", f"magnitudes of at most {FARTHEST:g} m or rad")
         types = tuple(self.joint_types) or ("revolute",) * n
         right = len(types) == n and set(types) <= {"revolute", "prismatic"}
         require(right, "joint_types", repr(types), f"{n} times revolute or prismatic")

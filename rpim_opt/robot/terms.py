@@ -274,7 +274,7 @@ def _quantity(key: str, value: float, where: str) -> tuple[str, str, float]:
     stem, unit = split_unit(key)
     if unit is None or unit.dimension not in DISPLAY:
         units = [name for name, each in UNITS.items() if each.dimension in DISPLAY]
-        raise InputError(place, "no unit that fits", f"a name with one of {', '.join(units)}")
+        raise InputError(place, "no unit of the right dimension", f"a name with one of {', '.join(units)}")
     return stem, unit.dimension, number(value, place) * unit.si
 
 

@@ -225,7 +225,7 @@ def _rows(values: Array, N: int, what: str) -> Array:
     far = np.abs(array).max(axis=1) > LARGEST
     if far.any():
         row = int(far.argmax())
-        raise InputError(f"{what}, row {row + 1}", f"{array[row]}", f"sizes of at most {LARGEST:g} m or rad")
+        raise InputError(f"{what}, row {row + 1}", f"{array[row]}", f"magnitudes of at most {LARGEST:g} m or rad")
     return array
 
 

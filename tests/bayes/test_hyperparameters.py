@@ -103,7 +103,7 @@ def test_a_start_that_does_not_fit_is_refused(start: object, found: str) -> None
 def test_data_that_are_no_numbers_are_refused() -> None:
     block = POSITION.data.blocks[0]
     broken = POSITION.on(replace(POSITION.data, blocks=(replace(block, y=np.where(block.y > 1, np.nan, block.y)),)))
-    with pytest.raises(ro.InputError, match="not finite"):
+    with pytest.raises(ro.InputError, match="non-finite"):
         ro.calibrate(broken)
 
 
@@ -205,7 +205,7 @@ def test_fewer_equations_than_parameters_are_said() -> None:
     few = POSITION.on(POSITION.data.configurations(5, 0))
     result = ro.calibrate(few)
     assert (
-        "15 equations for 34 parameters: at least 19 parameter combinations rest on the prior alone."
+        "15 equations for 34 parameters: at least 19 parameter combinations are determined by the prior alone."
         in result.weight_sentence()
     )
 

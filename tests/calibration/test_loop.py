@@ -123,7 +123,7 @@ def test_data_that_are_not_finite_are_refused(part: str) -> None:
 
     at = loop()
     broken = Broken(at.source, at.formulation)
-    with pytest.raises(ro.InputError, match="residuals or slopes that are not finite"):
+    with pytest.raises(ro.InputError, match="non-finite residuals or derivatives"):
         begun(broken, ro.tikhonov, weight_choice(1.0, True), None)
 
 

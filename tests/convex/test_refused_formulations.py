@@ -33,7 +33,7 @@ def drawn(text: str, **identify: Any) -> ro.calibration.Calibration:
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a statement that is a number": (lambda: combination(3), "prior: found 3"),  # type: ignore[arg-type]
     "a value beside a text that has one": (
-        lambda: Prior.known("a2 = 0.1 +- 0.1 mm", value=1.0), "a value or sd besides, accepted: the text alone"
+        lambda: Prior.known("a2 = 0.1 +- 0.1 mm", value=1.0), "a separate value or sd, accepted: the text alone"
     ),
     "a value that is none": (lambda: Prior.known("a2 - a3", value=np.nan, sd=1.0), "value nan, accepted: a finite"),
     "no deviation": (lambda: Prior.known("a2 - a3", value=0.0, sd=0.0), "sd 0.0, accepted: a standard deviation"),

@@ -54,7 +54,9 @@ def test_rows_of_one_configuration_stay_together(tmp_path: Path) -> None:
 
 
 def test_a_prismatic_joint_wants_a_length(tmp_path: Path) -> None:
-    with pytest.raises(ro.InputError, match="'q2_deg' without a unit that fits, accepted: q2_m, q2_mm, q2_um"):
+    with pytest.raises(
+        ro.InputError, match="'q2_deg' without a unit of the right dimension, accepted: q2_m, q2_mm, q2_um"
+    ):
         read(tmp_path, "q1_deg,q2_deg,x_mm,y_mm,z_mm\n0,0,0,0,0\n")
 
 

@@ -135,7 +135,7 @@ def test_many_lines_between_rows_are_counted_beyond_those_that_are_shown(tmp_pat
     between = "".join(f"P{i},{i},2,40{i},5,6\npause {i},,,,,\n" for i in range(1, 10))
     found = read(write(tmp_path, HEAD + between + "P10,1,2,3,4,5\n"))
     assert len(found.columns["label"]) == 10
-    assert any(note.endswith("more lines are no rows of the table: left out.") for note in found.notes)
+    assert any(note.endswith("more lines are not rows of the table: left out.") for note in found.notes)
 
 
 @pytest.mark.parametrize("name", ["u(x)", "u x", "u_x"])

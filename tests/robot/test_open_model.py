@@ -302,7 +302,7 @@ def test_columns_of_a_table_are_read_kept_and_missed(tmp_path: Path) -> None:
     assert data.take([3, 1]).blocks[0].columns["temperature"].tolist() == [3.0, 1.0]
     with pytest.raises(ro.InputError, match="column 'hours'"):
         ro.read_data(full, ARM, {"position_mm": 0.05})
-    with pytest.raises(ro.InputError, match="column 'temperature' without a unit that fits"):
+    with pytest.raises(ro.InputError, match="column 'temperature' without a unit of the right dimension"):
         ro.read_data(table | {"temperature": np.arange(N)}, robot, {"position_mm": 0.05})
     problem = blank()
     with pytest.raises(ro.InputError, match="no column 'hours'"):
@@ -421,7 +421,7 @@ def test_a_problem_file_identifies_and_scales_what_a_script_adds(tmp_path: Path)
 @pytest.mark.parametrize(
     ("make", "sentence"),
     [
-        (lambda: ro.robot.Term(lambda j, s: s, {"play": 1.0}), "no unit that fits"),
+        (lambda: ro.robot.Term(lambda j, s: s, {"play": 1.0}), "no unit of the right dimension"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 0.0}), "greater than zero"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": "much"}), "a finite number"),
         (lambda: ro.robot.Term(lambda j, s: s, {"tool_play_mrad": 1.0}), "a name that is another's"),

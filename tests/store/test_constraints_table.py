@@ -93,7 +93,7 @@ four = { x_mm = [400, 500], y_m = [-0.3, 0.3], z_mm = [-200, 200] }
         ('stated = ["move at most 3 mm: nowhere"]', "place 'nowhere'"),
         ("places.measured = { q_deg = [0, 0, 0, 0, 0, 0] }", "a place that every problem has"),
         ("places.here = { q_deg = [0, 0, 0] }", "3 joint values"),
-        ("places.here = { q_mm = [0, 0, 0] }", "no unit that fits"),
+        ("places.here = { q_mm = [0, 0, 0] }", "no unit of the right dimension"),
         ("places.here = { q_deg = [[0, 0], [0]] }", "lists of different lengths"),
         ("places.here = { x_mm = [0, 1] }", "x_mm"),
         ("places.here = { }", "nothing"),

@@ -181,7 +181,7 @@ def test_what_is_no_result_is_refused_in_one_sentence(tmp_path: Path, text: str,
 
 
 def test_no_file_is_refused_too(tmp_path: Path) -> None:
-    with pytest.raises(ro.InputError, match=r"result.json, the file: found nothing, accepted: a file there"):
+    with pytest.raises(ro.InputError, match=r"result.json, the file: found nothing, accepted: an existing file"):
         ro.load_result(tmp_path)
 
 

@@ -471,7 +471,7 @@ def test_a_journal_that_is_no_file_is_refused(toy, tmp_path: Path, kind: str) ->
         os.mkfifo(journal)
     else:
         journal.mkdir()
-    with pytest.raises(ro.InputError, match="accepted: an ordinary file"):
+    with pytest.raises(ro.InputError, match="accepted: a regular file"):
         run_study("toy", out=tmp_path / "out", resume=True)
 
 

@@ -89,12 +89,12 @@ def quantities_of(
             raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
         if dimension not in known[stem]:
             accepted = ", ".join(spelled(stem, known[stem]))
-            raise InputError("the header", f"column '{name}' without a unit that fits", accepted)
+            raise InputError("the header", f"column '{name}' without a unit of the right dimension", accepted)
         if (stem, dimension) in columns:
             raise InputError("the header", f"column '{stem}' in two units", "one of them")
         values = si * numbers(table[name], name, label) + (unit.zero if unit else 0.0)
         fits = np.abs(values) <= LARGEST
-        accepted = f"a size of at most {LARGEST / si:g}"
+        accepted = f"a magnitude of at most {LARGEST / si:g}"
         if stem.startswith(SPREADS) and fits.all():
             fits = values >= SMALLEST
             accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"

@@ -207,7 +207,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
     raw = read_table(path)
-    lost = next((note for note in raw.notes if "is no row of the table" in note or "is a total of others" in note), "")
+    lost = next((note for note in raw.notes if "is not a row of the table" in note or "is a summary" in note), "")
     if lost:
         raise InputError("the table", lost.rstrip("."), "a row a joint", path)
     columns: dict[str, list[str]] = {}
