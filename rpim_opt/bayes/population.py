@@ -75,7 +75,7 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
     else:
         named = {f"arm {i}": result for i, result in enumerate(results, start=1)}
     if len(named) < 2:
-        raise InputError("Prior.from_population", f"{len(named)} results", "results of two or more arms")
+        raise InputError("Prior.from_population", f"{len(named)} results", "results of two arms or more")
     tables = [each.problem.parameters for each in named.values()]
     every = [name for p in tables for name, frame in zip(p.free.names, p.free.of_frames, strict=True) if not frame]
     names = tuple(dict.fromkeys(every))
