@@ -218,7 +218,7 @@ def test_where_a_path_begins_changes_nothing(loss: str) -> None:
     ("loss", "over"),
     [
         (LOSSES["tail"]["loss"], "equation"),
-        (cp.max, "configuration"),
+        pytest.param(cp.max, "configuration", marks=pytest.mark.slow),
         (lambda r: cp.sum_largest(cp.abs(r), 40), "equation"),
         (lambda r: cp.max(cp.multiply(np.linspace(1, 2, r.size), cp.abs(r))), "equation"),
     ],

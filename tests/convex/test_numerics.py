@@ -52,6 +52,7 @@ def test_leaving_configurations_out_in_closed_form_is_leaving_them_out() -> None
     assert np.sqrt(chosen.score[::40] / len(program.model.b)) == pytest.approx(held_out_error(program)(some), rel=1e-6)
 
 
+@pytest.mark.slow
 def test_many_configurations_of_a_lasso_are_left_out_in_parts() -> None:
     problem, _ = simulated(noise=5e-5, configurations=130)
     program = ro.convex.pose(ro.lasso, problem.linearize(np.zeros(len(problem.parameters.free))))

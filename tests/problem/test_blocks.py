@@ -295,7 +295,8 @@ def test_rows_that_fit_are_those_of_one_table(whole: ro.CalibrationProblem) -> N
 @pytest.mark.parametrize("count", [2, pytest.param(7, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("formulation", "rule"),
-    [("minimax", "l_curve"), ("sum_of_norms", "leave_one_out"), ("lasso", "k_fold"), ("robust", "two_step"),
+    [pytest.param("minimax", "l_curve", marks=pytest.mark.slow), ("sum_of_norms", "leave_one_out"),
+     pytest.param("lasso", "k_fold", marks=pytest.mark.slow), ("robust", "two_step"),
      ("group_lasso", "corner"), ("tikhonov", "ncp")],
 )  # fmt: skip
 def test_storage_decides_nothing(formulation: str, rule: str, count: int) -> None:

@@ -262,7 +262,9 @@ def test_a_board_that_is_never_in_sight_is_said(monkeypatch) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda b: replace(b, q=b.q * [1, 1, -1, 1, 1, 1]), "write sign = -1 for joint 3"),
+        pytest.param(
+            lambda b: replace(b, q=b.q * [1, 1, -1, 1, 1, 1]), "write sign = -1 for joint 3", marks=pytest.mark.slow
+        ),
         pytest.param(
             lambda b: replace(b, q=b.q[:, :, [0, 2, 1, 3, 4, 5]]),
             "exchange the names of the columns q2 and q3",

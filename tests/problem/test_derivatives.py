@@ -12,6 +12,7 @@ import rpim_opt as ro
 from tests import ROOT
 
 NAMES = sorted(folder.name for folder in (ROOT / "problems").iterdir())
+LONG = {"datum_cube": pytest.mark.slow}  # as 3.0, without noise
 STEP = 3e-3
 """Of the differences, in prior standard deviations."""
 
@@ -38,7 +39,7 @@ def differences(problem: ro.CalibrationProblem, x: np.ndarray) -> np.ndarray:
     return np.column_stack([(4 * slope(k, STEP) - slope(k, 2 * STEP)) / 3 for k in range(len(x))])
 
 
-@pytest.mark.parametrize("name", [*NAMES, 3.0])
+@pytest.mark.parametrize("name", [*(pytest.param(name, marks=LONG.get(name, ())) for name in NAMES), 3.0])
 def test_every_column_of_the_jacobian_is_the_derivative(name: str | float) -> None:
     problem = ro.load(name).problem if isinstance(name, str) else scattered(name)
     scale = problem.parameters.free.scale
