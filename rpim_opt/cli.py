@@ -10,10 +10,11 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache
+from functools import cache, wraps
 from importlib import import_module
+from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 from typer import Argument, Option
@@ -26,6 +27,7 @@ from rpim_opt.report import console
 if TYPE_CHECKING:
     from rpim_opt.calibration.result import Calibration
     from rpim_opt.store.instances import Instance
+    from rpim_opt.use.reading import Measured
 
 HELP = """Robot calibration by convex optimization.
 
@@ -167,7 +169,88 @@ def _with_code(context: typer.Context, allowed: bool) -> None:
 Code = Annotated[bool, Option("--allow-code", help="Run the Python files that the folder names.", callback=_with_code)]
 
 
-@app.command()
+# --- how a command is made ---------------------------------------------------------------------------------
+
+
+class Answer(NamedTuple):
+    """What a command ends with: text and document, exit code, files written, and how its tables were read."""
+
+    text: object
+    document: dict[str, Any]
+    code: int = 0
+    written: Sequence[Path] | None = None
+    left_out: Sequence[str] | None = None
+    notes: Sequence[str] = ()
+
+    def show(self, as_json: bool) -> None:
+        """Print the text, or the document as JSON."""
+        lines = [*filter(None, [str(self.text)]), *self.notes]
+        if self.left_out:
+            lines.append(f"Columns that were left out: {', '.join(self.left_out)}.")
+        lines += [f"Written: {file}" for file in self.written or ()]
+        more = {"left_out": self.left_out, "tables": self.notes or None, "written": self.written}
+        document = {**self.document, **{key: value for key, value in more.items() if value is not None}}
+        console.show("\n".join(lines), document, as_json)
+
+
+class Tables(NamedTuple):
+    """Options of the commands that read tables of measurements."""
+
+    units: Units = ""
+    key: Key = ""
+    time_tolerance: TimeTolerance = None
+    sheet: Sheet = ""
+    measurement: Type = None
+
+    def read(self, result: "Calibration", sources: list[Path]) -> "Measured":
+        """Return the measurements of tables."""
+        from rpim_opt.use.reading import read_measurements
+
+        options = console.table_options(self.units, key=self.key, within=self.time_tolerance, sheet=self.sheet)
+        return read_measurements(result, sources, self.measurement, options)
+
+
+TABLES = Tables()
+CODES = {"accepted": 0, "rejected": 1, "undecided": 4}
+"""Exit codes of an acceptance test."""
+CODELESS = ("new", "iso9283", "study", "robots")
+"""Commands that read no folder of a calibration, which may name code."""
+
+
+def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
+    """Add a command: its answer is printed, as text or with --json as a document, and decides the exit code.
+
+    A parameter ``tables`` stands for the options of `Tables`; a command that runs a folder's code takes --allow-code.
+    """
+    own = signature(function).parameters
+    options = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in own.values() if each.annotation is not Tables]
+
+    def add(name: str, annotation: Any, default: Any) -> None:
+        options.append(Parameter(name, Parameter.KEYWORD_ONLY, annotation=annotation, default=default))
+
+    for name, annotation in Tables.__annotations__.items() if "tables" in own else ():
+        add(name, annotation, Tables._field_defaults[name])
+    if function.__name__ not in CODELESS:
+        add("allow_code", Code, False)
+    if "as_json" not in own:
+        add("as_json", Json, False)
+
+    @wraps(function)
+    def run(allow_code: bool = False, **values: Any) -> None:
+        as_json = values["as_json"] if "as_json" in own else values.pop("as_json")
+        if "tables" in own:
+            values["tables"] = Tables(**{name: values.pop(name) for name in Tables._fields})
+        answer = function(**values)
+        answer.show(as_json)
+        if answer.code:
+            raise typer.Exit(answer.code)
+
+    vars(run)["__signature__"] = signature(run).replace(parameters=options)
+    app.command()(run)
+    return function
+
+
+@command
 def new(
     folder: Annotated[Path, Argument(help="The problem folder to make; it must not exist.")],
     robot: Annotated[
@@ -204,7 +287,7 @@ def new(
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: Json = False,
-) -> None:
+) -> Answer:
     """Make a problem folder from a table and a robot; every key has a comment, every guess its reason."""
     with console.progress():
         from rpim_opt.basics.files import refused
@@ -217,8 +300,7 @@ def new(
         )  # fmt: skip
         if dry_run:
             found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)
-            console.show(found, found.content(), as_json)
-            return
+            return Answer(found, found.content())
         from rpim_opt.store.new_folder import new_problem
 
         with refused(folder):
@@ -228,11 +310,11 @@ def new(
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
             )  # fmt: skip
     document = {"written": [made.folder], "rows": made.rows, **made.understood.content(), "notes": made.notes}
-    console.show(made, document, as_json)
+    return Answer(made, document)
 
 
-@app.command()
-def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False, as_json: Json = False) -> None:
+@command
+def inspect(problem: Problem, variant: Variant = None) -> Answer:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
         from rpim_opt.calibration.lack_of_fit import foreseen
@@ -261,10 +343,10 @@ def inspect(problem: Problem, variant: Variant = None, allow_code: Code = False,
     if lacking is not None:
         document["lack_of_fit"] = lacking.content()
         text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"
-    console.show(text, document, as_json)
+    return Answer(text, document)
 
 
-@app.command()
+@command
 def calibrate(
     problem: Problem,
     variant: Variant = None,
@@ -284,9 +366,7 @@ def calibrate(
     box: Box = None,
     out: Folder = None,
     profile: Annotated[bool, Option("--profile", help="Print the time of each phase.")] = False,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
     Exit code 1 if the robot is not delivered or a limit is not kept; 4 where that cannot be decided.
@@ -317,26 +397,23 @@ def calibrate(
         say("summing up")
         found = summary(result, instance.published)
     text = describe(result, found)
-    if drop_outliers and not without:
-        text = f"No flagged row to drop: nothing was refitted.\n\n{text}"
-    if without:
-        text = f"Refitted without {', '.join(without)}.\n\n{text}"
+    if drop_outliers:
+        refitted = (
+            f"Refitted without {', '.join(without)}." if without else "No flagged row to drop: nothing was refitted."
+        )
+        text = f"{refitted}\n\n{text}"
     if profile:
         text = f"{text}\n\n{describe_times(times)}"
         found = {**found, "seconds": times}
-    _answer(text, {**found, "refitted_without": without}, as_json, _saved(result, out))
-    if not result.verdict.delivered:
-        raise typer.Exit(1)
-    _end_by(found["acceptance"])
+    code = CODES[(found["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
+    return Answer(text, {**found, "refitted_without": without}, code, _saved(result, out))
 
 
-@app.command()
+@command
 def report(
     result: Result,
     out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Write the calibration report: one HTML page that works offline, in the order in which it is signed."""
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import inside, refused
@@ -348,23 +425,17 @@ def report(
             out = inside(folder, "report.html", "the file", folder)
         with refused(out):
             write_report(loaded, out)
-    _answer("", {}, as_json, [out])
+    return Answer("", {}, written=[out])
 
 
-@app.command()
+@command
 def validate(
     result: Result,
     data: Annotated[list[Path], Argument(help=f"New measurements, in the same instrument's frame; {Several}")],
-    units: Units = "",
-    key: Key = "",
-    time_tolerance: TimeTolerance = None,
-    sheet: Sheet = "",
-    measurement: Type = None,
+    tables: Tables = TABLES,
     limit: Largest = None,
     out: Table = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named.
 
     In the table of --out, sigmas is a row's error over its predicted standard deviation, and allowed_sigmas what the
@@ -375,21 +446,18 @@ def validate(
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
-        from rpim_opt.use.reading import read_measurements
         from rpim_opt.use.validation import validate
 
-        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
-        read = read_measurements(loaded, data, measurement, options)
+        read = tables.read(loaded, data)
         found = validate(loaded, read.data)
     text, kept = _against(limit, "error", found.largest)
     document = {**found.content(), "limit_mm": limit, "within_limit": kept}
+    failed = kept is False or found.mistake or found.worse
     written = console.written_to(out, found.csv())
-    _answer("\n".join([str(found), *text]), document, as_json, written, read.left_out, read.notes)
-    if kept is False or found.mistake or found.worse:
-        raise typer.Exit(1)
+    return Answer("\n".join([str(found), *text]), document, int(bool(failed)), written, read.left_out, read.notes)
 
 
-@app.command()
+@command
 def accept(
     result: Result,
     limit: Tolerance = None,
@@ -397,39 +465,30 @@ def accept(
     data: Annotated[
         list[Path] | None, Option(help=f"New measurements that check it, instead of those it has; {Several}")
     ] = None,
-    units: Units = "",
-    key: Key = "",
-    time_tolerance: TimeTolerance = None,
-    sheet: Sheet = "",
-    measurement: Type = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+    tables: Tables = TABLES,
+) -> Answer:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
 
     Exit code 0 if it is accepted, 1 if it is rejected, 4 where that cannot be decided: then it says what is lacking.
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.calibration.acceptance import accept
-        from rpim_opt.use.reading import read_measurements
 
-        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
-        read = read_measurements(loaded, data, measurement, options) if data else None
+        read = tables.read(loaded, data) if data else None
         say("searching for the maximum uncertainty")
         found = accept(loaded, console.required(limit, box, loaded.record.requirement), read and read.data)
-    _answer(found, found.content(), as_json, left_out=read.left_out if read else (), notes=read.notes if read else ())
-    _end_by(found.content())
+    left_out, notes = (read.left_out, read.notes) if read else ((), ())
+    return Answer(found, found.content(), CODES[found.verdict], left_out=left_out, notes=notes)
 
 
-@app.command()
+@command
 def iso9283(
     table: Annotated[Path, Argument(help="Repeated approaches: pose, x_mm, y_mm, z_mm; command_x_mm, ...")],
     units: Units = "",
     limit: Annotated[Number, Option(help="Largest AP_p that is allowed [mm]; exit code 1 above.")] = None,
     repeatability: Annotated[Number, Option(help="Largest RP_l that is allowed [mm]; exit code 1 above.")] = None,
     out: Table = None,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
     from rpim_opt.use.iso9283 import read_approaches
 
@@ -444,63 +503,46 @@ def iso9283(
     limits = {"limit_mm": limit, "repeatability_limit_mm": repeatability}
     document = {**found.content(), **limits, "within_limits": all(checked) if checked else None}
     written = console.written_to(out, found.csv())
-    _answer("\n".join([str(found), *accuracy, *repeated]), document, as_json, written)
-    if not all(checked):
-        raise typer.Exit(1)
+    return Answer("\n".join([str(found), *accuracy, *repeated]), document, int(not all(checked)), written)
 
 
-@app.command()
+@command
 def update(
     result: Result,
     data: Annotated[
         list[Path], Argument(help=f"New measurements of the same robot, in the same instrument's frame; {Several}")
     ],
-    units: Units = "",
-    key: Key = "",
-    time_tolerance: TimeTolerance = None,
-    sheet: Sheet = "",
-    measurement: Type = None,
+    tables: Tables = TABLES,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     out: Folder = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Recalibrate with the previous result as prior: say whether the robot changed, and which parameters did.
 
     Exit code 1 if nothing explains what the new measurements miss, or the robot is not delivered.
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import sha256_of
-        from rpim_opt.use.reading import read_measurements
         from rpim_opt.use.recalibration import update
 
-        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
-        read = read_measurements(loaded, data, measurement, options)
+        read = tables.read(loaded, data)
         patterns = reset.replace(",", " ").split()
         found = update(loaded, read.data, prior_inflation=prior_inflation, reset=patterns, progress=say)
         updated = found.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
-    _answer(found, found.content(), as_json, _saved(updated, out), read.left_out, read.notes)
-    if not (found.explained and updated.verdict.delivered):
-        raise typer.Exit(1)
+    failed = not (found.explained and updated.verdict.delivered)
+    return Answer(found, found.content(), int(failed), _saved(updated, out), read.left_out, read.notes)
 
 
-@app.command()
+@command
 def monitor(
     result: Result,
     checks: Annotated[
         list[Path], Argument(help=f"Check readings; a column time, timestamp or date orders them; {Several}")
     ],
-    units: Units = "",
-    key: Key = "",
-    time_tolerance: TimeTolerance = None,
-    sheet: Sheet = "",
-    measurement: Type = None,
+    tables: Tables = TABLES,
     out: Annotated[File, Option(help="The chart over time: .html, or its points as .csv.")] = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Look for drift in check readings over time, each and together against the interval of a new reading.
 
     Exit code 1 if the robot drifts.
@@ -508,18 +550,14 @@ def monitor(
     with _loaded(result) as (loaded, _):
         from rpim_opt.report.page import written_checks
         from rpim_opt.use.monitoring import monitor
-        from rpim_opt.use.reading import read_measurements
 
-        options = console.table_options(units, key=key, within=time_tolerance, sheet=sheet)
-        read = read_measurements(loaded, checks, measurement, options)
+        read = tables.read(loaded, checks)
         found = monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
         written = written_checks(found, out, loaded.record.title)
-    _answer(found, found.content(), as_json, written, read.left_out, read.notes)
-    if found.drifts:
-        raise typer.Exit(1)
+    return Answer(found, found.content(), int(found.drifts), written, read.left_out, read.notes)
 
 
-@app.command()
+@command
 def export(
     result: Result,
     urdf: Annotated[File, Option(help="URDF of the nominal robot; corrected origins go to --out.")] = None,
@@ -540,9 +578,7 @@ def export(
     tool: Annotated[Choice, Option(help="Make its tip the reflector; by default if it is near.")] = None,
     marker: Marker = None,
     despite_verdict: Despite = False,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Write the identified robot for other tools: all files that are asked for, or none.
 
     Exit code 1 if the robot is not delivered.
@@ -555,10 +591,10 @@ def export(
             camera_info=camera_info, mdh=mdh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
             base=base, tool=tool, marker=marker, despite_verdict=despite_verdict,
         )  # fmt: skip
-    _answer("\n".join(notes), {"notes": notes}, as_json, written)
+    return Answer("\n".join(notes), {"notes": notes}, written=written)
 
 
-@app.command()
+@command
 def compensate(
     result: Result,
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
@@ -574,9 +610,7 @@ def compensate(
     limit: Annotated[Number, Option(help="Largest residual error [mm]; rows above it are marked, exit code 1.")] = None,
     out: Table = None,
     despite_verdict: Despite = False,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Correct joint commands so that the real robot goes where the nominal one would.
 
     Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or above the limit.
@@ -595,29 +629,26 @@ def compensate(
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
             limit=float("inf") if limit is None else 1e-3 * limit,
         )  # fmt: skip
-    _answer_with_table(found, found.csv(), out, {**found.content(), "limit_mm": limit}, as_json, left_out)
-    if found.missed:
-        raise typer.Exit(1)
+    document = {**found.content(), "limit_mm": limit}
+    return _with_table(found, found.csv(), out, document)._replace(code=int(bool(found.missed)), left_out=left_out)
 
 
-@app.command()
+@command
 def simulate(
     problem: Annotated[str, Argument(help="A problem folder with a [simulation] table.")],
     seed: Annotated[int | None, Option(min=0, help="Seed in place of the file's.")] = None,
     out: Annotated[File, Option(help="Folder for the tables; the problem's own by default.")] = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Make the tables of a simulated problem and the truth they come from."""
     from rpim_opt.basics.files import refused
     from rpim_opt.store.simulation import write_simulation
 
     with refused(out or problem):
         written = write_simulation(problem, seed, out)
-    _answer("", {}, as_json, written)
+    return Answer("", {}, written=written)
 
 
-@app.command()
+@command
 def design(
     problem: Problem,
     count: Annotated[int, Option(help="How many configurations to choose.")] = 30,
@@ -628,9 +659,7 @@ def design(
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
     augment: Annotated[bool, Option("--augment", help="Add to the measured ones, within their joint ranges.")] = False,
     out: Table = None,
-    allow_code: Code = False,
-    as_json: Json = False,
-) -> None:
+) -> Answer:
     """Choose the configurations to measure next, from candidates, by optimal design."""
     with console.progress() as say:
         from rpim_opt.basics.tables import csv_text, read_columns
@@ -660,10 +689,10 @@ def design(
             columns["label"] = [str(label[k]) for k in found.chosen]
     text = csv_text(columns, zip(*columns.values(), strict=True))
     document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap}
-    _answer_with_table(f"{found}{where}", text, out, {**document, "configurations": columns}, as_json)
+    return _with_table(f"{found}{where}", text, out, {**document, "configurations": columns})
 
 
-@app.command()
+@command
 def study(
     name: Annotated[str, Argument(help="A file mine.py, a folder with study.py, or a study of the checkout.")],
     quick: Annotated[bool, Option("--quick", help="The small version.")] = False,
@@ -674,7 +703,7 @@ def study(
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
     as_json: Json = False,
-) -> None:
+) -> Answer:
     """Run a study: replicates in parallel, with the time that is left; the results say what made them.
 
     With --gate exit code 1 if a metric got worse.
@@ -688,12 +717,14 @@ def study(
     if gate:
         worse = regressions(name, quick, report.metrics)
     document = {"report": report.text, "metrics": report.metrics, "worse": worse}
-    _answer(f"{report.text}\n", document, as_json, [folder])
+    answer = Answer(f"{report.text}\n", document, written=[folder])
     if worse:
+        answer.show(as_json)
         console.fail("\n".join(f"Worse: {line}" for line in worse), 1)
+    return answer
 
 
-@app.command()
+@command
 def compare(
     problems: Annotated[list[str], Argument(help="Problem folders, shipped names, a folder of problem folders.")],
     formulations: Annotated[str, Option(help="tikhonov,robust,...; folder: each its own.")] = "tikhonov",
@@ -709,9 +740,8 @@ def compare(
     scheduler: Scheduler = None,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the page, the replicates and the figure.")] = None,
-    allow_code: Code = False,
     as_json: Json = False,
-) -> None:
+) -> Answer:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
     With --out every replicate is written down when it is finished, and a page index.html in the end.
@@ -732,11 +762,11 @@ def compare(
         written = [found.report(out, against=against)]
         journal.unlink()
     document = {"replicates": found.rows, "made": found.made, "notes": summary.notes}
-    _answer(f"{found!r}\n\n{summary}", document, as_json, written)
+    return Answer(f"{found!r}\n\n{summary}", document, written=written)
 
 
-@app.command()
-def robots(as_json: Json = False) -> None:
+@command
+def robots() -> Answer:
     """List the ready robots that a problem file may name."""
     from rpim_opt.basics.text import table
     from rpim_opt.robot.formats.tables import read_robot
@@ -746,7 +776,7 @@ def robots(as_json: Json = False) -> None:
     ready = {name: read_robot(find_robot(name)) for name in names()}
     rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
     text = table(["robot", "name", "joints"], [[str(cell) for cell in row.values()] for row in rows])
-    console.show(text, {"robots": rows}, as_json)
+    return Answer(text, {"robots": rows})
 
 
 # --- what several commands do ------------------------------------------------------------------------------
@@ -763,13 +793,9 @@ def _loaded(result: Path) -> Iterator[tuple["Calibration", Callable[[str], None]
 
 
 def _calibrated(
-    instance: "Instance",
-    selector: Text,
-    formulation: Text,
-    words: dict[str, str | None],
-    say: Callable[[str], None],
+    instance: "Instance", selector: Text, formulation: Text, words: dict[str, Text], say: Callable[[str], None]
 ) -> "Calibration":
-    """Calibrate as a problem's file says, or as the options say instead."""
+    """Calibrate as a problem's file says, or as the options say; name likely causes where there is no solution."""
     from rpim_opt.store.problem_file import named_formulation, named_weight
 
     changes: dict[str, Any] = {key: word for key, word in words.items() if word}
@@ -783,21 +809,15 @@ def _calibrated(
             **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
         )
     except NoSolutionFound as error:
-        raise _with_causes(error, instance) from None
+        from rpim_opt.calibration.causes import likely_causes, mistakes
+        from rpim_opt.calibration.identify import calibrate
+        from rpim_opt.convex.formulation import tikhonov
 
-
-def _with_causes(error: NoSolutionFound, instance: "Instance") -> NoSolutionFound:
-    """Return the error of a program without solution; where data are likely read wrongly, it says how."""
-    from rpim_opt.calibration.causes import likely_causes, mistakes
-    from rpim_opt.calibration.identify import calibrate
-    from rpim_opt.convex.formulation import tikhonov
-
-    if error.conflict is not None:
-        return error
-    causes = likely_causes(calibrate(instance.problem, tikhonov, weight=1.0))
-    if not mistakes(causes):
-        return error
-    return NoSolutionFound(error.formulation, error.weight, error.status, advice=" ".join(causes).rstrip("."))
+        causes = [] if error.conflict else likely_causes(calibrate(instance.problem, tikhonov, weight=1.0))
+        if not mistakes(causes):
+            raise
+        advice = " ".join(causes).rstrip(".")
+        raise NoSolutionFound(error.formulation, error.weight, error.status, advice=advice) from None
 
 
 def _saved(result: "Calibration", out: Path | None) -> list[Path]:
@@ -813,29 +833,10 @@ def _saved(result: "Calibration", out: Path | None) -> list[Path]:
     return [file]
 
 
-def _answer(
-    text: object,
-    document: dict[str, Any],
-    as_json: bool,
-    written: Sequence[Path] | None = None,
-    left_out: Sequence[str] | None = None,
-    notes: Sequence[str] = (),
-) -> None:
-    """Print what was found, how tables were read, columns that were left out, and files that were written."""
-    lines = [*([str(text)] if str(text) else []), *notes]
-    if left_out:
-        lines.append(f"Columns that were left out: {', '.join(left_out)}.")
-    lines += [f"Written: {file}" for file in written or ()]
-    more = {"left_out": left_out, "tables": notes or None, "written": written}
-    console.show("\n".join(lines), {**document, **{k: v for k, v in more.items() if v is not None}}, as_json)
-
-
-def _answer_with_table(
-    found: object, rows: str, out: Path | None, document: dict[str, Any], as_json: bool, left_out: Sequence[str] = ()
-) -> None:
-    """Print what was found, and its table where no file takes it."""
+def _with_table(found: object, rows: str, out: Path | None, document: dict[str, Any]) -> Answer:
+    """Return what was found, with its table where no file takes it."""
     text = str(found) if out else f"{found}\n{rows.rstrip()}"
-    _answer(text, document, as_json, console.written_to(out, rows), left_out)
+    return Answer(text, document, written=console.written_to(out, rows))
 
 
 def _against(limit: float | None, name: str, value: float) -> tuple[list[str], bool | None]:
@@ -844,12 +845,6 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
         return [], None
     kept = 1e3 * value <= limit
     return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if kept else 'above'} {limit:g} mm."], kept
-
-
-def _end_by(acceptance: dict[str, Any] | None) -> None:
-    """End with the exit code of a verdict, unless it accepts or there is none."""
-    if acceptance is not None and acceptance["verdict"] != "accepted":
-        raise typer.Exit({"rejected": 1, "undecided": 4}[acceptance["verdict"]])
 
 
 def main() -> None:

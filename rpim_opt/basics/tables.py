@@ -420,6 +420,23 @@ def csv_text(header: Iterable[str], rows: Iterable[Iterable[Any]]) -> str:
     return stream.getvalue()
 
 
+def records(columns: Mapping[str, Sequence[Any]]) -> list[dict[str, Any]]:
+    """Return the rows of columns, each by column."""
+    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+
+
+def columns_csv(columns: Mapping[str, Sequence[Any]], exact: Iterable[str] = ()) -> str:
+    """Return columns as CSV; floats with six digits behind the point, nine in ``exact`` ones; empty if not finite."""
+    digits = dict.fromkeys(exact, 9)
+
+    def cell(name: str, value: Any) -> Any:
+        if not isinstance(value, float):
+            return value
+        return f"{value:.{digits.get(name, 6)}f}" if math.isfinite(value) else ""
+
+    return csv_text(columns, ([cell(name, value) for name, value in row.items()] for row in records(columns)))
+
+
 def _with_apostrophe(cell: Any) -> Any:
     """Return a cell that no spreadsheet takes for a formula; numbers may have a sign."""
     if not isinstance(cell, str) or not FORMULA.match(cell):

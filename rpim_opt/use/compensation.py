@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,10 +13,10 @@ import scipy
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.files import write_text
-from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
-from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.basics.units import display, joint_columns
+from rpim_opt.basics.threads import on_all_cores, one_blas_thread
+from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration.covariance import position_noise, scattered
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
@@ -34,7 +32,7 @@ from rpim_opt.problem.registration.frames import MISPLACED
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
-from rpim_opt.robot.mdh import Gravity, Robot
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameter_names import reflectors, tool_prefix
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.use.export import noted
@@ -57,31 +55,21 @@ TRIALS = 12
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """Corrected joint commands, and what the calibrated model says of them.
+    """Corrected joint commands of a ``robot`` for N targets, and what the calibrated model says of them.
 
-    Parameters
-    ----------
-    robot, label
-        The nominal robot, and N row labels.
-    nominal, q
-        (N, dof) commands of the nominal controller, and the corrected ones [rad or m].
-    position_before, orientation_before, position_error, orientation_error
-        (N,) how far the nominal and the corrected command miss the target [m], [rad], both by the calibrated model, of
-        which the solution leaves nothing where it is attainable; NaN for an orientation that does not count.
-    std
-        (N,) standard uncertainty of the position there [m], sqrt(tr J C J' + tr R), with the calibration's covariance
-        C, the Jacobian J of the position in the instrument's frame and the repeatability R. Infinite without C.
-    status
-        For every row ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
-        prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
-        ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where any of the
-        latter leaves more than that.
-    outside
-        Corrected commands beyond the joint ranges that the calibration measured.
-    note
-        Why the robot is not delivered, where it is used all the same.
-    point
-        Which point is moved, with its place in the flange frame, as text.
+    ``nominal`` and ``q`` (N, dof) are the commands of the nominal controller and the corrected ones [rad or m].
+    ``position_before`` and ``position_error`` (N,) [m] are by how much these miss the target, both by the calibrated
+    model, of which the solution leaves nothing where the target is attainable; ``orientation_before`` and
+    ``orientation_error`` [rad] likewise, NaN where orientations do not count. ``std`` (N,) [m] is the standard
+    uncertainty of the position there, sqrt(tr J C J' + tr R), with the calibration's covariance C, the Jacobian J of
+    the position in the instrument's frame and the repeatability R; infinite without C.
+
+    ``status`` of a row is ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
+    prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
+    ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where any of the
+    latter leaves more than that. ``outside`` are commands beyond the joint ranges that the calibration measured,
+    ``note`` says why a robot is not delivered that is used all the same, ``point`` which point is moved, with its place
+    in the flange frame.
     """
 
     robot: Robot
@@ -100,24 +88,21 @@ class Compensation:
 
     def __str__(self) -> str:
         """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
-        rows = {
+        figures = []
+        for name, values in {
             "position [mm], nominal command": self.position_before,
             "position [mm], corrected, by the model": self.position_error,
             "position [mm], standard uncertainty": self.std,
             "orientation [mrad], nominal command": self.orientation_before,
             "orientation [mrad], corrected, by the model": self.orientation_error,
-        }
-        figures = []
-        for name, values in rows.items():
+        }.items():
             if np.isfinite(values).all():
                 shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
                 figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
-        units = [display(dimension)[0] for dimension in self.robot.joint_dimensions]
-        changes = zip(self._largest_corrections().values(), units, strict=True)
-        largest = [f"q{i} {value:.3f} {unit}" for i, (value, unit) in enumerate(changes, start=1)]
+        changes = ([*name.split("_"), f"{value:.3f}"] for name, value in self._largest_corrections().items())
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
-            f"Largest corrections: {', '.join(largest)}.",
+            f"Largest corrections: {', '.join(f'{joint} {value} {unit}' for joint, unit, value in changes)}.",
         ]
         for status in ("limited", "near singular", UNREACHABLE, ABOVE):
             at = [i for i, each in enumerate(self.status) if each == status]
@@ -139,40 +124,34 @@ class Compensation:
         change = np.abs(self.q - self.nominal).max(axis=0) / list(joints.values())
         return dict(zip(joints, change.tolist(), strict=True))
 
-    def _columns(self) -> dict[str, Array]:
+    def _columns(self) -> dict[str, Sequence[Any]]:
         joints = joint_columns(self.robot.joint_dimensions)
-        columns = {name: self.q[:, i] / si for i, (name, si) in enumerate(joints.items())}
-        columns["position_error_mm"] = 1e3 * self.position_error
-        columns["orientation_error_mrad"] = 1e3 * self.orientation_error
-        columns["std_mm"] = 1e3 * self.std
-        return columns
+        commands = {name: self.q[:, i] / si for i, (name, si) in enumerate(joints.items())}
+        left = {"position_error_mm": self.position_error, "orientation_error_mrad": self.orientation_error}
+        left["std_mm"] = self.std
+        figures = commands | {name: 1e3 * values for name, values in left.items()}
+        return {"label": self.label, **{k: v.tolist() for k, v in figures.items()}, "status": self.status}
 
     def content(self) -> dict[str, Any]:
         """Return the errors [mm, mrad], and a row for every target as in `csv`."""
-        columns = self._columns()
-        rows = zip(self.label, *(values.tolist() for values in columns.values()), self.status, strict=True)
-        before = (self.position_before, self.orientation_before)
-        after = (self.position_error, self.orientation_error)
-        errors = [{"position": statistics(p), "orientation": statistics(o, "mrad")} for p, o in (before, after)]
         return {
-            "nominal": errors[0],
-            "corrected": errors[1],
+            "nominal": _errors(self.position_before, self.orientation_before),
+            "corrected": _errors(self.position_error, self.orientation_error),
             "largest_corrections": self._largest_corrections(),
             "missed": self.missed,
             "outside": [self.label[i] for i in self.outside.rows],
-            "rows": [dict(zip(("label", *columns, "status"), row, strict=True)) for row in rows],
+            "rows": records(self._columns()),
             "note": self.note,
             "point": self.point,
         }
 
     def csv(self) -> str:
         """Return labels, corrected commands, what is left of the errors, and status as CSV text."""
-        cells = []
-        for name, values in self._columns().items():
-            digits = 9 if name.startswith("q") else 6
-            cells.append([f"{v:.{digits}f}" if np.isfinite(v) else "" for v in values])
-        text = csv_text(["label", *self._columns(), "status"], zip(self.label, *cells, self.status, strict=True))
-        return noted(text, ".csv", self.note)
+        return noted(columns_csv(self._columns(), joint_columns(self.robot.joint_dimensions)), ".csv", self.note)
+
+
+def _errors(position: Array, orientation: Array) -> dict[str, Any]:
+    return {"position": statistics(position), "orientation": statistics(orientation, "mrad")}
 
 
 @one_blas_thread
@@ -214,62 +193,45 @@ def compensate(
 
     Parameters
     ----------
-    result
-        The calibration.
-    q
-        (N, dof) commands of the nominal controller [rad or m]; with ``poses`` where to look for those.
-    poses
-        (N, 7) targets: x, y, z [m] and unit quaternion, w first, in the base; or positions (N, 3). Without ``q``
-        every one is looked for from several configurations within the limits that come near.
+    q, poses
+        (N, dof) commands of the nominal controller [rad or m]; and/or targets in the base, (N, 7) x, y, z [m] and unit
+        quaternion, w first, or (N, 3) positions. ``q`` is then where to look for those; without it every target is
+        looked for from several configurations within the limits that come near.
     orientation
         Whether orientations count.
     tool
         (6,) a tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the robot has
-        exactly there. By default the reflector of the calibration: the controller's robot has it at its nominal place
-        (as stated, or where registration puts it), the real one as identified; a nominal place that the identified one
-        contradicts is no TCP, and both have it as identified. The flange frame is that of the DH table, after the last
-        joint.
-    marker
-        Which reflector, when there are several.
-    base
-        Whether to compensate the base.
-    torque
-        (N, dof) joint torques [Nm]: required, and zero if need be, where compliances were identified from measured
-        ones.
-    payload
-        Mass at the flange [kg], one or (N,), where compliances were identified without measured torques; by default
-        the one that the problem states. Joints are in the middle of their backlash.
-    payload_centre
-        (3,) where that mass is in the flange frame [m]; by default where the problem states it.
-    largest
-        Largest correction of a joint [rad or m].
-    limit
-        Position error left by the model above which a command counts as one that misses its target [m].
+        exactly there. By default the reflector of the calibration (``marker`` of several): the controller's robot has
+        it at its nominal place (as stated, or where registration puts it), the real one as identified; a nominal place
+        that the identified one contradicts is no TCP, and both have it as identified. The flange frame is that of the
+        DH table, after the last joint.
+    torque, payload, payload_centre
+        What joints bear, which are in the middle of their backlash. (N, dof) torques [Nm]: required, and zero if need
+        be, where compliances were identified from measured ones. Mass at the flange [kg], one or (N,), and its place
+        (3,) in the flange frame [m], where they were identified without; by default what the problem states.
+    largest, limit
+        Largest correction of a joint [rad or m], and position error left by the model above which a command counts as
+        one that misses its target [m].
     label
         N row labels; numbers from 1 by default.
     robot
         Which of several robots.
     despite_verdict
-        Use a robot that is not delivered, too.
+        Use a robot that is not delivered, too; otherwise it raises NotDelivered.
 
     Raises
     ------
-    NotDelivered
-        For a calibration that is not delivered.
     InputError
         For shapes that do not fit, numbers that are not finite, a reflector that is not known.
 
     Examples
     --------
-    >>> import numpy as np
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
     >>> found = ro.use.compensate(result, instance.validation.q)
     >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
     2.64 mm, 0.0000 mm left
-    >>> np.degrees(found.q - found.nominal)[0].round(2), found.status[0]
-    (array([ 0.24,  0.09,  0.41, -0.53,  0.21,  0.17]), 'ok')
     >>> print(found.csv().splitlines()[0])
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
     """
@@ -279,35 +241,34 @@ def compensate(
     if not largest >= SMALLEST:
         raise InputError("largest", f"{largest}", f"a correction of at least {SMALLEST:g}")
     oriented = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
-    gravity = arm.gravity
     if payload_centre is not None:
-        gravity = gravity.carrying(gravity.payload, list(payload_centre))
-    cell = _Cell.of(result, pose if oriented else position, tool, marker, base, torque is not None, gravity, robot)
+        arm = replace(arm, gravity=arm.gravity.carrying(arm.gravity.payload, list(payload_centre)))
+    tooled = _Tooled.of(result, robot, tool, marker)
+    cell = _Cell.of(result, tooled, arm, pose if oriented else position, base, targets.torque is not None, robot)
     N = len(targets.label)
-    masses = None
+    mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
     if payload is not None or payload_centre is not None:
         if not cell.loads.payload:
             accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
             raise InputError("payload", "a payload that bends nothing", accepted)
-        mass = np.asarray(cell.robot.gravity.payload if payload is None else payload, dtype=float)
         if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
             raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
-        masses = np.broadcast_to(mass, N)
+    if cell.loads.payload:
+        targets = targets._replace(payload=np.broadcast_to(mass, N))
 
     def compensated(start: int) -> dict[str, Array]:
-        def rows(values: Array | None) -> Array | None:
-            return None if values is None else values[start : start + BLOCK]
+        rows = slice(start, start + BLOCK)
+        return cell.compensated(Targets._make(None if each is None else each[rows] for each in targets), largest)
 
-        return cell.compensated(rows(targets.q), rows(targets.poses), rows(targets.torque), rows(masses), largest)
-
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        parts = list(pool.map(compensated, range(0, N, BLOCK)))
+    parts = on_all_cores(compensated, range(0, N, BLOCK))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     above = (whole["position_error"] > limit) & (whole["status"] != UNREACHABLE)
     whole["status"] = tuple(np.where(above, ABOVE, whole["status"]).tolist())
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
     outside = result.outside(commands)
-    return Compensation(arm, targets.label, **whole, outside=outside, note=note, point=cell.point)
+    return Compensation(
+        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=tooled.point
+    )
 
 
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
@@ -367,24 +328,58 @@ def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> 
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
 
-def _with_tool(
-    parameters: Parameters, x: Array, C: Array | None, prefix: str, tool: Sequence[float] | Array
-) -> tuple[Parameters, Array, Array | None]:
-    """Return parameters, deviations (p,) and covariance with a tool that is known exactly."""
-    frame = np.asarray(tool, dtype=float)
-    if frame.shape != (6,) or not np.isfinite(frame).all():
-        raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
-    at = [parameters.names.index(prefix + c) for c in FRAME]
-    nominal = parameters.nominal.copy()
-    nominal[at] = frame
-    identified = parameters.identified.copy()
-    identified[at] = False
-    x = x.copy()
-    x[at] = 0.0
-    if C is not None:
-        still = identified[parameters.identified]
-        C = C[np.ix_(still, still)]
-    return replace(parameters, nominal=nominal, identified=identified), x, C
+class _Tooled(NamedTuple):
+    """A robot's parameters, its deviations (p,), the covariance of those identified, and which point is moved."""
+
+    parameters: Parameters
+    x: Array
+    covariance: Array | None
+    marker: str
+    point: str
+    stated: bool = False
+
+    @classmethod
+    def of(cls, result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str) -> _Tooled:
+        """Take a stated tool in the place of the first reflector, or a reflector: one that data contradict as found."""
+        whole = result.problem.parameters
+        places = whole.places_of(robot)
+        p = whole.of_robot(robot)
+        every = np.zeros(len(whole))
+        every[whole.identified] = result.x
+        x = every[places]
+        C = known_covariance(result)
+        if C is not None:
+            own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
+            C = C[np.ix_(own, own)]
+        known = reflectors(p.names)
+        if tool is not None:
+            marker = known[0]
+        elif marker not in known:
+            raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+        at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
+        nominal = p.nominal.copy()
+        if tool is not None:
+            frame = np.asarray(tool, dtype=float)
+            if frame.shape != (6,) or not np.isfinite(frame).all():
+                raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+            nominal[at] = frame
+            x[at] = 0.0
+            identified = p.identified.copy()
+            identified[at] = False
+            if C is not None:
+                still = identified[p.identified]
+                C = C[np.ix_(still, still)]
+            point = f"Moved is the tool as stated, at {placed(frame)} in the flange frame."
+            return cls(replace(p, nominal=nominal, identified=identified), x, C, marker, point, True)
+        where = f"nominally (stated, or registered) at {placed(nominal[at])} in the flange frame"
+        if (np.abs(x[at]) > MISPLACED * (np.minimum(p.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)).any():
+            found = p.values(x)[at]
+            where = f"as identified at {placed(found)} in the flange frame; its nominal place is no TCP, as "
+            where += f"the data contradict it ({placed(nominal[at])})"
+            nominal[at] = found
+            x[at] = 0.0
+        point = f"Moved is the reflector, {where}: a controller with another TCP needs --tool."
+        return cls(replace(p, nominal=nominal), x, C, marker, point)
 
 
 class _Cell(NamedTuple):
@@ -405,65 +400,35 @@ class _Cell(NamedTuple):
     marker: str
     noise: Array
     level: float
-    point: str
 
     @classmethod
     def of(
         cls,
         result: Calibration,
+        tooled: _Tooled,
+        robot: Robot,
         kind: Measurement,
-        tool: Sequence[float] | Array | None,
-        marker: str,
         base: bool,
         torques: bool,
-        gravity: Gravity,
         which: str,
     ) -> _Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
-        robot = replace(result.problem.arms[which], gravity=gravity)
-        whole = result.problem.parameters
-        x = np.zeros(len(whole))
-        x[whole.identified] = result.x
-        C = known_covariance(result)
-        places = whole.places_of(which)
-        if C is not None:
-            own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
-            C = C[np.ix_(own, own)]
-        parameters, x = whole.of_robot(which), x[places]
-        known = reflectors(parameters.names)
-        if tool is not None:  # which takes the place of the first reflector
-            marker = known[0]
-            parameters, x, C = _with_tool(parameters, x, C, tool_prefix(marker), tool)
-        elif marker not in known:
-            raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
-        values = parameters.values(x)
-        at = [parameters.names.index(tool_prefix(marker) + c) for c in FRAME]
-        point = f"Moved is the tool as stated, at {placed(values[at])} in the flange frame."
-        if tool is None:
-            where = f"nominally (stated, or registered) at {placed(parameters.nominal[at])} in the flange frame"
-            known_to = MISPLACED * (np.minimum(parameters.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)
-            if (np.abs(x[at]) > known_to).any():
-                where = f"as identified at {placed(values[at])} in the flange frame; its nominal place is no TCP, as "
-                where += f"the data contradict it ({placed(parameters.nominal[at])})"
-                parameters = replace(parameters, nominal=parameters.nominal.copy())
-                parameters.nominal[at] = values[at]
-                x = x.copy()
-                x[at] = 0.0
-            point = f"Moved is the reflector, {where}: a controller with another TCP needs --tool."
-        nominal = dict(zip(parameters.names, parameters.nominal.tolist(), strict=True))
-        identified = dict(zip(parameters.names, values.tolist(), strict=True))
+        p = tooled.parameters
+        values = p.values(tooled.x)
+        nominal = dict(zip(p.names, p.nominal.tolist(), strict=True))
+        identified = dict(zip(p.names, values.tolist(), strict=True))
         moved = np.eye(4)
         if base:
             stated, found = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
             moved = np.linalg.inv(stated) @ found
         measured = result.problem.sample().alone(which) if which else result.problem
         scatter = measured.scatter
-        if tool is not None and scatter is not None:
+        if scatter is not None and tooled.stated:
             scatter = replace(scatter, at=values)
-        problem = CalibrationProblem(robot, parameters, measured.data, scatter=scatter)
-        require_same_torques(robot, parameters, measured_torques(problem.data), torques)
-        loads = loads_on(robot, parameters, problem.data, torques)
-        prefix = tool_prefix(marker)
+        problem = CalibrationProblem(robot, p, measured.data, scatter=scatter)
+        require_same_torques(robot, p, measured_torques(problem.data), torques)
+        loads = loads_on(robot, p, problem.data, torques)
+        prefix = tool_prefix(tooled.marker)
         return cls(
             robot,
             kind,
@@ -471,26 +436,23 @@ class _Cell(NamedTuple):
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads),
             loads,
             problem,
-            x[parameters.identified],
-            C,
-            marker,
+            tooled.x[p.identified],
+            tooled.covariance,
+            tooled.marker,
             position_noise(measured),
             result.variance_factor,
-            point,
         )
 
-    def compensated(
-        self, q: Array | None, poses: Array | None, torque: Array | None, payload: Array | None, largest: float
-    ) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some rows, of which q or poses are there."""
-        N = len(np.asarray(q if poses is None else poses))
+    def compensated(self, targets: Targets, largest: float) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some targets."""
+        _, q, poses, torque, payload = targets
+        N = len(targets.label)
         # what the joints of the model bear, as `Arm.at` takes it
         borne = [np.empty((N, 0))]
         if torque is not None:
             borne.append(torque @ np.linalg.inv(self.robot.joint_map))
-        if self.loads.payload:
-            mass = self.robot.gravity.payload if payload is None else payload
-            borne.append(np.broadcast_to(mass, N)[:, None])
+        if payload is not None:
+            borne.append(payload[:, None])
         load = np.hstack(borne)
         if poses is not None:
             commands, target = self._commands(poses, q, load), poses
