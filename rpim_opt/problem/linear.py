@@ -24,23 +24,14 @@ RANK_TOLERANCE = 1e-10
 class LinearModel(Brief):
     """A calibration linearized around some deviation: A z ~ b, everything dimensionless.
 
-    Parameters
-    ----------
-    A
-        (m, n) = Sigma^-1/2 J S, the whitened identification Jacobian in units of the scales.
-    b
-        (m,) = Sigma^-1/2 r + A z_k, so that z is the *total* deviation in units of the scales.
-    group
-        (m,) number of the configuration that an equation belongs to.
-    parameters
-        The n identified parameters.
-    constrained
-        Whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would meet them, so
-        that how well they are met does not tell the noise.
-    stands_for
-        How many equations A and b were reduced from by a rotation, None where they are the equations themselves.
-    offset
-        What a loss that these equations majorize has besides |A z - b|^2.
+    A (m, n) = Sigma^-1/2 J S is the whitened identification Jacobian in units of the scales, and b (m,) =
+    Sigma^-1/2 r + A z_k, so that z is the *total* deviation in units of the scales. ``group`` (m,) is the number of the
+    configuration that an equation belongs to; ``parameters`` are the n identified ones.
+
+    ``constrained`` says whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would
+    meet them, so that how well they are met does not tell the noise. ``stands_for`` is how many equations A and b were
+    reduced from by a rotation, None where they are the equations themselves, and ``offset`` what a loss that these
+    equations majorize has besides |A z - b|^2.
 
     Examples
     --------
@@ -50,10 +41,6 @@ class LinearModel(Brief):
     >>> model = problem.linearize(np.zeros(len(problem.parameters.free)))
     >>> model.A.shape, model.equations, model.rank, model.triangle.shape
     ((27, 26), 27, 20, (27, 27))
-    >>> (model.svd[1][:3] / model.svd[1][0]).round(2)  # largest singular values, relative
-    array([1.  , 0.96, 0.8 ])
-    >>> model.scaled(np.repeat([1.0, 0.0], [15, 12])).rank  # without the last four configurations
-    15
     """
 
     A: Array

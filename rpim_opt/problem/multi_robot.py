@@ -41,24 +41,15 @@ def together(
     kind of parameter of all robots, and one scatter. Parameters are called ``name.parameter``, ``left.a2``, but those
     that are shared keep their name; configurations of different problems are never the same.
 
-    Parameters
-    ----------
-    problems
-        In memory, of one robot each; called ``A``, ``B``, ...
-    shared
-        Patterns of the parameters that are one and the same in all problems that have them: ``["tool_*"]``. Their
-        nominal values are those of the first of these. Or patterns by the names of problems, each with its own: of two
-        arms of one cell and a camera elsewhere, the arms' ``base_*``. Joints of one URDF have parameters that can be
-        shared where chains branch, too, with ``read_urdf(..., origins=True)``.
-    named
-        Problems by the names that they are to have, ``left=problem``.
+    The problems are in memory, of one robot each; called ``A``, ``B``, ..., or by name: ``left=problem``. ``shared``
+    are patterns of the parameters that are one and the same in all problems that have them, ``["tool_*"]``; their
+    nominal values are those of the first of these. Or patterns by the names of problems, each with its own: of two arms
+    of one cell and a camera elsewhere, the arms' ``base_*``. Joints of one URDF have parameters that can be shared
+    where chains branch, too, with ``read_urdf(..., origins=True)``.
 
-    Raises
-    ------
-    InputError
-        For fewer than two problems, a pattern that matches no parameter that several have, shared parameters that are
-        stated differently, scatter (it is stated of the whole, or learned), data in blocks, and touches of a
-        point that is elsewhere for another robot.
+    InputError for fewer than two problems, a pattern that matches no parameter that several have, shared parameters
+    that are stated differently, scatter (it is stated of the whole, or learned), data in blocks, and touches of a point
+    that is elsewhere for another robot.
 
     Examples
     --------
@@ -69,11 +60,6 @@ def together(
     >>> both = ro.together(spring=half[0], autumn=half[1], shared=["[!b]*", "beta?"])  # all but the base
     >>> both.parameters.free.names[:2], both.parameters.free.names[-1], both.labels[-1]
     (('alpha1', 'a1'), 'autumn.base_rz', 'c39')
-    >>> result = ro.calibrate(both, ro.tikhonov, weight=1.0)
-    >>> result.converged, result.x.shape, result.covariance.shape
-    (True, (40,), (40, 40))
-    >>> list(result.robots)
-    ['spring', 'autumn']
     """
     parts = {**dict(zip(ascii_uppercase, problems, strict=False)), **named}
     count = len(problems) + len(named)
@@ -165,8 +151,6 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
 
     Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
     session is identified, or all are. Rows that name no session are of one more.
-
-    ``problem``: with measurements, perhaps of other sessions.
     """
     p = problem.parameters
     like: dict[str, str] = {}

@@ -25,17 +25,6 @@ class Scatter:
     ``position``, ``orientation`` and ``joint`` are standard deviations of every measured length, apart from the joints'
     part [m], of every measured angle and of every revolute joint [rad]; ``instrument`` multiplies the stated noise.
     ``at`` (P,) are the values of all parameters at which the joints' slopes are taken [SI], nominal if there are none.
-
-    Examples
-    --------
-    >>> import dataclasses
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem  # 0.03 mm of instrument
-    >>> rough = dataclasses.replace(problem, scatter=ro.problem.Scatter(position=40e-6))
-    >>> x = np.zeros(len(problem.parameters.free))
-    >>> bool(np.allclose(problem.linearize(x).b / rough.linearize(x).b, 5 / 3))
-    True
     """
 
     position: float = 0.0

@@ -68,13 +68,6 @@ class RobotModel(Tabled):
         These are names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links,
         Hayati's beta between nearly parallel axes, and the frames that the measurements can tell. InputError for a
         pattern that matches no parameter.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("position").problem
-        >>> [len(problem.identify(each).parameters.free) for each in ("auto", ["theta?", "tool_[xyz]"])]
-        [34, 9]
         """
         p = self.parameters
         return self.with_parameters(p.identify(identifiable(patterns, self.robot, p, self.sample().data)))
@@ -166,28 +159,12 @@ class RobotModel(Tabled):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationProblem(RobotModel):
-    """What was measured on which robot, and which parameters are to explain it.
+    """What was measured on which robot (of several by name, as `together` has them), and which parameters explain it.
 
-    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand
-    in the order of the data's blocks.
-
-    Parameters
-    ----------
-    robots
-        The nominal robot; or several by name, as `together` has them.
-    parameters
-        All parameters of the model, some of them identified.
-    data
-        The measurements, of one type or several.
-    asked
-        The functions that `frozen` keeps; None where every call asks the measurement models anew.
-    scatter
-        The robot's repeatability; None for the instrument's noise alone.
-
-    Raises
-    ------
-    InputError
-        When nothing is identified, or the data do not fit the robot or the parameters.
+    The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand in the order
+    of the data's blocks. ``asked`` are the functions that `frozen` keeps, None where every call asks the measurement
+    models anew; ``scatter`` is the robot's repeatability, None for the instrument's noise alone. InputError when
+    nothing is identified, or the data do not fit the robot or the parameters.
 
     Examples
     --------
@@ -200,11 +177,6 @@ class CalibrationProblem(RobotModel):
     ((27,), (9, 3), (27, 26))
     >>> [round(float(1e3 * p.errors(nominal).mean()), 3) for p in (problem, problem.on(instance.validation))]  # [mm]
     [2.096, 2.649]
-    >>> problem.labels[:2], problem.without({"T2-1"}).labels[0], problem.keeps_rows, list(problem.arms)
-    (('T2-1', 'T2-2'), 'T2-2', True, [''])
-    >>> norms, count = problem.whitened_errors(nominal)  # 2 mm off, and 0.03 mm of noise
-    >>> norms[:3].round(1), count[:3], len(problem.whitened_residual(nominal))
-    (array([72.9, 68.5, 54.5]), array([3, 3, 3]), 27)
     """
 
     data: Dataset
@@ -263,10 +235,7 @@ class CalibrationProblem(RobotModel):
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements.
 
-        Raises
-        ------
-        InputError
-            When data and parameters do not fit, or compliances have measured torques here and not there.
+        InputError when data and parameters do not fit, or compliances have measured torques here and not there.
         """
         here, there = ({block.robot for block in each.blocks} for each in (self.data, data))
         for name in here & there:
@@ -299,19 +268,16 @@ class CalibrationProblem(RobotModel):
         y = np.zeros((N, len(measurement.columns)))
         if "qw" in measurement.columns:
             y[:, list(measurement.columns).index("qw")] = 1.0
-        sided = any(block.approach is not None for block in self.data.blocks)
-        approach = np.broadcast_to(np.asarray(columns.get("approach", 0.0), dtype=float), q.shape) if sided else None
-        others = {name: each for name, each in columns.items() if name != "approach"}
+        stated = {name: np.asarray(each, dtype=float) for name, each in columns.items()}
+        approach = np.broadcast_to(stated.pop("approach", 0.0), q.shape)
+        if all(block.approach is None for block in self.data.blocks):
+            approach = None
         data = Dataset.of(
-            q,
-            y,
-            covariance,
-            measurement=measurement,
+            q, y, covariance, measurement=measurement, approach=approach,
             torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
-            approach=approach,
-            columns={name: np.broadcast_to(np.asarray(each, dtype=float), N) for name, each in others.items()},
-        )
+            columns={name: np.broadcast_to(each, N) for name, each in stated.items()},
+        )  # fmt: skip
         first = self.data.blocks[0]
         own = first.markers[:1] if marker is None else (marker,)
         fixture = first.fixture if measurement is first.measurement else ""
@@ -422,15 +388,6 @@ class CalibrationProblem(RobotModel):
         line of sight passes by the point. For touches the length is the distance from the mean of their point's
         touches, NaN for the only touch of a point. ``"stated length"`` and ``"stated angle"``: of what is known of
         them, which is no measurement.
-
-        Examples
-        --------
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("pose").problem
-        >>> nominal = np.zeros(len(problem.parameters.free))
-        >>> [f"{1e3 * problem.errors(nominal, dimension).mean():.2f}" for dimension in ("length", "angle")]  # mm, mrad
-        ['15.00', '7.07']
         """
         errors = np.full(len(self.data), np.nan)
         whole = self.residual(x)

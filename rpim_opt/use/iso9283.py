@@ -48,15 +48,7 @@ class PosePerformance(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Performance(Tabled):
-    """Accuracy and repeatability at the poses of a table.
-
-    Parameters
-    ----------
-    poses
-        One of each pose.
-    names
-        What the table calls the three angles.
-    """
+    """Accuracy and repeatability at the poses of a table; ``names`` is what it calls the three angles."""
 
     poses: tuple[PosePerformance, ...]
     names: tuple[str, ...] = ANGLES
@@ -119,13 +111,13 @@ class Performance(Tabled):
         turned = any(each.RP_angles is not None for each in self.poses)
         rows = []
         for each in self.poses:
-            row: dict[str, Any] = {"pose": each.pose, "cycles": each.cycles, "AP_p_mm": _milli(each.AP)}
-            row |= {f"AP_{axis}_mm": _milli(v) for axis, v in zip(AXES, each.AP_axes or [None] * 3, strict=True)}
-            row["RP_l_mm"] = _milli(each.RP)
+            figures: dict[str, float | None] = {"AP_p_mm": each.AP}
+            figures |= {f"AP_{axis}_mm": v for axis, v in zip(AXES, each.AP_axes or [None] * 3, strict=True)}
+            figures["RP_l_mm"] = each.RP
             for kind, values in (("AP", each.AP_angles), ("RP", each.RP_angles)) if turned else ():
                 angles = zip(self.names, values or [None] * 3, strict=True)
-                row |= {f"{kind}_{name}_mrad": _milli(value) for name, value in angles}
-            rows.append(row)
+                figures |= {f"{kind}_{name}_mrad": value for name, value in angles}
+            rows.append({"pose": each.pose, "cycles": each.cycles, **{k: _milli(v) for k, v in figures.items()}})
         return rows
 
 
@@ -153,21 +145,10 @@ def iso9283(
     (ISO 9283:1998, 7.2.1 and 7.2.2.) Attained positions are those that the instrument reads: measurement noise is in
     them. Angles count within half a turn of the command, or of the first approach.
 
-    Parameters
-    ----------
-    pose
-        N names of the pose that a row approaches.
-    position, command
-        (N, 3) attained and commanded positions [m] in one frame; without commands there is no accuracy.
-    angles, command_angles
-        (N, 3) the same for the orientation [rad].
-    names
-        What the three angles are called.
-
-    Raises
-    ------
-    InputError
-        For shapes that do not fit, a pose that is approached once, or whose command changes.
+    ``pose`` are N names of the pose that a row approaches, ``position`` and ``command`` (N, 3) attained and commanded
+    positions [m] in one frame, ``angles`` and ``command_angles`` (N, 3) the same of the orientation [rad], three angles
+    that are called ``names``. Without commands there is no accuracy. InputError for shapes that do not fit, a pose that
+    is approached once, or whose command changes.
 
     Examples
     --------
@@ -177,10 +158,6 @@ def iso9283(
     >>> found = ro.use.iso9283(["P1"] * 4, reached, command=np.full((4, 3), 1e-3))
     >>> print(f"{1e3 * found.accuracy:.3f} mm, {1e3 * found.repeatability:.3f} mm")
     1.732 mm, 0.100 mm
-    >>> round(found.content()["poses"][0]["RP_l_mm"], 3), found.csv().splitlines()[0]
-    (0.1, 'pose,cycles,AP_p_mm,AP_x_mm,AP_y_mm,AP_z_mm,RP_l_mm')
-    >>> print(found.content()["notes"][0])
-    The standard has 5 poses approached 30 times each: there is 1 pose, approached 4 times.
     """
     if not len(pose):
         raise InputError("iso9283", "no approach", "at least two of a pose")
@@ -235,18 +212,10 @@ def _rows(values: Array, N: int, what: str) -> Array:
 def read_approaches(source: Any, units: str = "") -> Performance:
     """Return pose accuracy and repeatability of a table of repeated approaches (`iso9283`).
 
-    Parameters
-    ----------
-    source
-        A text, Excel or Parquet file, or columns by name: ``pose``, attained ``x_mm, y_mm, z_mm``, commanded
-        ``command_x_mm, ...`` (or Nominal X, Target X, ...), and angles ``rx_deg, ry_deg, rz_deg`` likewise.
-    units
-        Units of columns whose name carries none, ``"deg,mm"``.
-
-    Raises
-    ------
-    InputError
-        For columns that are missing or without unit, cells that are no numbers, and what `iso9283` refuses.
+    ``source`` is a text, Excel or Parquet file, or columns by name: ``pose``, attained ``x_mm, y_mm, z_mm``, commanded
+    ``command_x_mm, ...`` (or Nominal X, Target X, ...), and angles ``rx_deg, ry_deg, rz_deg`` likewise. ``units`` are
+    those of columns whose name carries none, ``"deg,mm"``. InputError for columns that are missing or without unit,
+    cells that are no numbers, and what `iso9283` refuses.
 
     Examples
     --------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.causes import misread
@@ -46,10 +47,9 @@ HIGHEST_LIMIT = 50.0
 
 
 class Drift(NamedTuple):
-    """A change during checks.
+    """A change during checks: its cause, the first check after it, whether it is steady from the first to the last.
 
-    Its cause, the number of the first check after it, whether it is steady from the first to the last check, and by how
-    much a single parameter moved in all; None for a frame.
+    ``moved`` is by how much a single parameter moved in all; None for a frame.
     """
 
     cause: Cause
@@ -59,31 +59,19 @@ class Drift(NamedTuple):
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
-        moved = None
-        if self.moved is not None:
-            moved = {key: value for key, value in self.moved.content().items() if key != "name"}
+        moved = self.moved and {key: value for key, value in self.moved.content().items() if key != "name"}
         return {**self.cause._asdict(), "first": self.first, "steady": self.steady, "moved": moved}
 
 
 @dataclass(frozen=True, eq=False)
 class Monitoring:
-    """Checks of a robot in the order of time, against what its calibration predicts.
+    """N checks of a robot in the order of time, against what its calibration predicts.
 
-    Parameters
-    ----------
-    label, times, when
-        Names of the N checks, their times as the table states them, and (N,) in s; empty and None without.
-    error
-        (N,) errors against the calibration [m].
-    sigmas, allowed
-        (N,) innovation of a check, beyond the calibration and the checks before it, in standard deviations of a new
-        reading, and the limit that one of all N rarely exceeds.
-    sums, limit
-        (N,) their cumulative sum (CUSUM), and the limit that it rarely exceeds.
-    drift
-        The change that explains them best; None where chance does.
-    mistake
-        The likely mistake in the checks, in a sentence; empty where there is none.
+    ``times`` are their times as the table states them and ``when`` (N,) in s; empty and None without. ``error`` (N,)
+    are the errors against the calibration [m]; ``sigmas`` (N,) the innovation of a check, beyond the calibration and
+    the checks before it, in standard deviations of a new reading, and ``allowed`` (N,) the limit that one of all N
+    rarely exceeds; ``sums`` (N,) their cumulative sum (CUSUM) and ``limit`` what it rarely exceeds. ``drift`` is the
+    change that explains them best, None where chance does; ``mistake`` a likely one in the checks, in a sentence.
     """
 
     label: tuple[str, ...]
@@ -114,34 +102,29 @@ class Monitoring:
 
     def content(self) -> dict[str, Any]:
         """Return the figures, and the chart's points [mm]."""
-        alarm = since = moved = None
-        if self.alarm is not None:
-            alarm, since = self.label[self.alarm], self.label[self._since(self.alarm)]
+        moved = None
         if self.drift is not None:
             moved = {**self.drift.content(), "label": self.label[self.drift.first]}
         return {
             "drifts": self.drifts,
             "checks": len(self.label),
             "beyond": [self.label[i] for i in self.beyond],
-            "alarm": alarm,
-            "since": since,
+            "alarm": None if self.alarm is None else self.label[self.alarm],
+            "since": None if self.alarm is None else self.label[self._since(self.alarm)],
             "limit": self.limit,
             "moved": moved,
             "mistake": self.mistake,
-            "rows": self._rows(),
+            "rows": records(self._columns()),
         }
 
     def csv(self) -> str:
         """Return the chart's points as CSV."""
-        rows = self._rows()
-        return csv_text(list(rows[0]), [[str(cell) for cell in row.values()] for row in rows])
+        return csv_text(self._columns(), zip(*self._columns().values(), strict=True))
 
     def __str__(self) -> str:
         """Return the verdict, what shows it, and the largest figures."""
         count = f"{len(self.label)} checks"
-        lines = [f"No drift in {count}."]
-        if self.drifts:
-            lines = [f"The robot deviates from its calibration in {count}."]
+        lines = [f"The robot deviates from its calibration in {count}." if self.drifts else f"No drift in {count}."]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Beyond the interval of a new reading: {listed(named, between='; ')}.")
@@ -177,14 +160,17 @@ class Monitoring:
     def _named(self, i: int) -> str:
         return f"{self.label[i]} ({self.times[i]})" if self.times else f"'{self.label[i]}'"
 
-    def _rows(self) -> list[dict[str, Any]]:
-        columns: dict[str, Any] = {"label": self.label}
+    def _columns(self) -> dict[str, Sequence[Any]]:
+        columns: dict[str, Sequence[Any]] = {"label": self.label}
         if self.times:
             columns["time"] = self.times
-        figures = {"error_mm": 1e3 * self.error, "sigmas": self.sigmas, "allowed_sigmas": self.allowed}
-        for name, values in (*figures.items(), ("sum", self.sums)):
-            columns[name] = [round(value, 6) for value in values.tolist()]
-        return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+        figures = {
+            "error_mm": 1e3 * self.error,
+            "sigmas": self.sigmas,
+            "allowed_sigmas": self.allowed,
+            "sum": self.sums,
+        }
+        return columns | {name: [round(value, 6) for value in values.tolist()] for name, values in figures.items()}
 
 
 def monitor(result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = ()) -> Monitoring:
@@ -194,21 +180,9 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     innovations are summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before
     some check or steadily. A robot that does not drift is said to with probability `FALSE_ALARM` in all.
 
-    Parameters
-    ----------
-    result
-        The calibration, with a squared penalty or none; perhaps of `load_result`.
-    data
-        Check readings in the instrument's frame of the calibration.
-    when
-        (N,) their times [s]; by default they are in the order of time.
-    times
-        N texts that say so; numbers of the checks by default.
-
-    Raises
-    ------
-    InputError
-        For times that are not one a check; a result that has no covariance (lasso).
+    The result has a squared penalty or none. ``data`` are check readings in the instrument's frame of the calibration,
+    in the order of ``when`` (N,) [s] if that is stated; ``times`` are N texts that say so.
+    InputError for times that are not one a check, and a result that has no covariance (lasso).
 
     Examples
     --------
@@ -307,13 +281,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
 
 
 def cusum(deviate: Array) -> Array:
-    """Return Page's sums (N,), S_t = max(0, S_(t-1) + u_t - `ALLOWANCE`).
-
-    >>> import numpy as np
-    >>> from rpim_opt.use.monitoring import cusum
-    >>> cusum(np.array([0.0, 2.0, 1.0, -3.0])).tolist()
-    [0.0, 1.5, 2.0, 0.0]
-    """
+    """Return Page's sums (N,), S_t = max(0, S_(t-1) + u_t - `ALLOWANCE`)."""
     total = np.cumsum(deviate - ALLOWANCE)
     return total - np.minimum(np.minimum.accumulate(total), 0.0)
 

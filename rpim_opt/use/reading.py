@@ -52,18 +52,9 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     both: joint values are then where to look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ...,
     ``payload_kg``.
 
-    Parameters
-    ----------
-    source
-        A path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column names
-        to cells.
-    robot
-        Its joints' number and types decide the joint columns.
-
-    Raises
-    ------
-    InputError
-        Naming the file, the row or column, what was found and what is accepted.
+    ``source`` is a path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column
+    names to cells; the robot's joints decide the joint columns. InputError names the file, the row or column, what was
+    found and what is accepted.
 
     Examples
     --------
@@ -143,16 +134,9 @@ def read_measurements(
 
     Rows that state no uncertainty have that of the calibration's data.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    source
-        A text, Excel or Parquet file, a data frame, or a list of them, which are stacked or joined.
-    measurement
-        Which of the calibration's measurement types, where it has several.
-    options
-        What is stated of the tables; what is not, is as it was for the calibration's own.
+    ``source`` is a text, Excel or Parquet file, a data frame, or a list of them, which are stacked or joined;
+    ``measurement`` which of the calibration's measurement types, where it has several. ``options`` are what is stated
+    of the tables; what is not, is as it was for the calibration's own.
 
     Examples
     --------

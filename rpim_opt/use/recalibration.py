@@ -110,20 +110,10 @@ class Moved(NamedTuple):
 class Update:
     """A recalibration with the previous result as prior.
 
-    Parameters
-    ----------
-    result
-        The calibration, whose record has the previous one.
-    before, after
-        How the readings fit the previous calibration, and with the changes.
-    changes
-        Parameters and frames that changed, and wrong readings, which were left out, in the order of their discovery.
-    causes
-        All that may have changed, with its evidence before anything was released, the most probable first.
-    moved
-        By how much the released parameters moved.
-    readings
-        Rows that were given.
+    ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` say how the ``readings``
+    (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
+    readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
+    evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
     """
 
     result: Calibration
@@ -205,23 +195,11 @@ def update(
     the most probable change is released: its parameters get a prior about where they were, wider than any crash, and
     all others keep the posterior.
 
-    Parameters
-    ----------
-    result
-        The previous calibration, with a squared penalty or none; perhaps of `load_result`.
-    data
-        New measurements of the same robot, in the same instrument's frame unless ``reset`` says otherwise.
-    prior_inflation
-        Factor on the earlier standard deviations, where everything may have drifted a little.
-    reset
-        Patterns of parameters of which the earlier result says nothing, ``("base_*",)`` where the instrument moved.
-    progress
-        Called with each step in words.
-
-    Raises
-    ------
-    InputError
-        For a result without covariance (lasso), data in blocks, and readings that cannot be this robot's.
+    The result has a squared penalty or none. ``data`` are new measurements of the same robot, in the same instrument's
+    frame unless ``reset`` says otherwise: patterns of parameters of which the earlier result says nothing,
+    ``("base_*",)`` where the instrument moved. ``prior_inflation`` is a factor on the earlier standard deviations,
+    where everything may have drifted a little; ``progress`` is called with each step in words. InputError for a result
+    without covariance (lasso), data in blocks, and readings that cannot be this robot's.
 
     Examples
     --------

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.tables import csv_text
+from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
@@ -23,33 +23,21 @@ from rpim_opt.problem.diagnosis import shared_rows
 
 @dataclass(frozen=True, eq=False)
 class Validation:
-    """Errors of a calibration on new measurements.
+    """Errors of a calibration on N new measurements.
 
-    Parameters
-    ----------
-    label
-        N row labels.
-    nominal, error
-        (N,) position errors before and after calibration [m].
-    vectors
-        (N, 3) measured minus predicted position [m]; NaN where no position was measured.
-    angle
-        (N,) orientation errors [rad]; NaN for rows that are no poses.
-    sigmas, allowed
-        (N,) |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the instrument's as the
-        row states it, and the repeatability) and C the calibration's, and its limit by Fisher's F, which one of all N
-        rows exceeds with probability 0.01. NaN where the calibration has no covariance, or none in a direction that
-        the row depends on.
-    coverage
-        Share of the lengths that lie in the 95 % interval of a new reading; None without covariance.
-    outside
-        Rows beyond the joint ranges that the calibration measured.
-    touched
-        How far touches are from their points and planes, the worst first, as documents [mm].
-    remarks
-        What a reader of the errors has to know: of touches, and that the calibration is not delivered.
-    mistake
-        Another reading of the measurements that fits far better, in a sentence; empty where there is none.
+    ``nominal`` and ``error`` (N,) are the position errors before and after calibration [m], ``vectors`` (N, 3) measured
+    minus predicted position [m], NaN where no position was measured, and ``angle`` (N,) the orientation errors [rad],
+    NaN for rows that are no poses.
+
+    ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the
+    instrument's as the row states it, and the repeatability) and C the calibration's; ``allowed`` (N,) their limit by
+    Fisher's F, which one of all N rows exceeds with probability 0.01. Both are NaN where the calibration has no
+    covariance, or none in a direction that the row depends on. ``coverage`` is the share of the lengths that lie in the
+    95 % interval of a new reading; None without covariance.
+
+    ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` says how far touches are
+    from their points and planes, the worst first [mm], ``remarks`` what a reader of the errors has to know, and
+    ``mistake`` names another reading of the measurements that fits far better, if there is one.
     """
 
     label: tuple[str, ...]
@@ -84,7 +72,6 @@ class Validation:
     def content(self) -> dict[str, Any]:
         """Return the figures [mm, mrad], and the rows."""
         axes = {a: v[np.isfinite(v)] for a, v in zip("xyz", self.vectors.T, strict=True)}
-        rows = self._rows()
         return {
             "nominal": statistics(self.nominal),
             "identified": statistics(self.error),
@@ -98,14 +85,12 @@ class Validation:
             "mistake": self.mistake,
             "worse": self.worse,
             "judged": bool(np.isfinite(self.sigmas).any()),
-            "rows": [dict(zip(rows, row, strict=True)) for row in zip(*rows.values(), strict=True)],
+            "rows": records(self._rows()),
         }
 
     def csv(self) -> str:
         """Return the rows as CSV."""
-        rows = self._rows()
-        cells = [[c if isinstance(c, str) else f"{c:.6f}" if np.isfinite(c) else "" for c in v] for v in rows.values()]
-        return csv_text(rows, zip(*cells, strict=True))
+        return columns_csv(self._rows())
 
     def __str__(self) -> str:
         """Return the errors as a table, and the rows beyond their uncertainty by name."""
@@ -148,12 +133,7 @@ class Validation:
 def validate(result: Calibration, data: Dataset) -> Validation:
     """Return the errors of a calibration on measurements, and whether its uncertainty explains them.
 
-    Parameters
-    ----------
-    result
-        The calibration, perhaps of `load_result`.
-    data
-        Measurements in the same instrument's frame, by reflectors of the calibration.
+    ``data`` are in the same instrument's frame, by reflectors of the calibration, which may be one of `load_result`.
 
     Examples
     --------

@@ -54,17 +54,6 @@ def view_pose(points: Array, xy: Array) -> Array:
 
     ``points`` are (P, 3) on the board [m], ``xy`` (P, 2) directions, as `normalized` has them. Refused are fewer than
     four points of a plane, or six in space, and points on a line.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> points = np.array(list(ro.data.grid_board(4, 3, 0.03).values()))
-    >>> seen = points + [0.01, 0.02, 0.5]  # upright before the camera
-    >>> ro.problem.view_pose(points, seen[:, :2] / seen[:, 2:])[:3].round(6) + 0.0
-    array([[1.  , 0.  , 0.  , 0.01],
-           [0.  , 1.  , 0.  , 0.02],
-           [0.  , 0.  , 1.  , 0.5 ]])
     """
     middle, axes, planar = _plane(points)
     local = (points - middle) @ axes.T

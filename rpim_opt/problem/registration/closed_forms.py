@@ -23,17 +23,6 @@ def register(source: Array, target: Array) -> Array:
 
     ``source`` and ``target`` are N points (N, 3) [m]. Refused are fewer than three points, points that coincide, and
     points on a line: their rotation is arbitrary.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]])
-    >>> seen = np.array([[2, 0, 0], [2, 1, 0], [1, 0, 0]])  # turned by 90 degrees about z, moved by 2 along x
-    >>> ro.problem.register(corners, seen).round(9)[:3] + 0.0
-    array([[ 0., -1.,  0.,  2.],
-           [ 1.,  0.,  0.,  0.],
-           [ 0.,  0.,  1.,  0.]])
     """
     source, target = np.asarray(source, dtype=float), np.asarray(target, dtype=float)
     if source.shape != target.shape or source.shape[1:] != (3,):

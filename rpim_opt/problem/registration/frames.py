@@ -181,25 +181,12 @@ def problem_from(
 ) -> CalibrationProblem:
     """Return the problem of a robot and its measurements, base and tool located in closed form.
 
-    Parameters
-    ----------
-    robot
-        The nominal robot, what `read_urdf` returns, a file that describes one, or the name of a ready robot.
-    data
-        The measurements.
-    identify
-        Patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`.
-    base
-        (6,) start of the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx;
-        ``"auto"`` registers it; zero where the measurements do not depend on it.
-    tool
-        (6,) start of the reflector in the frame behind the last joint's modified-DH row; where it is not stated, that
-        of the URDF's tip, or zero. A start that the data contradict is replaced by its registration.
-
-    Raises
-    ------
-    InputError
-        For data that do not determine where the base is, or a pattern that matches no parameter.
+    The ``robot`` is the nominal one, what `read_urdf` returns, a file that describes one, or the name of a ready robot;
+    ``identify`` are patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`. ``base`` (6,) is a start of
+    the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx; ``"auto"`` registers it; zero
+    where the measurements do not depend on it. ``tool`` (6,) is a start of the reflector in the frame behind the last
+    joint's modified-DH row, by default that of the URDF's tip, or zero; one that the data contradict is replaced by its
+    registration. InputError for data that do not determine where the base is, or a pattern that matches no parameter.
 
     Examples
     --------
