@@ -1,4 +1,4 @@
-"""Acceptance: whether a calibrated robot keeps a limit at every configuration of a region."""
+"""Acceptance test: whether a calibrated robot meets a tolerance at every configuration of a region."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ LEAST = 1e-9
 
 @dataclass(frozen=True, eq=False)
 class Region:
-    """A problem whose joint limits are those of the region, a box (3, 2) [m] in its base frame, and the reflector."""
+    """Region of a requirement: a problem with its joint limits, a box (3, 2) [m] in the base frame, and a reflector."""
 
     problem: CalibrationProblem
     box: Array | None
@@ -56,11 +56,11 @@ class Region:
 
     @property
     def limits(self) -> Array:
-        """Least and largest value (dof, 2) of every joint [rad or m]."""
+        """Lower and upper limits (dof, 2) of the joints [rad or m]."""
         return self.problem.robot.limits
 
     def inside(self, q: Array, slack: float = 0.0) -> np.ndarray:
-        """Return which configurations (N, dof) are in the region, (N,), or beyond it by so many parts of its ranges."""
+        """Return whether configurations (N, dof) are in the region (N,), with a margin as a fraction of its ranges."""
         low, high = self.limits.T
         spare = slack * (high - low)
         found = ((q >= low - spare) & (q <= high + spare)).all(axis=1)
@@ -70,12 +70,12 @@ class Region:
         return found
 
     def drawn(self) -> Array:
-        """Return configurations (N, dof) that represent the region; InputError where none reaches into the box."""
+        """Return configurations (N, dof) that represent the region; InputError if none reaches the box."""
         return within(self.problem, self.box, self.marker)
 
 
 def region_of(result: Outcome, requirement: Requirement) -> Region:
-    """Return the region of a requirement; refuse several robots, and joints and reflectors that the robot has not."""
+    """Return the region of a requirement; refuse several robots, and unknown joints and reflectors."""
     problem = result.problem
     if len(problem.arms) > 1 or "" not in problem.arms:
         raise InputError("acceptance", "several robots in one calibration", "a calibration of one robot")
@@ -109,22 +109,22 @@ class Workspace:
 
     @property
     def count(self) -> int:
-        """How many were drawn."""
+        """Number of sampled configurations."""
         return len(self.q) - 1
 
     @property
     def largest(self) -> float:
-        """The largest one [m]."""
+        """Maximum expanded uncertainty [m]."""
         return float(self.expanded[-1])
 
     @property
     def typical(self) -> float:
-        """The median of those that were drawn [m]."""
+        """Median expanded uncertainty of the sampled configurations [m]."""
         return float(np.median(self.expanded[:-1]))
 
 
 def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: Array) -> Workspace:
-    """Return the expanded uncertainty at configurations (N, dof) of a region and at the worst that a search finds.
+    """Return the expanded uncertainty at configurations (N, dof) of a region and at the maximum found by a search.
 
     InputError for a formulation without covariance.
     """
@@ -143,13 +143,13 @@ def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: 
 
 
 def reaching(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
-    """Return where the robot will be at configurations (N, dof), (N, 3) [m], and bounds (N,) on how far off it is."""
+    """Return predicted positions (N, 3) [m] at configurations (N, dof), and their expanded uncertainties (N,)."""
     found = Uncertainty(result, confidence).predict(q, region.marker, of="reached")
     return found.position, distance_quantile(found.covariance, result.freedom, confidence)
 
 
 def distance_quantile(covariance: Array, freedom: float, probability: float) -> Array:
-    """Return quantiles (N,) of the length of Student's vectors with covariances (N, k, k) at scale 1.
+    """Return quantiles (N,) of the norm of Student-t vectors with scale matrices (N, k, k).
 
     Of a normal vector with covariance S the squared length is nearly g chi^2 with h degrees of freedom (Satterthwaite),
     ``g = tr S^2 / tr S``, ``h = (tr S)^2 / tr S^2``; a scale known to nu degrees of freedom makes it Fisher's F::
@@ -175,7 +175,7 @@ def distance_quantile(covariance: Array, freedom: float, probability: float) -> 
 
 @dataclass(frozen=True, eq=False)
 class Acceptance:
-    """What a requirement and a calibration come to.
+    """Result of the acceptance test of a calibration against a requirement.
 
     Parameters
     ----------
@@ -210,11 +210,11 @@ class Acceptance:
 
     @property
     def bound(self) -> float | None:
-        """The largest bound [m]."""
+        """Maximum expanded uncertainty [m]."""
         return None if self.workspace is None else self.workspace.largest
 
     def sentences(self) -> list[str]:
-        """Return the verdict and what it rests on, sentence by sentence."""
+        """Return the verdict and its grounds, sentence by sentence."""
         asked = self.requirement
         said = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Cannot be decided"}[self.verdict]
         limit = f"limit {1e3 * asked.limit:g} mm with {percent(asked.confidence)}"
@@ -257,7 +257,7 @@ class Acceptance:
 
 @one_blas_thread
 def accept(result: Calibration, requirement: Requirement | None = None, data: Dataset | None = None) -> Acceptance:
-    """Return whether the calibrated robot keeps a limit at every configuration of a region.
+    """Test whether the calibrated robot meets a tolerance at every configuration of a region.
 
     What is held against the limit is the position that the robot will reach, as `Calibration.predict` has it: with the
     uncertainty of the parameters and the robot's repeatability, without the instrument's noise. Its distance from the
@@ -292,7 +292,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     """
     requirement = requirement or result.record.requirement
     if requirement is None:
-        raise InputError("acceptance", "no limit", "a limit [mm]: --limit, or limit_mm in [acceptance]")
+        raise InputError("acceptance", "no limit", "--limit [mm], or limit_mm in [acceptance]")
     if data is not None:
         refuse_misread(result, data)
     limit = requirement.limit
@@ -310,13 +310,13 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     against += missed
     if least > limit:
         against.append(
-            f"With this model the robot's repeatability contributes {1e3 * least:.3f} mm at least: only a model that "
-            'explains more of it (model = "auto") or a more repeatable robot lowers that.'
+            f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only a "
+            "model that "
+            'explains more of the residuals (model = "auto") or a more repeatable robot reduces it.'
         )
     if not np.isfinite(mapped.largest):
         lacking.append(
-            "Lacking: measurements that identify combinations which neither data nor penalty determine, and which move "
-            "the robot."
+            "Lacking: measurements that identify the parameter combinations that neither data nor penalty determine."
         )
     elif mapped.largest > limit:
         if scatter > limit:
@@ -374,7 +374,7 @@ def _held_out(
     chance = 1 - requirement.confidence
     if missing and bdtrc(len(missing) - 1, count, chance) < chance:
         missed.append(
-            f"{len(missing)} of {count} rows miss by more than the limit and the instrument's part of it: "
+            f"{len(missing)} of {count} rows have errors above the limit plus the instrument's uncertainty: "
             f"{listed(missing, MOST)}."
         )
     lacking: list[str] = []
@@ -382,16 +382,16 @@ def _held_out(
         lacking.append(f"Lacking: at least {FEWEST} held-out rows; there are {rows}.")
     if beyond:
         lacking.append(
-            f"Lacking: valid prediction intervals. Rows outside theirs: {listed(beyond, MOST)}. Measure again, or find "
-            "what the model lacks."
+            f"Lacking: valid prediction intervals. Rows outside theirs: {listed(beyond, MOST)}. Repeat these "
+            "measurements, or extend the model."
         )
-    sentence = f"Held out: {rows} rows, {count} of them in the region, the largest error there {largest:.3f} mm, of "
-    sentence += f"which the instrument may account for {1e3 * instrument[inside].max(initial=0.0):.3f} mm"
+    sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm, of "
+    sentence += f"which the instrument may contribute {1e3 * instrument[inside].max(initial=0.0):.3f} mm"
     if coverage is not None:
         # coordinates of a row are not independent of each other: a row counts once
         least = float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
-        share = f"{100 * coverage:.0f} % of the coordinates lie in their 95 % intervals"
-        sentence += f"; {share} (at least {100 * least:.0f} % are required of so many rows)"
+        share = f"{100 * coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
+        sentence += f"; {share} (at least {100 * least:.0f} % are required for this number of rows)"
         if coverage < least:
             lacking.append(f"Lacking: valid prediction intervals. Only {share}.")
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
@@ -402,7 +402,7 @@ def _held_out(
 
 
 def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
-    """Return the bound [m] at q (dof,) if all parameters were known: repeatability as estimated, and at the least.
+    """Return the bounds [m] at q (dof,) if all parameters were known, for the estimated and the smallest repeatability.
 
     Zero where it is not known apart from the noise; at the least where the data know no more than an upper end.
     """
@@ -433,6 +433,6 @@ def _unmodelled(result: Calibration, region: Region) -> list[str]:
         low, high = region.limits[joint - 1] / si
         named.append(f"joint {joint} from {low:.4g} to {high:.4g} {unit}")
     if named:
-        where = f"{joined(named)}, as the region has it: nothing checked the model there."
+        where = f"{joined(named)}, which is part of the region: no measurement checked the model there."
         lines.append(f"Lacking: measurements with {where}")
     return lines

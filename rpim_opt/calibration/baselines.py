@@ -1,4 +1,4 @@
-"""The usual methods without convex programming, so that agreement with them is evidence."""
+"""Baseline methods without convex programming, for comparison."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = [
 
 
 class Baseline(NamedTuple):
-    """Identified deviations (n,) [SI], the passes or evaluations that it took, and the method."""
+    """Identified deviations (n,) [SI], the number of iterations or evaluations, and the method."""
 
     x: Array
     iterations: int
@@ -28,7 +28,7 @@ class Baseline(NamedTuple):
 
 
 def linear_least_squares(problem: CalibrationProblem) -> Baseline:
-    """LSM of the paper: one step of least squares from nominal, of smallest norm in units of the scales."""
+    """Linear least squares of the paper: one step from nominal, of smallest norm in units of the scales."""
     scale = problem.parameters.free.scale
     model = problem.linearize(np.zeros_like(scale))
     return Baseline(scale * np.linalg.lstsq(model.A, model.b, rcond=1e-12)[0], 1, "linear least squares")
@@ -37,7 +37,7 @@ def linear_least_squares(problem: CalibrationProblem) -> Baseline:
 def gauss_newton(
     problem: CalibrationProblem, iterations: int = 20, tolerance: float = 1e-10, cutoff: float = 1e-8
 ) -> Baseline:
-    """Gauss-Newton: least-squares steps of smallest norm, repeated until they are shorter than ``tolerance`` scales.
+    """Gauss-Newton: repeat least-squares steps of smallest norm until they are shorter than ``tolerance`` scales.
 
     Weakly identifiable directions wander where noise sends them. Singular values below ``cutoff`` times the largest are
     taken for zero: that of a redundant direction is rounding at nominal, and larger where deviations are not exact.
@@ -59,7 +59,7 @@ def gauss_newton(
 
 
 def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
-    """Levenberg-Marquardt as in SciPy (MINPACK), on whitened residuals, analytic Jacobian, 200 evaluations."""
+    """Levenberg-Marquardt of SciPy (MINPACK) on whitened residuals, with analytic Jacobian and 200 evaluations."""
     scale = problem.parameters.free.scale
 
     def residual(z: Array) -> Array:
@@ -80,7 +80,7 @@ def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
 
 
 def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, preconditioned: bool = False) -> Baseline:
-    """Descend along the gradient of the sum of squares, by the linear model's exact steps.
+    """Gradient descent on the sum of squares, with exact steps of the linear model.
 
     As in the paper it works on raw parameters (metres and radians); with ``preconditioned`` on deviations divided by
     the column norms of the Jacobian, which is what makes it move at all along the weak directions.

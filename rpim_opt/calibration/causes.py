@@ -1,4 +1,4 @@
-"""Likely causes of a bad fit: the mistakes that `inspect` knows are looked for when residuals are too large."""
+"""Likely causes of a poor fit: input mistakes that are tested when residuals are too large."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ LARGEST = {"length": 0.02, "angle": 0.05}
 """A machined and assembled robot deviates by less than this [m, rad]."""
 
 NOTHING = (
-    "None of the tested mistakes explains it. Check the nominal parameters; the arm may be compliant, or less "
-    "repeatable than stated. See rpim-opt inspect."
+    "None of the tested input mistakes explains it. Check the nominal parameters; the arm may be compliant,"
+    " or less repeatable than stated. See rpim-opt inspect."
 )
 
 
 def likely_causes(result: Outcome) -> list[str]:
-    """Return what a bad fit likely comes from, a sentence each with its figure; nothing where the fit is good.
+    """Return the likely causes of a poor fit, one sentence each; empty if the fit is good.
 
     A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
     does not distrust, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
@@ -99,7 +99,7 @@ def likely_causes(result: Outcome) -> list[str]:
             signs.append(f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)")
         if ratio > NOISY:
             noise = f"{three_digits(ratio)} times the stated noise"
-            signs.append(f"residuals {noise}, the freedom of transmission errors counted")
+            signs.append(f"residuals {noise}, including the degrees of freedom of transmission errors")
     # no drawing is as wrong as that; what was learned to be large is not what was expected
     expected = free.scale if learned is None else learned.stated
     largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
@@ -162,7 +162,7 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:
-    """Return the reading of new measurements that fits far better; None where they are near, or none does.
+    """Return the interpretation of new measurements that fits far better; None if they fit, or if there is none.
 
     Asked where their errors are beyond `HOPELESS` times what the instrument is stated to have.
     """
@@ -173,15 +173,15 @@ def better_fitting(result: Outcome, data: Dataset) -> Better | None:
 
 
 def refuse_misread(result: Outcome, data: Dataset) -> None:
-    """Raise an InputError for new measurements of which `better_fitting` finds another reading."""
+    """Refuse new measurements that `better_fitting` interprets differently."""
     better = better_fitting(result, data)
     if better is not None:
-        left = f"readings {1e3 * better.stated:.3g} mm off, and {1e3 * better.left:.3g} mm with {better.what}"
+        left = f"errors of {1e3 * better.stated:.3g} mm, but {1e3 * better.left:.3g} mm with {better.what}"
         raise InputError("the new measurements", left, better.remedy)
 
 
 def misread(result: Outcome, data: Dataset) -> str:
-    """Return what `better_fitting` finds as a sentence, empty for nothing."""
+    """Return the result of `better_fitting` as a sentence, empty for None."""
     better = better_fitting(result, data)
     if better is None:
         return ""
@@ -189,7 +189,7 @@ def misread(result: Outcome, data: Dataset) -> str:
 
 
 def mistakes(causes: Sequence[str]) -> list[str]:
-    """Return the mistakes among `likely_causes`."""
+    """Return the input mistakes among `likely_causes`."""
     return [text for text in causes if text != NOTHING and not text.startswith(BAD)]
 
 

@@ -1,4 +1,4 @@
-"""Evidence that a solution is one: the user's functions and the model asked anew, and nothing taken from the loop."""
+"""Optimality certificate of a solution, computed from the user's functions and the model, independently of the loop."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ TINY = 1e-300
 
 
 class Certificate(NamedTuple):
-    """How well the conditions of a solution are met.
+    """Residuals of the optimality conditions at a solution.
 
     ``step`` is how far the convex program at the solution would still go, relative to 1 + |z|; ``violation`` by how
     much the constraints are missed, in units of the scales; ``decrease`` what that step promises, relative to the
@@ -45,7 +45,7 @@ class Certificate(NamedTuple):
     decrease: float | None = None
 
     def holds(self, z: Array) -> bool:
-        """Whether this is a solution z (n,), to the accuracy of an interior point."""
+        """Whether the conditions hold at z (n,), to the accuracy of an interior-point solver."""
         return self.decrease is not None and self.decrease <= DECREASE and self.violation <= feasibility_tolerance(z)
 
 
@@ -58,7 +58,7 @@ def certified(
     residual: Callable[[Array], Array] | None = None,
     before: Program | None = None,
 ) -> Certificate:
-    """Return the evidence that z (n,) minimizes the nonlinear problem: the formulation's functions are asked anew.
+    """Return the certificate that z (n,) minimizes the nonlinear problem; the formulation's functions are called anew.
 
     ``model`` is the problem linearized at z, anew; ``floor`` the objective below which one has vanished. Where
     ``residual`` gives the whitened residual b - A z at z (n,), the model's derivative is compared with its differences,

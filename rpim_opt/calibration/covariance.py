@@ -1,4 +1,4 @@
-"""Covariance of deviations and of positions, three intervals of a position, and the test of the measurement noise."""
+"""Covariances of deviations and positions, intervals of a position, and the test of the measurement noise."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ UNLIKELY = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Spread:
-    """The uncertainty of a squared fit with a squared penalty, noise and prior apart (`Uncertainty` has the formulas).
+    """Covariance of a least-squares fit with a quadratic penalty, noise and prior separately (see `Uncertainty`).
 
     Parameters
     ----------
@@ -64,12 +64,12 @@ class Spread:
 
     @property
     def spare(self) -> float:
-        """What equations are left over, m - dof; with a robust loss of those that it keeps."""
+        """Residual degrees of freedom, m - dof; with a robust loss of the equations that it keeps."""
         return self.linear.equations - self.degrees_of_freedom
 
     @cached_property
     def noise_variance(self) -> float:
-        """sigma^2 = RSS / (m - dof) in units of the stated variance, or 1 where no equation is left over."""
+        """sigma^2 = RSS / (m - dof) in units of the stated variance; 1 without residual degrees of freedom."""
         if self.level is not None:
             return self.level
         if self.spare <= 1e-6:
@@ -87,7 +87,7 @@ class Spread:
 
     @cached_property
     def prior(self) -> Array:
-        """Mean square (n, n) [SI] of what the penalty holds back, in unidentifiable directions above all."""
+        """Mean-square bias (n, n) [SI] due to the penalty, mostly in unidentifiable directions."""
         found = self._in_si(self.form.prior(self.weight))
         if self.drift is not None:
             found = found + self.drift @ self.drift.T
@@ -95,14 +95,14 @@ class Spread:
 
     @cached_property
     def covariance(self) -> Array:
-        """Covariance (n, n) [SI]; infinite variances where something moves that neither data nor penalty decide."""
+        """Covariance (n, n) [SI]; infinite for combinations that neither data nor penalty determine."""
         C = self.noise + self.prior
         open_ended = np.sum(self.form.undecided(self.weight) ** 2, axis=1) > 1e-12
         C[open_ended, open_ended] = np.inf
         return C
 
     def of_positions(self, J: Array) -> Array:
-        """Return the covariances (N, 3, 3) [m^2] of positions with slopes J (N, 3, n) by the deviations [SI].
+        """Return the covariances (N, 3, 3) [m^2] of positions with derivatives J (N, 3, n) by the deviations [SI].
 
         Variances are infinite where an undecided direction moves the position; where none does they are finite, even
         if no parameter alone is known.
@@ -120,7 +120,7 @@ class Spread:
 
 
 class Scattered(NamedTuple):
-    """What adds to the covariance of a row's model, block by block (N, k, k) [SI].
+    """Covariances added to that of the rows' model, block by block (N, k, k) [SI].
 
     ``robot`` is the robot's repeatability, ``reading`` this and the instrument's noise, with ``session``, the offset of
     a session that the problem does not know.
@@ -132,7 +132,7 @@ class Scattered(NamedTuple):
 
 
 def scattered(problem: CalibrationProblem, level: float) -> Scattered:
-    """Return what robot and instrument add to the model of some measurements.
+    """Return the covariances that robot and instrument add to the model of some measurements.
 
     A problem whose repeatability was estimated knows its parts. Of another one the robot's is what the residuals show
     beyond the stated noise, (level - 1) Sigma, with ``level`` the noise's variance over the stated one, at least 1.
@@ -148,7 +148,7 @@ def scattered(problem: CalibrationProblem, level: float) -> Scattered:
 
 
 def position_noise(source: Source) -> Array:
-    """Return the median covariance (3, 3) [m^2] of a reading of a position; zero where no position was measured."""
+    """Return the median covariance (3, 3) [m^2] of a position reading; zero if no position was measured."""
     for part in source.rows():
         seen = [b.covariance[:, :3, :3] for b in part.data.blocks if b.measurement.name in ("position", "pose")]
         if seen:
@@ -157,7 +157,7 @@ def position_noise(source: Source) -> Array:
 
 
 def require_interval(of: str) -> None:
-    """Refuse what is no `Interval`."""
+    """Refuse anything but an `Interval`."""
     if of not in get_args(Interval):
         raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
 
@@ -168,7 +168,7 @@ def coverage_factor(freedom: float | Array, confidence: float) -> Array:
 
 
 def row_freedom(freedom: float, spread: float, whole: Array, session: Array) -> Array:
-    """Return the degrees of freedom (N,) of rows' variances, at least one; fewer where a few sessions told a part.
+    """Return the degrees of freedom (N,) of the rows' variances, at least one; few sessions reduce them.
 
     2 V^2 / var(V) of the sum V of both parts' variances (Satterthwaite), with ``freedom`` that of what no session adds,
     ``spread`` the standard deviation of the logarithm of the session offsets' size, and covariances (N, k, k) of a row
@@ -185,7 +185,7 @@ def row_freedom(freedom: float, spread: float, whole: Array, session: Array) -> 
 
 
 class NoiseTest(NamedTuple):
-    """Observed over stated standard deviation, its two-sided probability under the stated noise, and a verdict."""
+    """Ratio of observed to stated standard deviation, its two-sided p-value under the stated noise, and a verdict."""
 
     ratio: float
     probability: float
@@ -193,25 +193,25 @@ class NoiseTest(NamedTuple):
 
     @property
     def overstated(self) -> bool:
-        """Whether residuals are so much smaller that the noise is stated too large."""
+        """Whether residuals are so small that the noise must be stated too large."""
         return self.probability < UNLIKELY and self.ratio < 1
 
 
 def noise_test(squares: float, freedom: float, learned: bool = False, factor: float = 1.0) -> NoiseTest:
-    """Compare a sum of squared residuals in sigmas with chi^2.
+    """Compare a sum of squared whitened residuals with its chi-squared distribution.
 
     ``learned``: the repeatability is known beside the noise; ``factor``: what is estimated on the stated noise.
     """
     if freedom < 1:
-        return NoiseTest(1.0, 1.0, "No degree of freedom is left to test the stated measurement noise.")
+        return NoiseTest(1.0, 1.0, "No degrees of freedom remain to test the stated measurement noise.")
     ratio = float(np.sqrt(squares / freedom))
     upper = float(chdtrc(freedom, squares))
     probability = 2 * min(upper, 1 - upper)
     if probability >= UNLIKELY:
         return NoiseTest(ratio, probability, f"Residuals agree with the stated measurement noise (ratio {ratio:.2f}).")
-    cause = "noise is larger, rows are wrong, or the model lacks an effect (backlash, elasticity)"
+    cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"
     if upper >= 0.5:
-        cause = "it is stated too large"
+        cause = "the noise is stated too large"
         if learned and factor == 1.0:
             cause += ' (noise = "free" estimates it)'
     elif learned:

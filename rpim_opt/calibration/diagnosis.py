@@ -1,4 +1,4 @@
-"""What a fit says of its data and its constraints: outlying rows, active bounds, shadow prices, extrapolation."""
+"""Diagnostics of a fit: outliers, active bounds, shadow prices, extrapolation."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ACTIVE = 1e-6
 
 
 class Flag(NamedTuple):
-    """An outlying row: its residual in sigmas, and its error [mm]."""
+    """An outlier: label, residual in standard deviations, and error [mm]."""
 
     label: str
     sigmas: float
@@ -33,7 +33,7 @@ class Flag(NamedTuple):
 
 
 class Held(NamedTuple):
-    """A parameter at its bound [SI], the bound's multiplier, and the gain of loosening it by a tenth."""
+    """An active bound of a parameter [SI], its multiplier, and the gain of loosening it by a tenth."""
 
     name: str
     bound: float
@@ -42,7 +42,7 @@ class Held(NamedTuple):
 
 
 class Price(NamedTuple):
-    """A statement of a drawing at a solution.
+    """A constraint that is written as text, at a solution: its shadow price or its slack.
 
     ``slack`` is how far it is from its limit, in ``unit``; ``multiplier`` by how much the misfit (loss + weight
     penalty) would fall for every ``unit`` by which it is loosened, zero where it is not active; ``gain`` what loosening
@@ -63,7 +63,7 @@ class Price(NamedTuple):
         return self.multiplier > 0
 
     def sentence(self) -> str:
-        """Say what it costs."""
+        """Return the price or the slack as a sentence."""
         if not self.holds:
             return f"'{self.text}' is inactive, with {self.slack:.3g} {self.unit} of slack."
         return (
@@ -73,7 +73,7 @@ class Price(NamedTuple):
 
 
 def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
-    """Return the rows beyond `outlying` at x (n,) [SI], the worst first."""
+    """Return the outliers at x (n,) [SI], by the threshold `outlying`, the worst first."""
     norms, count = problem.whitened_errors(x)
     limit = outlying(norms, count)
     error = problem.errors(x)
@@ -85,7 +85,7 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
 
 
 def active_bounds(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
-    """Return the parameters at an active bound at z (n,), the costliest first."""
+    """Return the parameters with an active bound at z (n,), the largest multiplier first."""
     box = program.box
     if box is None or not program.formulation.constraints:
         return ()
@@ -104,7 +104,7 @@ def active_bounds(program: Program, z: Array, weight: float) -> tuple[Held, ...]
 
 
 def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
-    """Return what the statements of drawings among a program's constraints cost at its solution z (n,)."""
+    """Return the shadow prices of a program's textual constraints at its solution z (n,)."""
     constraints = program.formulation.constraints
     if not any(isinstance(constraint, Parsed) for constraint in constraints):
         return ()
@@ -132,14 +132,14 @@ def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
 
 @dataclass(frozen=True)
 class Outside:
-    """Which of ``count`` rows lie outside the measured joint ranges, and how many by each joint (from 1)."""
+    """Rows, of ``count``, outside the measured joint ranges, and how many of them by each joint (from 1)."""
 
     count: int = 0
     rows: tuple[int, ...] = ()
     joints: Mapping[int, int] = field(default_factory=dict)
 
     def sentences(self) -> list[str]:
-        """Say how many rows are outside, or nothing."""
+        """Return a sentence on the number of rows outside; empty if there are none."""
         if not self.rows:
             return []
         by = ", ".join(f"joint {joint}: {count}" for joint, count in self.joints.items())
@@ -151,13 +151,13 @@ class Outside:
 
 
 def measured_ranges(problem: Source) -> dict[str, Array]:
-    """Return the least and largest measured value of every joint (2, dof) [rad or m], by robot."""
+    """Return the minimum and maximum measured value of every joint (2, dof) [rad or m], by robot."""
     blocks = (block for part in problem.rows() for block in part.data.blocks)
     return widest((block.robot, np.stack([block.q.min(axis=(0, 1)), block.q.max(axis=(0, 1))])) for block in blocks)
 
 
 def widest(ranges: Iterable[tuple[str, Array]]) -> dict[str, Array]:
-    """Return the ranges (2, dof) that hold all of some, by robot."""
+    """Return the union of ranges (2, dof), by robot."""
     found: dict[str, Array] = {}
     for robot, (low, high) in ranges:
         least, most = found.get(robot, (low, high))
@@ -166,7 +166,7 @@ def widest(ranges: Iterable[tuple[str, Array]]) -> dict[str, Array]:
 
 
 def outside(ranges: Mapping[str, Array], data: Dataset) -> Outside:
-    """Return which rows have a point outside of joint ranges (2, dof) by robot."""
+    """Return which rows have a point outside the joint ranges (2, dof) of their robot."""
     beyond = np.zeros((len(data), max(block.q.shape[2] for block in data.blocks)), dtype=bool)
     for block in data.blocks:
         low, high = ranges[block.robot]

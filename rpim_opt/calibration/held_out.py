@@ -1,4 +1,4 @@
-"""Held-out rows: against the intervals that predict them, and used for a last fit."""
+"""Held-out rows: comparison with their prediction intervals, and the final fit to all rows."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ RARE = 0.01
 
 
 class Judged(NamedTuple):
-    """Residuals (N,) in standard deviations of a reading, what of it is allowed, and the coverage of the intervals."""
+    """Residuals (N,) in standard deviations of a reading, their limits, and the coverage of the intervals."""
 
     sigmas: Array
     allowed: Array
@@ -31,7 +31,7 @@ class Judged(NamedTuple):
 
 
 def judged(result: Calibration, data: Dataset) -> Judged:
-    """Return how N measurements lie beside what the calibration's uncertainty predicts; NaN where it predicts nothing.
+    """Compare N measurements with their prediction intervals; NaN where there is no prediction.
 
     A row is allowed the norm that one of N rows exceeds with probability 0.01.
     """
@@ -66,7 +66,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
 
 
 def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibration:
-    """Return the calibration from identification and validation rows together, asked as this one was.
+    """Return the calibration from identification and validation rows together, with the same settings.
 
     Errors on the held-out rows, which validate the procedure, stay in its record (``held_out``); the parameters come
     from all rows. No row is left that checks these alone.

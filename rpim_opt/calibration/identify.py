@@ -1,4 +1,4 @@
-"""Calibration: identify the parameters of a problem at a weight, or at estimated hyperparameters."""
+"""Identification of a problem's parameters at a given weight or at estimated hyperparameters."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ FAR = 1000.0
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
 ZERO = 0.1
 """Standard deviation [rad] of a joint's zero that was found from the data."""
-ELSEWHERE = "The stated frames are far from their registration; deviations count from the registered frames."
+ELSEWHERE = "The stated frames are far from their registration; deviations refer to the registered frames."
 
 
 @one_blas_thread
@@ -203,14 +203,17 @@ def calibrate(
 
 
 def ending(ended: Ended, most: int) -> str:
-    """Say how the loop ended within so many iterations, and why."""
+    """Return a sentence on how the loop ended and why."""
     state = ended.state
     iterations = counted(len(state.history), "iteration")
     if not ended.settled:
-        what = "the positions that constraints bound still change; give a larger weight"
+        what = "the predicted positions in the constraints still change; use a larger weight"
         return f"Not converged: after {ROUNDS} rounds {what}."
     if ended.converged and ended.rounds > 1:
-        return f"Converged after {iterations} in {ended.rounds} rounds, positions linear about the solution."
+        return (
+            f"Converged after {iterations} in {ended.rounds} rounds; positions in the constraints are "
+            "linearized at the solution."
+        )
     if ended.converged:
         text = f"Converged after {iterations}."
         if state.choice.weight == 0 and np.abs(state.z).max(initial=0.0) > FAR:
@@ -220,13 +223,13 @@ def ending(ended: Ended, most: int) -> str:
         decrease = ended.certificate.decrease
         why = f"the constraints are violated by {ended.certificate.violation:.1g} scales."
         if decrease is None:
-            why = "the convex program at the end could not be solved again, so that the solution is not certified."
+            why = "the final convex program could not be solved again, so the solution is not certified."
         elif decrease > DECREASE:
-            why = f"the convex program at the end still predicts a decrease by {decrease:.1g} of the objective."
+            why = f"the final convex program still predicts a decrease by {decrease:.1g} of the objective."
     elif state.outcome == "stuck":
         why = (
-            "no step lowers the nonlinear objective, however short; the formulation may have no minimum here, or the "
-            "start is far away."
+            "no step, however short, decreases the nonlinear objective; the formulation may have no minimum "
+            "here, or the start is far from it."
         )
     else:
         why = f"{counted(most, 'iteration')} {'was' if most == 1 else 'were'} not enough"
@@ -241,7 +244,7 @@ def ending(ended: Ended, most: int) -> str:
 
 
 def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:
-    """Return a calibration of problems whose joints are mapped already, which says so."""
+    """Return a calibration of problems with estimated joint mappings, with notes on them."""
     return asked if mapping is None else partial(_mapped, mapping, asked)
 
 

@@ -1,4 +1,4 @@
-"""Lack of fit: what a calibration's residuals consist of, which effect the model lacks, and what to do."""
+"""Lack of fit: components of a calibration's residuals, missing effects, and remedies."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
 
 
 class Extension(NamedTuple):
-    """A model extension in words: the patterns that identify it, and what it is where it is missing, and present."""
+    """A model extension in words: its parameter patterns, and its description when missing and when present."""
 
     identify: tuple[str, ...]
     name: str
@@ -64,13 +64,13 @@ EXTENSIONS = {
     "gravity": Extension(("compliance?",), "gravity", "The arm bends under gravity"),
     "first harmonic": Extension(
         ("ecc_cos?", "ecc_sin?"),
-        "unevenly turning joints (eccentric encoders or gears)",
-        "Joints turn unevenly (eccentric encoders or gears)",
+        "eccentric encoders or gears (once a turn)",
+        "Encoders or gears of joints are eccentric (errors once a turn)",
     ),
     "second harmonic": Extension(
-        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints turn unevenly twice a turn"
+        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints have errors twice a turn"
     ),
-    "moments": Extension(("bend*",), "gravity on masses with other centres than assumed"),
+    "moments": Extension(("bend*",), "gravity on masses whose centres differ from the assumed ones"),
     SESSIONS: Extension(
         ("session_*",),
         "a registration that differs from session to session",
@@ -81,7 +81,7 @@ EXTENSIONS = {
 
 
 class Autocorrelation(NamedTuple):
-    """Correlation of the residuals of nearest configurations, and its z-score among permutations."""
+    """Autocorrelation of residuals of nearest configurations, and its z-score among permutations."""
 
     correlation: float
     z: float
@@ -89,7 +89,7 @@ class Autocorrelation(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class LackOfFit:
-    """What a calibration's residuals consist of, as RMS of vectors over the rows [m; rad or px without lengths].
+    """Components of a calibration's residuals, as RMS of vectors over the rows [m; rad or px without lengths].
 
     Parameters
     ----------
@@ -149,12 +149,12 @@ class LackOfFit:
 
     @property
     def correlated(self) -> bool:
-        """Whether neighbouring configurations err alike, beyond what chance does."""
+        """Whether residuals of neighbouring configurations are significantly correlated."""
         return self.alike is not None and self.alike.z > CORRELATED
 
     @property
     def alarming(self) -> bool:
-        """Whether the model is said to lack anything."""
+        """Whether a missing effect is reported."""
         return bool(self.missing or self.upward or self.correlated)
 
     def sentences(self) -> list[str]:
@@ -163,7 +163,7 @@ class LackOfFit:
         if not self.instrument:
             count = max(round(self.spare), 0)
             degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
-            return [f"{rms}; {degrees} too few to tell what it consists of. Measure more configurations."]
+            return [f"{rms}; {degrees} too few to separate its components. Measure more configurations."]
         parts = [f"measurement noise {_size(self, self.instrument)}"]
         if self.repeatable:
             parts.append(f"missing effects {_size(self, self.repeatable)}")
@@ -230,7 +230,7 @@ class LackOfFit:
 
 @one_blas_thread
 def lack_of_fit(result: Outcome) -> LackOfFit:
-    """Return what a calibration's residuals consist of.
+    """Return the components of a calibration's residuals.
 
     The evidence of model extensions is computed at the linearization of the result, whatever its weight; of large data
     at most 1000 configurations are looked at, and outlying rows are left out.
@@ -289,7 +289,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
 
 
 def judged(result: Outcome) -> LackOfFit | None:
-    """Return `lack_of_fit`, or None for a calibration that did not converge, or whose equations are no numbers."""
+    """Return `lack_of_fit`; None for a calibration that did not converge or has non-finite equations."""
     if not result.converged:
         return None
     try:
@@ -299,7 +299,7 @@ def judged(result: Outcome) -> LackOfFit | None:
 
 
 def foreseen(problem: Source) -> LackOfFit | None:
-    """Return what a quick fit of the geometry would leave, of at most 60 configurations; None where none succeeds."""
+    """Return the lack of fit of a quick fit of the geometry to at most 60 configurations; None if it fails."""
     try:
         return judged(calibrate(sampled(problem, QUICK), tikhonov, reml))
     except (InputError, NoSolutionFound, np.linalg.LinAlgError):
@@ -425,13 +425,13 @@ def _size(found: LackOfFit, value: float) -> str:
 def _limit(found: LackOfFit) -> list[str]:
     """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
     if found.correlated and found.alike is not None:
-        even = "Even then residuals" if found.missing else "Residuals"
+        even = "Even then, residuals" if found.missing else "Residuals"
         return [
             f"{even} of neighbouring configurations are correlated ({found.alike.correlation:.2f}, z = "
-            f"{found.alike.z:.0f}): the model lacks an effect, which more readings will not average away."
+            f"{found.alike.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
         ]
     if found.robot > GROSS * found.instrument:
-        return ["No robot repeats so badly: look for wrong units, signs, frames or rows first (`inspect`)."]
+        return ["No robot has such poor repeatability: check units, signs, frames and rows first (`inspect`)."]
     if found.robot > ROUGH * found.instrument:
         limit = "The robot, not the instrument, limits the result"
         if found.repeated is not None and found.excess:
@@ -443,7 +443,7 @@ def _limit(found: LackOfFit) -> list[str]:
             "configurations, approached from both sides, before a better instrument is bought."
         ]
     if found.overstated:
-        return ["Repeat one reading ten times, and state its standard deviation as the measurement noise."]
+        return ["Repeat one reading ten times and state its standard deviation as the measurement noise."]
     if found.robot < FINE * found.instrument:
         return ["The instrument limits the result: only a more accurate one would show the robot's repeatability."]
     return []

@@ -1,4 +1,4 @@
-"""Influence of every configuration on the parameters, and the expected improvement of the robot by all of them."""
+"""Influence of every configuration on the parameters, and the expected improvement of the robot."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ BALANCED = 1e-4
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Influence(Tabled):
-    """What C configurations do to n parameters.
+    """Influence of C configurations on n parameters.
 
     Parameters
     ----------
@@ -112,7 +112,7 @@ class Influence(Tabled):
 
 @one_blas_thread  # small matrices: threads would wait for each other longer than they compute
 def influence(result: Outcome) -> Influence:
-    """Return what leaving out every configuration would do to every parameter.
+    """Return the change of every parameter when one configuration is left out.
 
     At the solution z the data's equations A z ~ b with their weights W and the penalty w |L z - c|^2 have the
     information H = A'WA + w L'L. Without configuration k, whose weighted equations are A_k and residuals r_k,
@@ -247,7 +247,7 @@ WORTH = 0.9
 
 @dataclass(frozen=True)
 class Improvement:
-    """Position errors of the flange [m] that are expected over the joint ranges, base and tool fitted.
+    """Expected position errors of the flange [m] over the joint ranges, with base and tool fitted.
 
     Parameters
     ----------
@@ -263,12 +263,12 @@ class Improvement:
 
     @property
     def improves(self) -> bool:
-        """Whether identified parameters are expected to be clearly better than the nominal ones."""
+        """Whether the identified parameters are expected to be significantly better than the nominal ones."""
         return self.after < WORTH * self.before
 
 
 def improvement(result: Outcome) -> Improvement | None:
-    """Return the expected position errors of the flange, nominal and identified; None where nothing tells them.
+    """Return the expected position errors of the flange, nominal and identified; None if undetermined.
 
     With the deviations x, D their slopes of W positions over the joint ranges less what fitting base and tool anew
     takes back, N the covariance of x by noise and B the mean square of what the penalty holds back::

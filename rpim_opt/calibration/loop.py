@@ -1,4 +1,4 @@
-"""The outer loop: linearize, choose the weight, solve, step or damp, until the convex program promises no decrease."""
+"""The outer loop: linearize, choose the weight, solve, step or damp, until no decrease is predicted."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ class Iteration:
 
 @dataclass(frozen=True)
 class Options:
-    """How a calibration is solved; the arguments of `calibrate`."""
+    """Options of the loop, from the arguments of `calibrate`."""
 
     max_iterations: int = 500
     tolerance: float = 1e-8
@@ -114,7 +114,7 @@ class Options:
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the loop is: the program linearized at z (n,) [scales], the weight, and the nonlinear objective there.
+    """State of the loop: the program linearized at z (n,) [scales], the weight, and the nonlinear objective.
 
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2; ``idle``
     and ``refused`` count iterations in a row that promised, and steps that lowered, nothing. ``outcome`` says why the
@@ -135,19 +135,19 @@ class State:
     outcome: str = ""
 
     def weighted(self, choice: WeightChoice) -> State:
-        """Return the state with a weight; the objective follows it."""
+        """Return the state with another weight and its objective."""
         if choice.weight == self.choice.weight:
             return replace(self, choice=choice)
         return replace(self, choice=choice, merit=merit(self.program, self.z, choice.weight))
 
     def relative(self, length: float) -> float:
-        """Return a length over that of the solution."""
+        """Return a length relative to that of the solution."""
         return length / (1 + float(np.linalg.norm(self.z)))
 
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """What stays the same: the measurements, the formulation, and about which x predicted positions are linear."""
+    """Constants of the loop: the measurements, the formulation, and the linearization point of predicted positions."""
 
     source: Source
     formulation: Formulation
@@ -170,7 +170,7 @@ class Loop:
     # --- the weight ------------------------------------------------------------------------------------------
 
     def chosen(self, state: State) -> State:
-        """Ask the rule for the weight, unless it is settled."""
+        """Return the state with the weight that the rule selects, unless the weight is final."""
         choice = state.choice
         if choice.settled:
             return state
@@ -181,7 +181,7 @@ class Loop:
         return state.weighted(choice)
 
     def confirmed(self, state: State) -> State:
-        """Ask the rule once more where the loop is at rest: a weight is chosen when it is its own answer."""
+        """Apply the rule once more at convergence: a weight is final if the rule selects it again."""
         if state.outcome != "rest" or state.choice.final:
             return state
         choice = state.choice.confirmed(self._judged(state))
@@ -190,7 +190,7 @@ class Loop:
         return replace(state.weighted(choice), idle=0, outcome="")
 
     def answered(self, state: State) -> State:
-        """Ask a rule that was not asked yet."""
+        """Apply a rule that was not applied yet."""
         if state.choice.final or state.choice.answers:
             return state
         return state.weighted(replace(state.choice, settled=False).asked(self._judged(state)))
@@ -208,7 +208,7 @@ class Loop:
     # --- one step --------------------------------------------------------------------------------------------
 
     def advanced(self, state: State) -> State:
-        """Solve the convex program at z; rest where it promises nothing, else step to its minimum, or damp."""
+        """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
         # the first linearization is good for a rough minimum, unless that promises too little to judge by
         rough = 0.0 if state.history or state.refused or self.options.solver else FIRST_ACCURACY
         straight = self._solved(state.program, state, rough)
@@ -327,7 +327,7 @@ class Loop:
 
 
 def merit(program: Program, z: Array, weight: float) -> float:
-    """Return the nonlinear objective at the z (n,) of a linearization, and what missing ``largest`` costs."""
+    """Return the nonlinear objective at the z (n,) of a linearization, and the penalty for violating ``largest``."""
     objective = program.objective(z, weight)
     excess = program.excess(z)
     if excess == 0:
@@ -340,7 +340,7 @@ def merit(program: Program, z: Array, weight: float) -> float:
 
 @dataclass(frozen=True, eq=False)
 class Ended:
-    """Where the loop ended, deviations x (n,) [SI] there, and the evidence that this is a solution."""
+    """Final state of the loop, deviations x (n,) [SI], and the optimality certificate."""
 
     state: State
     x: Array
@@ -350,14 +350,14 @@ class Ended:
 
     @property
     def converged(self) -> bool:
-        """Whether the loop is at rest at a solution that the certificate confirms."""
+        """Whether the loop converged to a solution that the certificate confirms."""
         return self.settled and self.state.outcome == "rest" and self.certificate.holds(self.state.z)
 
 
 def minimize(
     problem: Source, formulation: Formulation, weight: float | str | Selector, start: Array | None, options: Options
 ) -> Ended:
-    """Run the loop from deviations ``start`` (n,) [SI], and certify its end.
+    """Run the loop from deviations ``start`` (n,) [SI], and certify the result.
 
     Positions that constraints bound are linear about a point: then it runs again about its solution until they are
     those of the solution. Where solutions jump to and fro, the next round linearizes between them.
@@ -386,7 +386,7 @@ def minimize(
 
 
 def nearby(problem: Source, formulation: Formulation, start: Array, steps: int) -> Array:
-    """Return deviations (n,) [SI] near a minimum at weight 1, or on the way to it: nothing certifies them."""
+    """Return deviations (n,) [SI] at or near a minimum at weight 1, without a certificate."""
     loop, state = _rested(problem, formulation, 1.0, start, Options(steps, ROUGH_TOLERANCE))
     return loop.scale * state.z
 
@@ -442,7 +442,7 @@ def _rested(
 
 
 def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Array | None) -> State:
-    """Return the state before the first iteration, at a point that meets the constraints."""
+    """Return the initial state, at a feasible point."""
     free = loop.source.parameters.free
     x = np.zeros(len(loop.scale))
     if start is not None:
@@ -469,7 +469,7 @@ def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Arr
 
 
 def require_start(start: Array, count: int) -> Array:
-    """Return deviations (n,) to begin with, or refuse them."""
+    """Return the checked start (n,) of the deviations."""
     accepted = f"{count} deviations, finite, one a parameter"
     try:
         x = np.asarray(start, dtype=float)
@@ -483,7 +483,7 @@ def require_start(start: Array, count: int) -> Array:
 
 
 def require_finite(*arrays: Array) -> None:
-    """Refuse residuals or slopes that are no numbers."""
+    """Refuse non-finite residuals or derivatives."""
     if not all(np.isfinite(values).all() for values in arrays):
         raise InputError("data", "non-finite residuals or derivatives", "measurements and a model that are")
 

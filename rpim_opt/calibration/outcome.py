@@ -1,4 +1,4 @@
-"""What a calibration found, in numbers: parameters, errors, what the fit rests on, and how certain it is."""
+"""Numerical results of a calibration: parameters, errors, uncertainty, and diagnostics."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class Prediction(NamedTuple):
 
 
 class Kept(NamedTuple):
-    """What the functions of a script said of a result, in whose file they are not.
+    """Values of a script's functions, which a result file cannot hold.
 
     Active bounds; the equations that a robust loss keeps (None where there were none), the weight that it gives to
     them, and the numbers of those that it left out; what statements of a drawing cost.
@@ -105,7 +105,7 @@ class Kept(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Outcome:
-    """The numbers of a `Calibration`, which puts them into words; its fields are described there."""
+    """The numerical part of a `Calibration`, which documents the fields."""
 
     problem: Source
     formulation: Formulation
@@ -133,7 +133,7 @@ class Outcome:
 
     @property
     def robot(self) -> Robot:
-        """The robot with its identified MDH parameters; gears and compliances are no part of it.
+        """The robot with its identified MDH parameters, without gear errors and compliances.
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
@@ -206,7 +206,7 @@ class Outcome:
         columns: Mapping[str, Array] = MappingProxyType({}),
         robot: str = "",
     ) -> Prediction:
-        """Return the positions that a reflector will have, with their uncertainty; arguments as for `forward`.
+        """Return predicted positions of a reflector with their uncertainty; arguments as for `forward`.
 
         Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u
         (`Uncertainty.predict` takes the coverage factor of a confidence instead): with ``of`` ``"mean"`` of what the
@@ -241,19 +241,19 @@ class Outcome:
         return Prediction(problem.modelled(self.x)[0], covariance, COVERAGE_FACTOR, self.outside(problem.data), freedom)
 
     def outside(self, data: Dataset) -> Outside:
-        """Return which rows are beyond the measured joint ranges, where no measurement checked the model."""
+        """Return which rows are outside the measured joint ranges, where the model extrapolates."""
         return diagnosis.outside(self.ranges, data)
 
     @cached_property
     def ranges(self) -> Mapping[str, Array]:
-        """The measured range of every joint (2, dof) [rad or m], by robot, that of earlier calibrations included."""
+        """The measured range of every joint (2, dof) [rad or m], by robot, including earlier calibrations."""
         earlier = [(robot, np.array(r)) for each in self.record.earlier for robot, r in each.ranges.items()]
         return diagnosis.widest([*diagnosis.measured_ranges(self.problem).items(), *earlier])
 
     # --- errors ------------------------------------------------------------------------------------------------
 
     def error_vectors(self, data: Dataset | None = None, nominal: bool = False) -> Array:
-        """Return measured minus modelled position of every row, (N, 3) [m]; NaN where no position was measured.
+        """Return measured minus modelled position of every row, (N, 3) [m]; NaN without a measured position.
 
         Of the identification data by default; ``nominal``: of the nominal robot, as in `nominal_errors`.
         """
@@ -265,7 +265,7 @@ class Outcome:
         return np.concatenate([error_vectors(part, x) for part in source.rows()])
 
     def measured_positions(self, data: Dataset | None = None) -> Array:
-        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured."""
+        """Return the measured position of every row, (N, 3) [m]; the modelled one where none was measured."""
         source = self.problem
         if data is not None:
             source = source.on(data)
@@ -299,7 +299,7 @@ class Outcome:
         return source.errors(self.x, dimension)
 
     def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
-        """Return the error of every row with the nominal robot, (N,) [m]; arguments as for `errors`.
+        """Return the error of every row for the nominal robot, (N,) [m]; arguments as for `errors`.
 
         Frames (base, reflectors, anchors, ...) that the calibration identifies are fitted to the identification data
         first: before that they say nothing about the robot.
@@ -316,7 +316,7 @@ class Outcome:
 
     @cached_property
     def stated(self) -> Source:
-        """The problem as it was stated: without estimated scales, noise and model extensions."""
+        """The original problem, without estimated scales, noise and model extensions."""
         learned = self.learned
         if learned is None:
             return self.problem
@@ -341,12 +341,12 @@ class Outcome:
 
     @property
     def squared_loss(self) -> bool:
-        """Whether the loss that was asked for is a square; QR factors may have stood for another one."""
+        """Whether the requested loss is quadratic, even if blocks were solved with other squares."""
         return self.program.formulation is self.formulation and self.program.loss_form is not None
 
     @property
     def linear_penalty(self) -> bool:
-        """Whether the penalty is quadratic, or there is none: the estimate is then linear in the data."""
+        """Whether there is no penalty or a quadratic one, so that the estimate is linear in the data."""
         return self.program.linear_penalty
 
     @cached_property
@@ -369,12 +369,12 @@ class Outcome:
 
     @cached_property
     def linear(self) -> LinearModel:
-        """The last linearization, of the rows that a robust loss keeps (`Program.trusted`)."""
+        """The final linearization, of the rows that a robust loss keeps (`Program.trusted`)."""
         return self._squares[0]
 
     @cached_property
     def spread(self) -> Spread:
-        """What the uncertainty rests on: the equations that the fit keeps, and its penalty.
+        """The basis of the uncertainty: the equations that the fit keeps, and its penalty.
 
         Raises
         ------
@@ -394,13 +394,13 @@ class Outcome:
 
     @property
     def variance_factor(self) -> float:
-        """The noise's variance over the stated one, where it is larger than chance would have it, and otherwise 1."""
+        """Ratio of the noise variance to the stated one if significantly larger, otherwise 1."""
         if not self.linear_penalty or self.noise_test().probability >= UNLIKELY:
             return 1.0
         return max(self.spread.noise_variance, 1.0)
 
     def noise_test(self) -> NoiseTest:
-        """Compare the residuals with the instrument's stated noise.
+        """Test the residuals against the stated measurement noise.
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
@@ -417,7 +417,7 @@ class Outcome:
 
     @property
     def freedom(self) -> float:
-        """Degrees of freedom of the noise: estimated with it, or what equations are left over, m - sum f."""
+        """Degrees of freedom of the noise: those of its estimate, or the residual ones, m - sum f."""
         if self.learned is not None:
             return self.learned.freedom
         return max(self.spread.spare, 0.0)
@@ -441,7 +441,7 @@ class Outcome:
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:
-        """Outlying rows, the worst first: those beyond `trust.outlying`, with the noise that the other rows show.
+        """Outliers, the worst first: rows above `trust.outlying` for the noise that the other rows show.
 
         After a robust loss those of them that a fit without them contradicts, because it may sacrifice half of few rows
         to the other half. After a squared loss outliers may hide behind each other: a robust loss finds them.
@@ -468,7 +468,7 @@ class Outcome:
 
     @cached_property
     def kept_together(self) -> tuple[str, ...]:
-        """Labels of flagged rows that err together with their neighbours in joint space or in time.
+        """Labels of flagged rows whose errors are correlated with those of neighbours in joint space or time.
 
         They are no outliers: the model lacks something there, or the set-up moved. `without_flagged` keeps them.
         """
@@ -489,19 +489,19 @@ class Outcome:
         return [*before, *(flag.label for flag in self.flagged)]
 
     def without_flagged(self) -> Self:
-        """Return the calibration without the flagged rows, asked as this one was: formulation, selector, solver.
+        """Return the calibration without the flagged rows, with the same formulation, selector and solver.
 
         Rows that are `kept_together` stay: without them the robot would be extrapolated where the model fails.
         """
         out = [flag for flag in self.flagged if flag.label not in self.kept_together]
         kept = self.stated.without({flag.label for flag in out})
-        reasons = {f.label: f"outlier, {f.sigmas:.0f} sigmas, {f.error_mm:.2f} mm" for f in out}
+        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in out}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.asked(kept), record=record)
 
     @cached_property
     def held(self) -> tuple[Held, ...]:
-        """The parameters at an active bound, the costliest first.
+        """The parameters at an active bound, the largest multiplier first.
 
         ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
         the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong data, or a
@@ -513,7 +513,7 @@ class Outcome:
 
     @cached_property
     def prices(self) -> tuple[Price, ...]:
-        """What the statements of a drawing (`constraints.parse`) cost, in their order; empty where there are none.
+        """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none.
 
         >>> import cvxpy as cp
         >>> import rpim_opt as ro
@@ -530,7 +530,7 @@ class Outcome:
 
     @cached_property
     def held_back(self) -> tuple[str, ...]:
-        """Names of the parameters at an active bound, or of an active statement of a drawing."""
+        """Names of the parameters at an active bound or in an active textual constraint."""
         names = [held.name for held in self.held]
         holding = {price.text for price in self.prices if price.holds}
         for constraint in self.formulation.constraints:

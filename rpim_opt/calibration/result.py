@@ -1,4 +1,4 @@
-"""The result of a calibration: what was asked, the numbers of it, its verdict, and all of it in words."""
+"""The result of a calibration: its settings, numbers and verdict, and their presentation as text."""
 
 from __future__ import annotations
 
@@ -67,23 +67,23 @@ class Calibration(Outcome):
 
     @cached_property
     def verdict(self) -> Verdict:
-        """Whether this robot is delivered, and if not, why: exports, exit codes and reports follow it."""
+        """Whether this robot is delivered, and the reasons if not; exports, exit codes and reports follow it."""
         return judge(self, mistakes(self.causes))
 
     @cached_property
     def causes(self) -> tuple[str, ...]:
-        """What a bad fit likely comes from, a sentence each (`likely_causes`)."""
+        """Likely causes of a poor fit, one sentence each (`likely_causes`)."""
         if self.known_causes is not None:
             return self.known_causes
         return tuple(likely_causes(self))
 
     @property
     def selector(self) -> str:
-        """Name of the rule that chose the weight, ``given`` for a number, ``none`` where there is no penalty."""
+        """Name of the rule that chose the weight; ``given`` for a number, ``none`` without a penalty."""
         return words.selector(self)
 
     def weight_sentence(self) -> str:
-        """Say the weight and where it came from.
+        """Return a sentence on the weight and its origin.
 
         >>> import rpim_opt as ro
         >>> print(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).weight_sentence())
@@ -99,7 +99,7 @@ class Calibration(Outcome):
         return words.parameter_rows(self)
 
     def to_frame(self, what: str = "parameters") -> Any:
-        """Return one of its tables as a data frame (pandas, or polars where that is missing).
+        """Return one of the result's tables as a data frame (pandas, or polars if pandas is not installed).
 
         Parameters
         ----------

@@ -1,4 +1,4 @@
-"""How certain the identified parameters and the positions they predict are."""
+"""Uncertainty of identified parameters and of predicted positions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from rpim_opt.robot.terms import transmission
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Uncertainty(Tabled):
-    """The uncertainty of a calibration, by the law of propagation (JCGM 100) on its last linearization.
+    """Uncertainty of a calibration by the law of propagation (JCGM 100) at its final linearization.
 
     With A = U diag(s) V' whitened and scaled, weight w and the noise level sigma::
 
@@ -75,16 +75,16 @@ class Uncertainty(Tabled):
 
     @property
     def coverage_factor(self) -> float:
-        """Quantile k of Student's t at (1 + confidence) / 2, with the noise's degrees of freedom, at least one."""
+        """Coverage factor k, the Student-t quantile at (1 + confidence) / 2 with at least one degree of freedom."""
         return float(coverage_factor(self.result.freedom, self.confidence))
 
     def intervals(self) -> Array:
-        """Return lower and upper ends (n, 2) [SI] of the deviations' intervals."""
+        """Return the lower and upper limits (n, 2) [SI] of the deviations' intervals."""
         half = self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
         return np.column_stack([self.result.x - half, self.result.x + half])
 
     def predict(self, q: Array, marker: str = "", **arguments: Any) -> Prediction:
-        """Return what `Calibration.predict` does, with the confidence's coverage factor; arguments as for it.
+        """Return `Calibration.predict` with the coverage factor of this confidence; same arguments.
 
         The factor is larger for readings of an unknown session, where few sessions told how far they lie apart.
 
@@ -126,12 +126,12 @@ class Uncertainty(Tabled):
             f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
         ]
         if any(row["held_back"] for row in self._frame_rows()):
-            lines.append("Held back at an active bound or by a constraint: the interval is conditional on it.")
+            lines.append("At an active bound or constraint: the interval is conditional on it.")
         return lines
 
 
 def known_covariance(result: Outcome) -> Array | None:
-    """Return the covariance (n, n) [SI] of the deviations; None for a penalty or loss that has none."""
+    """Return the covariance (n, n) [SI] of the deviations; None for a penalty or loss without one."""
     try:
         return result.covariance
     except InputError:
@@ -139,7 +139,7 @@ def known_covariance(result: Outcome) -> Array | None:
 
 
 def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dict[str, Array]:
-    """Return what contributes to u^2 (N,) [m^2] of the positions reached at q (N, dof), over all axes; they add up."""
+    """Return the contributions to u^2 (N,) [m^2] of the positions reached at q (N, dof), summed over all axes."""
     spread = result.spread
     there = result.problem.sample().measuring(q, position, marker, covariance=position_noise(result.problem))
     J = there.jacobian(result.x).reshape(len(q), 3, -1)
@@ -155,7 +155,7 @@ def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dic
 
 
 class TransmissionError(NamedTuple):
-    """What a joint (from 1) turns further than its values ``q`` (K,), and its standard uncertainty [rad].
+    """Transmission error of a joint (from 1) at values ``q`` (K,), and its standard uncertainty [rad].
 
     ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS of what the error moves in the
     measured lengths [m].
@@ -170,7 +170,7 @@ class TransmissionError(NamedTuple):
 
     @property
     def inside(self) -> np.ndarray:
-        """(K,) which values are within those measured."""
+        """Which values (K,) are within the measured range."""
         return (self.q >= self.measured[0]) & (self.q <= self.measured[1])
 
     @property
@@ -180,7 +180,7 @@ class TransmissionError(NamedTuple):
 
 
 def transmission_errors(result: Outcome) -> list[TransmissionError]:
-    """Return the curves of the joints, four values a period of the finest harmonic; none where none were admitted."""
+    """Return the transmission errors of the joints, with four values a period of the finest harmonic; empty if none."""
     free = result.problem.parameters.free
     if not free.of_curves.any():
         return []
@@ -211,7 +211,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
 
 
 def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
-    """Return deviations (draws, n) [SI] identified from data drawn anew around the fit, noise at the observed level.
+    """Return deviations (draws, n) [SI] identified from data simulated at the fit with noise of the observed level.
 
     The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
     with `Spread.noise`. Every draw solves the linearized program at the same weight.

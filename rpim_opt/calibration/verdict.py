@@ -65,7 +65,7 @@ class Verdict:
 
     @property
     def delivered(self) -> bool:
-        """Whether nothing speaks against it."""
+        """Whether there is no reason against delivery."""
         return not self.reasons
 
     def __str__(self) -> str:
@@ -73,11 +73,11 @@ class Verdict:
         return " ".join(["Delivered." if self.delivered else "Not delivered.", *self.reasons])
 
     def beside(self, causes: Sequence[str]) -> list[str]:
-        """Return the likely causes that the reasons do not say already."""
+        """Return the likely causes that the reasons do not already mention."""
         return [text for text in causes if text not in self.reasons and not (self.reasons and text.startswith(BAD))]
 
     def require(self, forced: bool = False) -> str:
-        """Return the note that goes with a robot that is used in spite of its verdict; empty where it is delivered.
+        """Return the note for a robot used despite its verdict, empty if it is delivered; otherwise raise NotDelivered.
 
         Raises
         ------
@@ -88,12 +88,14 @@ class Verdict:
             return ""
         if not forced:
             found = f"not delivered: {' '.join(self.reasons)}".rstrip(".")
-            raise NotDelivered("the calibration", found, "a delivered one, or --despite-verdict (despite_verdict=True)")
-        return f"Written in spite of the verdict. {self}"
+            raise NotDelivered(
+                "the calibration", found, "a delivered calibration, or --despite-verdict (despite_verdict=True)"
+            )
+        return f"Written despite the verdict. {self}"
 
 
 def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
-    """Return the verdict on a calibration, with likely mistakes in its data, a sentence each.
+    """Return the verdict on a calibration, with likely input mistakes, one sentence each.
 
     Not delivered is a robot whose fit did not converge; whose residuals without outliers are beyond 3 times the stated
     noise and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors
@@ -110,7 +112,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 
 def kept_rows(result: Outcome) -> np.ndarray:
-    """Return which rows (N,) are no outliers: neither excluded before the fit nor flagged after a robust loss."""
+    """Return which rows (N,) are not outliers: neither excluded before the fit nor flagged after a robust fit."""
     labels: set[str] = set()
     if result.learned is not None:
         labels |= {row.label for row in result.learned.left_out}
@@ -120,7 +122,7 @@ def kept_rows(result: Outcome) -> np.ndarray:
 
 
 def noise_ratio(problem: Source, errors: Array, dimension: str = "length") -> float:
-    """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 where none of the dimension was measured."""
+    """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 if the dimension was not measured."""
     variance = stated_variance(problem, dimension)
     of = np.isfinite(errors) & (variance > 0)
     if not of.any():
@@ -129,7 +131,7 @@ def noise_ratio(problem: Source, errors: Array, dimension: str = "length") -> fl
 
 
 def stated_variance(problem: Source, dimension: str) -> Array:
-    """Return the variance of the stated noise of every row (N,) [SI], zero where it measures none of the dimension."""
+    """Return the stated noise variance of every row (N,) [SI]; zero if the row does not measure the dimension."""
     variance = np.zeros(len(problem.labels))
     start = 0
     for part in problem.rows():
@@ -141,13 +143,13 @@ def stated_variance(problem: Source, dimension: str) -> Array:
 
 
 def rms(errors: Array) -> float:
-    """Return the root mean square of errors that are numbers; 0 where there is none."""
+    """Return the root mean square of the finite errors; 0 if there are none."""
     finite = errors[np.isfinite(errors)]
     return float(np.sqrt(np.mean(finite**2))) if len(finite) else 0.0
 
 
 def worse_than_nominal(nominal: Array, identified: Array) -> bool:
-    """Whether errors (N,) of the identified robot are larger than those of the nominal one, beyond chance.
+    """Whether errors (N,) of the identified robot are significantly larger than those of the nominal one.
 
     By the mean difference of the squares, row by row, over its standard error.
     """
@@ -160,9 +162,9 @@ def worse_than_nominal(nominal: Array, identified: Array) -> bool:
 
 
 def worse_sentence(nominal: Array, identified: Array) -> str:
-    """Say by how much errors (N,) [m] on held-out rows are larger than the nominal robot's."""
+    """Return a sentence comparing errors (N,) [m] on held-out rows with those of the nominal robot."""
     return (
-        f"Errors on {len(nominal)} held-out rows are larger than the nominal robot's: RMS "
+        f"Errors on {len(nominal)} held-out rows are larger than those of the nominal robot: RMS "
         f"{three_digits(1e3 * rms(identified))} mm against {three_digits(1e3 * rms(nominal))} mm."
     )
 
@@ -236,7 +238,7 @@ def _deviations(result: Outcome) -> Iterator[str]:
         said = f"{said}: no robot is machined worse than {1e3 * largest:g} {unit}."
         worst = max(worst, (float(abs(x)) / largest, said))
     if worst[1]:
-        yield f"{worst[1]} Check the order (exchanged names), signs and units of the joint columns, and the DH table."
+        yield f"{worst[1]} Check the order, signs and units of the joint columns, and the DH table."
 
 
 def _worse(result: Outcome) -> Iterator[str]:
@@ -244,9 +246,9 @@ def _worse(result: Outcome) -> Iterator[str]:
     nominal, identified = result.nominal_errors(), result.errors()
     if worse_than_nominal(nominal, identified):
         yield (
-            f"Errors on the identification rows are larger than the nominal robot's: RMS "
+            f"Errors on the identification rows are larger than those of the nominal robot: RMS "
             f"{three_digits(1e3 * rms(identified))} mm against "
-            f"{three_digits(1e3 * rms(nominal))} mm: too large a weight."
+            f"{three_digits(1e3 * rms(nominal))} mm: the weight is too large."
         )
     held, validation = result.record.held_out, result.record.validation
     if held is not None:
@@ -275,11 +277,11 @@ def _computed(result: Outcome) -> Iterator[str]:
         rounding.append(0.0 if decimals is None else 1e-3 * 10.0**-decimals * np.sqrt(len(lengths) / 12))
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
         yield (
-            f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, far below the stated noise: they look "
-            "computed from it, not measured."
+            f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, far below the stated noise: the "
+            "data seem to be computed from this robot, not measured."
         )
     elif min(rounding) > 0 and nominal < ROUNDED * max(rounding):
         yield (
-            f"The nominal robot misses the data by {1e3 * nominal:.2g} mm RMS, no more than their rounding: they look "
-            "computed from it, or have too few decimals to calibrate it."
+            f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, no more than the rounding of the "
+            "data: they seem to be computed from this robot, or have too few decimals."
         )

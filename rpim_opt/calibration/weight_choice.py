@@ -1,4 +1,4 @@
-"""The weight while the loop goes on: a number, or what a rule answers until it answers the same."""
+"""Choice of the weight during the loop: a number, or a selection rule applied until its result repeats."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MOST_ANSWERS = 10
 
 @dataclass(frozen=True, eq=False)
 class WeightChoice:
-    """The weight of an iteration, and what is known of its choice.
+    """The weight of an iteration, and how it was chosen.
 
     ``rule`` is None for a number; ``answers`` are all of its answers in turn, ``selection`` the last one.
     ``settled``: the weight stays while the loop comes to rest; ``final``: for good. ``robust``: the loss is a sum over
@@ -44,7 +44,7 @@ class WeightChoice:
     robust: bool = False
 
     def asked(self, program: Program) -> WeightChoice:
-        """Return what the rule makes of a program, unless the weight is settled."""
+        """Return the choice of the rule for a program, unless the weight is final."""
         if self.settled or self.rule is None:
             return self
         with phase("selection"):
@@ -61,13 +61,13 @@ class WeightChoice:
         return chosen._checked()
 
     def after(self, step: float) -> WeightChoice:
-        """Return the choice after a step of that length, relative to the solution."""
+        """Return the choice after a step of that relative length."""
         if self.settled or step > SETTLED:
             return self
         return replace(self, settled=True)
 
     def confirmed(self, program: Program) -> WeightChoice:
-        """Return the choice after the rule was asked about the program at the end: final, or another weight."""
+        """Return the choice after applying the rule to the final program: final, or another weight."""
         if self.final:
             return self
         again = replace(self, settled=False).asked(program)
@@ -123,7 +123,7 @@ def _same(one: float, other: float, apart: float = SAME) -> bool:
 
 
 def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoice:
-    """Return how a weight is to be found: a number, a selector, or a ready selector's name; or refuse it."""
+    """Return the choice for a number, a selector, or the name of a ready selector; refuse anything else."""
     weight = weight_of(weight)
     if callable(weight):
         return WeightChoice(weight, settled=not penalized, final=not penalized)

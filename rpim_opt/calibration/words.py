@@ -1,4 +1,4 @@
-"""A calibration in words: its parameters as a table, its weight or hyperparameters, and remarks."""
+"""Text of a calibration: the parameter table, the weight or hyperparameters, and remarks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from rpim_opt.robot.extensions import EXPECTED
 from rpim_opt.robot.parameter_names import EXPANSION, is_joint_offset, of_session, own_name
 
 MOST_ROWS, MOST_BOUNDS = 8, 5
-"""Outlying rows and active bounds that are named one by one."""
+"""Number of outliers and active bounds named individually."""
 LAST_DIGIT = 1e-4
 """What tables of parameters show [mm, degree]."""
 REPEATABILITY = {
@@ -68,7 +68,7 @@ def parameter_rows(result: Outcome) -> list[dict[str, Any]]:
 
 
 def turned_frames(result: Outcome) -> list[str]:
-    """Say where a deviation is not the difference of the columns beside it: turns of a frame are composed."""
+    """Return a note on frames whose deviation is a composed rotation, not a difference of the columns."""
     names = [
         row["name"]
         for row in parameter_rows(result)
@@ -76,7 +76,7 @@ def turned_frames(result: Outcome) -> list[str]:
     ]
     if not names:
         return []
-    turn = "the turn from the nominal frame about the axes of the one before it, no difference of the angles"
+    turn = "the rotation from the nominal frame about the axes of its parent, not a difference of the angles"
     return [f"Deviations of {listed(names)}: {turn}."]
 
 
@@ -111,7 +111,7 @@ def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
 
 
 def sentences(result: Outcome, verdict: Verdict) -> list[str]:
-    """Return what stands below the table: errors, the verdict's reasons, weight, noise and remarks."""
+    """Return the sentences below the table: errors, reasons of the verdict, weight, noise and remarks."""
     before = 1e3 * np.nanmean(result.nominal_errors())
     after = 1e3 * np.nanmean(result.errors())
     errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
@@ -120,7 +120,7 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
 
 
 def noise_sentence(result: Outcome) -> list[str]:
-    """Say how the residuals compare with the stated measurement noise; nothing where there is no covariance."""
+    """Return the noise test as a sentence; empty without a covariance."""
     try:
         return [result.noise_test().verdict]
     except InputError:  # no freedom: a penalty that is no prior, or a loss that no squared one stands for
@@ -128,7 +128,7 @@ def noise_sentence(result: Outcome) -> list[str]:
 
 
 def selector(result: Outcome) -> str:
-    """Return the rule's name: ``learned`` sizes, ``given`` for a number, ``none`` without a penalty."""
+    """Return the name of the rule: ``learned`` (prior scales), ``given`` for a number, ``none`` without a penalty."""
     if result.formulation.penalty is None:
         return "none"
     if result.record.earlier:
@@ -141,7 +141,7 @@ def selector(result: Outcome) -> str:
 
 
 def weight_lines(result: Outcome) -> list[str]:
-    """Say the weight and where it came from, or the hyperparameters in its place: a few sentences."""
+    """Return sentences on the weight and its origin, or on the hyperparameters."""
     name = result.formulation.name
     if result.record.earlier:
         last = result.record.earlier[-1]
@@ -164,7 +164,7 @@ def weight_lines(result: Outcome) -> list[str]:
 
 
 def remarks(result: Outcome) -> list[str]:
-    """Say what a reader must know besides the figures: outliers, active bounds, what did not converge."""
+    """Return remarks on outliers, active bounds and convergence."""
     lines = _outlying(result)
     for held in result.held[:MOST_BOUNDS]:
         unit, si = display(result.problem.parameters.dimension_of(held.name))
@@ -176,10 +176,12 @@ def remarks(result: Outcome) -> list[str]:
     beyond = np.flatnonzero(np.abs(result.x) > 1.001 * result.problem.parameters.free.tolerance)
     if len(beyond):
         names = listed([result.problem.parameters.free.names[i] for i in beyond])
-        lines.append(f"Beyond their stated tolerance: {names}. It bounds the formulation 'bounded' alone.")
+        lines.append(
+            f"Deviations beyond the stated tolerance: {names}. Only the formulation 'bounded' enforces tolerances."
+        )
     lines += [price.sentence() for price in result.prices]
     if not result.formulation.solvable:
-        lines.append("The formulation has functions that the result's file cannot hold: it cannot be solved again.")
+        lines.append("The formulation has functions that the result file cannot hold: it cannot be solved again.")
     return [*lines, result.message]
 
 
@@ -187,20 +189,23 @@ def _outlying(result: Outcome) -> list[str]:
     flagged = result.flagged
     if not flagged:
         return []
-    named = [f"{flag.label} ({flag.sigmas:.0f} sigma, residual {flag.error_mm:.2f} mm)" for flag in flagged[:MOST_ROWS]]
-    text = f"Outlying rows: {', '.join(named)}"
+    named = [
+        f"{flag.label} ({flag.sigmas:.0f} standard deviations, residual {flag.error_mm:.2f} mm)"
+        for flag in flagged[:MOST_ROWS]
+    ]
+    text = f"Outliers: {', '.join(named)}"
     if len(flagged) > MOST_ROWS:
         text += f" and {len(flagged) - MOST_ROWS} more"
     lines = [f"{text}."]
     together = result.kept_together
     if together:
         lines.append(
-            f"Of them {listed(together)} err with their neighbours in joint space or in time: they are no outliers; "
-            "the model lacks an effect there (model 'auto' compares compliance and gear eccentricity) or the set-up "
-            "moved. A refit keeps them."
+            f"Of them {listed(together)} have errors like their neighbours in joint space or time, so they are not"
+            " outliers: the model lacks an effect there (model 'auto' tests compliance and gear eccentricity), or"
+            " the set-up moved. --drop-outliers keeps them."
         )
     if len(together) < len(flagged) and result.squared_loss:
-        lines.append("A squared loss lets outliers pull the fit: use formulation 'robust', or exclude them.")
+        lines.append("Outliers bias a squared loss: use formulation 'robust', or exclude them.")
     return lines
 
 
@@ -208,7 +213,7 @@ def _outlying(result: Outcome) -> list[str]:
 
 
 def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
-    """Say which hyperparameters were estimated; parameters' names (n,), and z (n,) in units of the local scales."""
+    """Return sentences on estimated hyperparameters, from names (n,) and z (n,) in units of the local scales."""
     groups = []
     deflections = []
     for name, size in learned.sizes.items():
@@ -320,7 +325,7 @@ HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified",
 
 
 def camera_remarks(result: Outcome) -> list[str]:
-    """Return remarks on a camera's views; nothing where there are none."""
+    """Return remarks on views of a camera; empty if there are none."""
     if not camera_blocks(result.problem.sample().data):
         return []
     from rpim_opt.calibration.leverage import improvement  # which no other measurement asks for
@@ -332,11 +337,11 @@ def camera_remarks(result: Outcome) -> list[str]:
     ]
     found = improvement(result)
     if found is None:
-        remarks.append("This result does not determine the expected position error of the flange.")
+        remarks.append("The expected position error of the flange is not determined by this result.")
     else:
         remarks.append(
             "Expected position error of the flange over its joint ranges, base and tool fitted: "
-            f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % of it within "
+            f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % within "
             f"{1e3 * found.within:.3g} mm along any axis)."
         )
         if not found.improves:
@@ -356,7 +361,7 @@ def camera_remarks(result: Outcome) -> list[str]:
 
 
 def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str, Any], ...]:
-    """Return how far the touches of every point or plane are from it [mm], the worst first, from errors (N,) [m].
+    """Return the distances [mm] of touches from their point or plane, the worst first, from errors (N,) [m].
 
     By its name: how many, their RMS before and after calibration, and the largest.
     """
@@ -380,7 +385,7 @@ def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
 
 
 def scatter_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
-    """Return the rows of a table [mm] under `HEADER`: the worst points, and how many others there are."""
+    """Return the rows of the table [mm] under `HEADER`: the worst points, and the number of the others."""
     rows = []
     for each in found[:MOST_POINTS]:
         lengths = [f"{each[key]:.3f}" for key in ("nominal_rms_mm", "rms_mm", "max_mm")]
@@ -393,16 +398,16 @@ def scatter_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 
 def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
-    """Say of which points that rows touched the calibration has touches of its own: those are not held out."""
+    """Return a sentence on touched points that the calibration used too, so are not held out."""
     known = {name for name, _ in _touched(problem.data)}
     both = [name for name, _ in _touched(data) if name in known]
     if not both:
         return []
-    return [f"Not held out: the calibration has touches of {listed(both)}, too."]
+    return [f"Not held out: the calibration also used touches of {listed(both)}."]
 
 
 def contact_remarks(problem: CalibrationProblem) -> list[str]:
-    """Return remarks on errors of touches; nothing where there are none."""
+    """Return remarks on errors of touches; empty if there are none."""
     if problem.touches is None:
         return []
     nearest = []
@@ -410,7 +415,7 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
         nearest.append("the mean of all touches of its point")
     if any(problem.touches.planar):
         nearest.append("the plane that fits all touches of it best")
-    said = f"Error of a touch: the distance of the tool from {', or '.join(nearest)}, as the model has them"
+    said = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
     tells = "how well the robot returns there"
     if len(problem.arms) > 1:
         tells = "how well the robots meet and return there"

@@ -118,7 +118,7 @@ def test_a_robot_that_bends_is_no_mistake() -> None:
     noisy = values(lambda y: y + 2e-3 * rng.normal(size=y.shape))(problem)
     causes = likely_causes(calibrated(noisy))
     assert len(causes) == 2
-    assert causes[1].startswith("None of the tested mistakes explains it")
+    assert causes[1].startswith("None of the tested input mistakes explains it")
 
 
 def test_validation_rows_that_are_identification_rows_are_named() -> None:
@@ -233,7 +233,7 @@ def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
     made(monkeypatch, tmp_path, values(lambda _: y.round(4))(problem))
     assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 1
-    assert "computed from it" in capsys.readouterr().out
+    assert "computed from this robot" in capsys.readouterr().out
 
 
 def test_joints_rounded_to_half_degrees_are_named() -> None:

@@ -28,7 +28,7 @@ def test_all_published_points_with_the_two_misprints() -> None:
     assert 1e3 * result.errors()[clean].mean() <= 0.020
     squared = ro.calibrate(instance.problem, ro.tikhonov, ro.reml)
     assert 1e3 * squared.errors()[clean].mean() > 1.0
-    assert "A squared loss lets outliers pull the fit" in str(squared)
+    assert "Outliers bias a squared loss" in str(squared)
 
 
 @pytest.mark.parametrize("formulation", [ro.robust, ro.sum_of_norms])
@@ -62,7 +62,7 @@ def test_the_command_names_and_refits(monkeypatch, capsys) -> None:
     assert "Refitted without " in out
     assert all(label in out for label in BLUNDERS)
     assert run(monkeypatch, "calibrate", "paper_arm", "--variant", "misprints") == 0
-    assert "Outlying rows: T8-6 (" in capsys.readouterr().out
+    assert "Outliers: T8-6 (" in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "paper_arm", "--formulation", "robust", "--drop-outliers") == 0
     said = capsys.readouterr().out
     assert said.startswith("No flagged row to drop: nothing was refitted.")

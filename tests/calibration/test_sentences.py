@@ -78,7 +78,8 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
     "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 degrees of freedom are too few", "measurement noise"),
     "effects": (
         left(1e-4, instrument=1e-4, present={"gravity": 30.0, "first harmonic": 9.0}),
-        "gravity: -2 ln L falls by 30. Joints turn unevenly (eccentric encoders or gears): -2 ln L falls by 9.",
+        "gravity: -2 ln L falls by 30. Encoders or gears of joints are eccentric (errors once a turn): -2 ln L "
+        "falls by 9.",
         "would explain",
     ),
     "alike": (
@@ -87,11 +88,11 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
     ),
     "alike even then": (
         left(2e-4, instrument=1e-4, alike=Autocorrelation(0.5, 9.0), **LACKING),
-        "Even then residuals of neighbouring configurations are correlated (0.50, z = 9): the model lacks an effect, "
-        "which more readings will not average away.",
+        "Even then, residuals of neighbouring configurations are correlated (0.50, z = 9): the model lacks an effect, "
+        "which averaging more readings does not remove.",
         "Residuals of",
     ),
-    "gross": (left(1e-1, instrument=1e-4, position=1e-1), "No robot repeats so badly", "limits"),
+    "gross": (left(1e-1, instrument=1e-4, position=1e-1), "No robot has such poor repeatability", "limits"),
     "does not repeat": (
         left(1e-3, instrument=1e-4, position=1e-3, repeated=1e-3),
         "limits the result, by its repeatability, backlash or drift", "Repeat five",

@@ -86,7 +86,7 @@ def test_what_few_equations_tell(left: float, tells: bool) -> None:
     u = stand_in(20, 20.0 - left, 1.0)
     assert u.result.freedom == pytest.approx(left, abs=1e-12)
     test = u.result.noise_test()
-    assert ("No degree of freedom is left" in test.verdict) != tells
+    assert ("No degrees of freedom remain" in test.verdict) != tells
     if not tells:
         assert (test.ratio, test.probability) == (1.0, 1.0)
     assert u.coverage_factor == pytest.approx(student.ppf(0.975, max(left, 1.0)), rel=1e-12)

@@ -64,7 +64,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
 def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     assert flagged(0) == ["Done."]
     eight = flagged(8)[0]
-    assert eight.startswith("Outlying rows: r0 (10 sigma, residual 1.23 mm), ")
+    assert eight.startswith("Outliers: r0 (10 standard deviations, residual 1.23 mm), ")
     assert "r7 (17 sigma" in eight
     assert "more" not in eight
     eleven = flagged(11)
@@ -77,8 +77,8 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     )
     loosened = "'a2 by 0.5 mm' is active: loosening it by 0.1 mm would lower the objective by 0.2 of 9."
     assert eleven.count(loosened) == 11
-    assert not any("A squared loss lets" in line for line in eleven)
-    assert any("A squared loss lets" in line for line in flagged(1, True))
+    assert not any("Outliers bias" in line for line in eleven)
+    assert any("Outliers bias" in line for line in flagged(1, True))
 
 
 def test_points_beyond_a_table_are_counted_with_the_largest_of_their_errors() -> None:
@@ -124,7 +124,7 @@ def test_passes_are_counted(count: int, said: str) -> None:
     assert said_of(before) == f"Converged after {said}."
     noted = replace(before, choice=replace(before.choice, note="It alternates."))
     assert said_of(noted) == f"Converged after {said}. It alternates."
-    assert "no step lowers the nonlinear objective" in said_of(replace(before, outcome="stuck"))
+    assert "no step, however short, decreases the nonlinear objective" in said_of(replace(before, outcome="stuck"))
     assert "still predicts a decrease by 0.5 of the objective" in said_of(before, bad)
     ended = said_of(replace(before, outcome="", history=()), most=7)
     assert ended == "Not converged: 7 iterations were not enough; allow more (max_iterations)."
@@ -149,7 +149,7 @@ def test_deviations_beyond_a_tolerance_that_nothing_bounds_are_named() -> None:
     tight = instance.problem.with_parameters(instance.problem.parameters.toleranced({"length_mm": 0.01}))
     free = ro.calibrate(tight, ro.tikhonov, 1e-3)
     (line,) = [line for line in words.remarks(free) if "tolerance" in line]
-    assert line.endswith("It bounds the formulation 'bounded' alone.")
+    assert line.endswith("Only the formulation 'bounded' enforces tolerances.")
     assert "d4" in line
     bounded = ro.calibrate(tight, ro.bounded, 1e-3)
     assert not [line for line in words.remarks(bounded) if line.startswith("Beyond")]

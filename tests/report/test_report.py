@@ -252,7 +252,7 @@ def test_many_flagged_rows_are_not_all_named(monkeypatch) -> None:
     text = page(result)
     assert "and 3 more" in text
     assert "The measurements are simulated." in text
-    assert "Outlying rows: c" in text
+    assert "Outliers: c" in text
     assert "huber(2.0) of each configuration" in text
     named = [flag.label for flag in result.flagged]
     assert f">{named[1]}<" in text
@@ -303,7 +303,7 @@ def test_only_tolerances_that_were_kept_are_shown() -> None:
     loose = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
     assert "tolerance" in Reader(page(kept)).words
     words = Reader(page(loose)).words
-    assert "Beyond their stated tolerance: a5." in words
+    assert "Deviations beyond the stated tolerance: a5." in words
     assert words.count("tolerance") == 1  # no column of them
 
 
