@@ -131,7 +131,7 @@ def test_a_scatter_that_is_known_rejects_what_no_calibration_can_keep() -> None:
     problem, _ = simulated(noise=5e-4)  # ten times what the instrument has
     found = accept(ro.calibrate(problem), Requirement(2e-4))
     assert found.verdict == "rejected"
-    assert "the robot's repeatability contributes" in found.reasons[0]
+    assert "the robot's repeatability alone contributes" in found.reasons[0]
     assert found.scatter > 2e-4
 
 
@@ -142,7 +142,7 @@ def test_the_mean_of_the_errors_does_not_decide(result) -> None:
     assert found.bound > 1.2 * largest
     assert found.verdict == "undecided"
     assert f"Held out: 40 rows, 40 of them in the region, maximum error there {1e3 * largest:.3f} mm, of" in str(found)
-    assert "their 95 % intervals (at least 85 % are required for this number of rows)." in str(found)
+    assert "their 95 % prediction intervals (at least 85 % are required for this number of rows)." in str(found)
 
 
 def test_held_out_rows_may_be_elsewhere(result) -> None:

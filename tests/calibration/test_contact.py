@@ -124,7 +124,7 @@ def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path)
     assert "touches by point" in str(found)
     assert "Not held out" not in str(found)
     again = ro.use.validate(result, instance.problem.data)
-    assert "Not held out: the calibration has touches of" in str(again)
+    assert "Not held out: the calibration also used touches of" in str(again)
     write_report(result, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text()
     assert "Validation, distance of touches" in page

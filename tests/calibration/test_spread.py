@@ -62,7 +62,7 @@ def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     [
         (1.0, "agree with the stated"),
         (0.3, "stated too large"),
-        (3.0, "times the stated measurement noise: noise is larger"),
+        (3.0, "times the stated measurement noise: the noise is larger"),
     ],
 )
 def test_the_noise_is_judged_by_its_distribution(variance: float, said: str) -> None:

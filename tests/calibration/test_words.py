@@ -65,7 +65,7 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     assert flagged(0) == ["Done."]
     eight = flagged(8)[0]
     assert eight.startswith("Outliers: r0 (10 standard deviations, residual 1.23 mm), ")
-    assert "r7 (17 sigma" in eight
+    assert "r7 (17 standard deviations" in eight
     assert "more" not in eight
     eleven = flagged(11)
     assert eleven[0].endswith("and 3 more.")
