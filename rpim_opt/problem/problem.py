@@ -33,7 +33,7 @@ from rpim_opt.problem.row_functions import (
     require_loads,
     require_same_torques,
 )
-from rpim_opt.robot.evaluation import evaluate_rows
+from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.origins import ORIGIN, carried_by
 from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
@@ -344,7 +344,7 @@ class CalibrationProblem(RobotModel):
             self._arguments[block] = np.hstack([*loads_in(self.arms[block.robot], block), *shifted, block.y])
         function = self.functions(block)[what]
         with phase("evaluation"):
-            return evaluate_rows(function, [x, self.parameters.nominal], self._arguments[block])
+            return call_rows(function, [x, self.parameters.nominal], self._arguments[block])
 
     def _values(self, block: Block, what: str, x: Array) -> Array:
         return self._evaluated(block, what, x)[0][:, 0]

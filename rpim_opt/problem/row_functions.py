@@ -15,13 +15,12 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.registry import READY
-from rpim_opt.robot.evaluation import SYMBOLS
 from rpim_opt.robot.extensions import Statics
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, of_term, tool_prefix
 from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import Dependencies, Posture, Symbol, Term, dependencies
+from rpim_opt.robot.terms import SYMBOLS, Dependencies, Posture, Symbol, Term, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""

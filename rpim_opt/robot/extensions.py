@@ -9,8 +9,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.robot.evaluation import call_rows
-from rpim_opt.robot.kinematics import table_symbols, transforms
+from rpim_opt.robot.kinematics import call_rows, table_symbols, transforms
 from rpim_opt.robot.mdh import MDH, STANDARD, Gravity, Robot
 from rpim_opt.robot.terms import Posture, Symbol, Weight, term_of
 

@@ -1,6 +1,6 @@
-"""Symbolic kinematics in CasADi: homogeneous transforms, the MDH chain, frames.
+"""Symbolic kinematics in CasADi: homogeneous transforms, the MDH chain, frames; and functions at many rows.
 
-Every function takes and returns CasADi ``SX`` (numbers are welcome) and builds 4 x 4 matrices, or the factors whose
+Functions of symbols take and return CasADi ``SX`` (numbers are welcome) and build 4 x 4 matrices, or the factors whose
 `product` they are.
 """
 
@@ -10,14 +10,15 @@ import itertools
 import operator
 from collections.abc import Callable, Iterator, Sequence
 from functools import lru_cache, reduce
+from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.robot.evaluation import call_rows
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import Place, Posture, Symbol, Term, displacement, motion
+from rpim_opt.robot.terms import SYMBOLS, Place, Posture, Symbol, Term, displacement, motion
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -26,6 +27,12 @@ FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True)
 
 ZERO, ONE = ca.SX(0), ca.SX(1)
 """Made once: to make symbols of sixteen numbers takes longer than all the rest of a transform."""
+WIDTH = 256
+"""Rows of one call: in the virtual machine their numbers stay in the processor's second cache."""
+SHARE = 16 * WIDTH
+"""Rows that one thread evaluates before it takes more: enough to be worth handing over."""
+PAYS = 2_000
+"""Rows, at once or in all, from which a vectorized function pays: to build it takes as long as to evaluate them."""
 
 
 def rotation_x(angle: Symbol) -> ca.SX:
@@ -201,3 +208,85 @@ def forward_kinematics(robot: Robot, q: Array) -> Array:
     configurations = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
     function = _flange(tuple(robot.joint_types))
     return call_rows(function, [robot.mdh.ravel()], configurations)[0].reshape(-1, 4, 4).transpose(0, 2, 1)
+
+
+# Functions at many rows
+
+
+def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> list[Array]:
+    """Evaluate a CasADi function of shared vectors and a row on every row (N, k) of a table, on all cores.
+
+    Returned are its outputs, dense ones (r, c) as (N, c, r). CasADi's virtual machine spends most of its time between
+    operations: a function of scalars that is called often is rebuilt so that every operation is done on `WIDTH` rows
+    at once. Operations and their order stay, and with them every bit of the values.
+    """
+    results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
+    arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
+    evaluated = _evaluated(function)
+    evaluated[0] += len(rows)
+    vectorized = _vectorized(function) if evaluated[0] >= PAYS and len(rows) >= WIDTH else None
+
+    def evaluate(begin: int) -> None:
+        buffers: dict[int, Any] = {}
+        end = min(begin + SHARE, len(rows))
+        for start in range(begin, end, WIDTH):
+            part = slice(start, min(start + WIDTH, end))
+            N = len(rows[part])
+            if N not in buffers:
+                mapped = vectorized if vectorized and N == WIDTH else _mapped(function, N)
+                buffers[N] = mapped.buffer()
+                for i, values in enumerate(arguments[:-1]):
+                    buffers[N][0].set_arg(i, values.data)
+            buffer, trigger = buffers[N]
+            buffer.set_arg(len(shared), arguments[-1][part].data)
+            for i, values in enumerate(results):
+                buffer.set_res(i, values[part].data)
+            trigger()
+
+    on_all_cores(evaluate, range(0, len(rows), SHARE))
+    return results
+
+
+@lru_cache(maxsize=256)
+def _evaluated(_: ca.Function) -> list[int]:
+    """Return a list with the number of rows at which a function was evaluated, to be counted up."""
+    return [0]
+
+
+@lru_cache(maxsize=512)
+def _mapped(function: ca.Function, N: int) -> ca.Function:
+    """Return the function of N rows, the columns of its last input."""
+    return ca.Function.map(function, "rows", "serial", N, list(range(function.n_in() - 1)), [], {})
+
+
+@lru_cache(maxsize=256)
+def _vectorized(function: ca.Function) -> ca.Function | None:
+    """Return the function of `WIDTH` rows, what depends on them as vectors; None for one that calls others."""
+    if not function.is_a("SXFunction"):
+        return None
+    *shared, row = range(function.n_in())
+    with SYMBOLS:
+        inputs = [ca.MX.sym("shared", function.size1_in(i)) for i in shared]
+        table = ca.MX.sym("rows", function.size1_in(row), WIDTH)
+    entries = [*map(ca.vertsplit, inputs), ca.horzsplit(table.T)]
+    outputs = [[ca.MX.zeros(1, WIDTH)] * function.nnz_out(i) for i in range(function.n_out())]
+    values: dict[int, ca.MX] = {}
+    for k in range(function.n_instructions()):
+        operation = function.instruction_id(k)
+        source = function.instruction_input(k)
+        target = function.instruction_output(k)
+        if operation == ca.OP_OUTPUT:
+            dense = ca.densify(values[source[0]]).T
+            outputs[target[0]][target[1]] = dense if dense.numel() == WIDTH else ca.repmat(dense, 1, WIDTH)
+        elif operation == ca.OP_INPUT:
+            values[target[0]] = entries[source[0]][source[1]]
+        elif operation == ca.OP_CONST:
+            values[target[0]] = ca.MX(function.instruction_constant(k))
+        elif operation in (ca.OP_CALL, ca.OP_PARAMETER):
+            return None
+        elif len(source) == 1:
+            values[target[0]] = ca.MX.unary(operation, values[source[0]])
+        else:
+            values[target[0]] = ca.MX.binary(operation, values[source[0]], values[source[1]])
+    results = [ca.reshape(ca.vertcat(*each), function.size1_out(i), -1) for i, each in enumerate(outputs)]
+    return ca.Function("vectorized", [*inputs, table], results)

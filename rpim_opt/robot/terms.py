@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
@@ -13,9 +14,10 @@ import casadi as ca
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import DISPLAY, SMALLEST, UNITS, number, split_unit
-from rpim_opt.robot.evaluation import SYMBOLS
 
 Symbol = Any  # ca.SX or a number: CasADi ships no types
+SYMBOLS = threading.RLock()
+"""CasADi counts its symbols without a lock; reentrant, since a user's function may itself evaluate a problem."""
 Place = Literal["joint", "link", "base", "tool"]
 _STEM = re.compile(r"(?!base_|tool_)[A-Za-z](\w*[A-Za-z_])?(\{\}\w+)?")
 _FRAME = re.compile(r"\w*_r[xyz]")

@@ -11,8 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.problem.row_functions import Loads
-from rpim_opt.robot.evaluation import call_rows
-from rpim_opt.robot.kinematics import FRAME, chain, placed, product, transforms
+from rpim_opt.robot.kinematics import FRAME, call_rows, chain, placed, product, transforms
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.terms import motion
 

@@ -9,10 +9,10 @@ from functools import wraps
 from typing import Any
 
 import numpy as np
+from scipy.optimize import minimize_scalar
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.minimization import least
 from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.program import Estimate, Program
@@ -220,8 +220,10 @@ def grid_of(form: Ridge, count: int = 200) -> Array:
 def least_between(score: Score, weights: Array, best: int) -> tuple[float, float]:
     """Return the weight of the least score between the neighbours of the best on a grid, and that score."""
     low, high = np.log(weights[[best - 1, best + 1]])
-    at, value = least(lambda t: score(np.exp([t]))[0], float(low), float(high), 1e-6)
-    return float(np.exp(at)), value
+    found = minimize_scalar(
+        lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": 1e-6}
+    )
+    return float(np.exp(found.x)), float(found.fun)
 
 
 def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
