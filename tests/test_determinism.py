@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot import evaluation
+from rpim_opt.robot import kinematics
 
 PROGRAM = """
 import json, sys
@@ -80,9 +80,9 @@ def test_kernels_of_linear_algebra_change_what_rounding_does(kernel: str) -> Non
 def test_vectorized_evaluation_has_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """So that it does not matter which of them a process has come to use."""
     problem = ro.load(name).problem
-    monkeypatch.setattr(evaluation, "PAYS", 10**9)
+    monkeypatch.setattr(kinematics, "PAYS", 10**9)
     one_by_one = ro.calibrate(problem, ro.tikhonov, 1.0).z
-    monkeypatch.setattr(evaluation, "PAYS", 1)
+    monkeypatch.setattr(kinematics, "PAYS", 1)
     assert np.array_equal(ro.calibrate(problem, ro.tikhonov, 1.0).z, one_by_one)
 
 

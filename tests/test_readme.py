@@ -16,7 +16,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem import blocks as parts
-from rpim_opt.robot import evaluation
+from rpim_opt.robot import kinematics
 from rpim_opt.study import studies
 from studies.gallery import pages
 from tests import ROOT
@@ -259,7 +259,7 @@ def test_figures_of_benchmarks_in_texts_are_the_studys() -> None:
 
 def test_figures_of_large_data_are_the_codes() -> None:
     assert f"From {parts.KEPT:,} equations on only the QR factor R" in PAGES["large_data"]
-    assert f"Kinematics are evaluated on {evaluation.WIDTH} rows at once" in PAGES["large_data"]
+    assert f"Kinematics are evaluated on {kinematics.WIDTH} rows at once" in PAGES["large_data"]
 
 
 AUTO = "learned, model auto"
