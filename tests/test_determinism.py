@@ -14,7 +14,6 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot import kinematics
 
 PROGRAM = """
 import json, sys
@@ -73,17 +72,6 @@ def test_kernels_of_linear_algebra_change_what_rounding_does(kernel: str) -> Non
     if kernel == "SkylakeX" and "avx512f" not in Path("/proc/cpuinfo").read_text():
         pytest.skip("a processor without these instructions")
     require_near(answers(OPENBLAS_CORETYPE=kernel), answers(PYTHONHASHSEED="0"), 1e-8)  # to which passes are repeated
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", ["position", "pose", "distance", "cable", "tracker", "joints", "scara", "seven_axis"])
-def test_vectorized_evaluation_has_the_same_bits(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """So that it does not matter which of them a process has come to use."""
-    problem = ro.load(name).problem
-    monkeypatch.setattr(kinematics, "PAYS", 10**9)
-    one_by_one = ro.calibrate(problem, ro.tikhonov, 1.0).z
-    monkeypatch.setattr(kinematics, "PAYS", 1)
-    assert np.array_equal(ro.calibrate(problem, ro.tikhonov, 1.0).z, one_by_one)
 
 
 @pytest.mark.slow

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
@@ -15,15 +16,7 @@ LONGEST_COMPARED = 200
 
 
 class RpimError(Exception):
-    """Base class of all exceptions of this package.
-
-    >>> import rpim_opt as ro
-    >>> try:
-    ...     ro.load("paper_arm", variant="bound")
-    ... except ro.basics.RpimError as error:
-    ...     print(type(error).__name__)
-    InputError
-    """
+    """Base class of all exceptions of this package."""
 
 
 class InputError(RpimError):
@@ -72,12 +65,7 @@ class NotDelivered(InputError):
 
 
 class RowError(InputError):
-    """Invalid value in a row of a table (counted from 0); the table's reader adds the label of the row.
-
-    >>> from rpim_opt.basics.exceptions import RowError
-    >>> print(RowError(3, "a quaternion of norm 2", "norm 1").named("row P4"))
-    row P4: found a quaternion of norm 2, accepted: norm 1.
-    """
+    """Invalid value in a row of a table (counted from 0); the table's reader adds the label of the row."""
 
     def __init__(self, row: int, found: str, accepted: str):
         super().__init__(f"row {row + 1}", found, accepted)
@@ -106,19 +94,18 @@ class Conflict(NamedTuple):
         parts = []
         if self.constraints:
             parts.append(f"these constraints contradict each other: {', '.join(self.constraints)}")
-        bounds = _by(self.parameters)
+        bounds, stated = (
+            ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in of.items())
+            for of in (self.parameters, self.stated)
+        )
         rows = ", ".join(f"{name} by {v:.3g} standard deviations" for name, v in self.configurations.items())
         if bounds and rows:
             parts.append(f"bounds contradict measurements: loosen {bounds}, or else {rows}")
         elif bounds or rows:
             parts.append(f"loosen {bounds or rows}")
-        if self.stated:
-            parts.append(f"loosen {_by(self.stated)}")
+        if stated:
+            parts.append(f"loosen {stated}")
         return "; ".join(parts)
-
-
-def _by(bounds: Mapping[str, float]) -> str:
-    return ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
 
 
 class NoSolutionFound(RpimError):
@@ -166,26 +153,16 @@ class NoSolutionFound(RpimError):
         )
 
     def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
-        """Return the error with labels in place of the numbers of configurations.
-
-        >>> import rpim_opt as ro
-        >>> from rpim_opt.basics.exceptions import Conflict
-        >>> error = ro.NoSolutionFound("mine", 1e-3, "infeasible", Conflict({}, {3: 1.5}))
-        >>> error.naming({3: "P4"}).conflict.configurations
-        {'P4': 1.5}
-        """
+        """Return the error with labels in place of the numbers of configurations."""
         if not self.conflict:
             return self
 
-        def rename(constraint: str) -> str:
-            what, number, *rest = constraint.split(" ", 2)
-            if what == "configuration" and number.isdigit():
-                return " ".join([what, str(names.get(int(number), number)), *rest])
-            return constraint
+        def name(found: re.Match[str]) -> str:
+            return f"configuration {names.get(int(found[1]), found[1])}"
 
         rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}
-        renamed = tuple(rename(each) if " " in each else each for each in self.conflict.constraints)
-        named = self.conflict._replace(configurations=rows, constraints=renamed)
+        constraints = tuple(re.sub(r"^configuration (\d+)\b", name, each) for each in self.conflict.constraints)
+        named = self.conflict._replace(configurations=rows, constraints=constraints)
         return NoSolutionFound(self.formulation, self.weight, self.status, named, self.advice)
 
 
@@ -193,14 +170,12 @@ def choices(found: str, known: Iterable[str], many: int = 24) -> str:
     """Return the valid names as text; of more than ``many`` those similar to ``found`` and the number of the others."""
     names = list(known)
     found = found[:LONGEST_COMPARED]
-    close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
-    shown = names
+    listed = ", ".join(names) or "nothing"
     if len(names) > many:
         near = difflib.get_close_matches(found, names, n=8, cutoff=0.0)
-        shown = [name for name in names if name in near]
-    listed = ", ".join(shown) if names else "nothing"
-    more = f" and {len(names) - len(shown)} others" if len(shown) < len(names) else ""
-    return f"{listed}{more} (did you mean {' or '.join(close)}?)" if close else listed + more
+        listed = ", ".join(name for name in names if name in near) + f" and {len(names) - len(near)} others"
+    close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)
+    return listed + (f" (did you mean {' or '.join(close)}?)" if close else "")
 
 
 def pick(known: Mapping[str, Named], name: str, where: str, file: object = None, also: str = "") -> Named:

@@ -73,12 +73,7 @@ def html_table(header: Sequence[str], rows: Sequence[Sequence[str]], notes: Sequ
 
 
 def three_digits(value: float) -> str:
-    """Return a number with three significant digits, and without an exponent if it is large.
-
-    >>> from rpim_opt.basics.text import three_digits
-    >>> three_digits(0.53712), three_digits(-44.26), three_digits(852677.3)
-    ('0.537', '-44.3', '853,000')
-    """
+    """Return a number with three significant digits, and without an exponent if it is large."""
     rounded = float(f"{value:.3g}")
     return f"{rounded:g}" if abs(rounded) < 1000 else f"{rounded:,.0f}"
 
@@ -138,13 +133,7 @@ class Tabled(Brief):
         return ()
 
     def to_frame(self) -> Any:
-        """Return the table as a data frame (pandas, or polars if pandas is not installed).
-
-        >>> import rpim_opt as ro
-        >>> frame = ro.load("position").problem.parameters.to_frame()
-        >>> list(frame.columns)
-        ['parameter', 'unit', 'nominal', 'scale', 'tolerance', 'identified']
-        """
+        """Return the table as a data frame (pandas, or polars if pandas is not installed)."""
         from rpim_opt.basics.tables import frame_of
 
         return frame_of(self._frame_rows())

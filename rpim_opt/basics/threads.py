@@ -33,30 +33,18 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     """Return a function's results for items, in their order, computed on all cores.
 
     What the items are does not depend on the number of cores, and so neither does any digit of the answers. Inside a
-    thread of its own it works one by one. A second in each of several threads counts as one second of its phase.
+    thread of its own it works one by one. Phases of a clock are the caller's.
     """
     waiting = list(items)
     workers = min(cores(), len(waiting))
     if workers < 2 or getattr(_worker, "busy", False):
         return [function(item) for item in waiting]
-    clocks: list[Clock] = []
-
-    def work(item: Item) -> Answer:
-        with clock() as own:
-            clocks.append(own)
-            return function(item)
 
     def begin() -> None:
         _worker.busy = True
 
     with ThreadPoolExecutor(workers, initializer=begin) as pool:
-        answers = list(pool.map(work, waiting))
-    running = _running.get()
-    if running is not None and not running.stack:  # else all of it is a part of the phase that runs
-        for own in clocks:
-            for name, seconds in own.seconds.items():
-                running.seconds[name] += seconds / workers
-    return answers
+        return list(pool.map(function, waiting))
 
 
 _lock = threading.Lock()

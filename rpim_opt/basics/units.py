@@ -80,7 +80,7 @@ DISPLAY = {
 }
 """The unit in which a dimension is shown and written."""
 
-_LONGEST_UNIT = max(map(len, UNITS))
+WITH_UNIT = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})\Z")
 LONGEST = 200
 """Characters of a pattern or a name: longer ones would take too long to match."""
 
@@ -98,32 +98,17 @@ def display(dimension: str) -> tuple[str, float]:
 
 
 def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
-    """Return the columns for writing joint values, and the size of their units in SI.
-
-    >>> from rpim_opt.basics.units import joint_columns
-    >>> joint_columns(["angle", "length"])
-    {'q1_deg': 0.017453292519943295, 'q2_mm': 0.001}
-    """
+    """Return the columns for writing joint values, and the size of their units in SI."""
     units = (display(dimension) for dimension in dimensions)
     return {f"q{i}_{unit}": si for i, (unit, si) in enumerate(units, start=1)}
 
 
 def split_unit(name: str) -> tuple[str, Unit | None]:
-    """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None if there is none.
-
-    >>> from rpim_opt.basics.units import split_unit
-    >>> split_unit("base_rx_mrad")[0], split_unit("label")
-    ('base_rx', ('label', None))
-    """
+    """Split ``"q1_deg"`` into ``"q1"`` and its unit; the unit is None if there is none."""
     if name == CELSIUS:  # elsewhere a letter C is a name
         return "temperature", UNITS["degC"]
-    place = name.find("_", max(len(name) - _LONGEST_UNIT - 1, 0))
-    while place >= 0:  # the first that fits is the longest
-        unit = UNITS.get(name[place + 1 :])
-        if unit is not None:
-            return name[:place], unit
-        place = name.find("_", place + 1)
-    return name, None
+    match = WITH_UNIT.search(name)
+    return (name[: match.start()], UNITS[match[1]]) if match else (name, None)
 
 
 def with_unit(stem: str, dimension: str, count: int = 9) -> list[str]:
@@ -148,12 +133,7 @@ def number(value: Any, where: str) -> float:
 
 
 def numeral(text: str) -> float:
-    """Return the finite number that an ASCII text states in Python's notation; NaN for any other text.
-
-    >>> from rpim_opt.basics.units import numeral
-    >>> numeral("1.5e-3"), numeral("1_000"), numeral("inf")
-    (0.0015, nan, nan)
-    """
+    """Return the finite number that an ASCII text states in Python's notation; NaN for ``1_000``, ``inf``, ..."""
     try:
         value = float(text)
     except ValueError:

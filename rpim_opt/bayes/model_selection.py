@@ -19,7 +19,7 @@ from rpim_opt.bayes.prior_terms import Result
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.extensions import families, family_scales
-from rpim_opt.robot.parameter_names import EXPANSION, frame_of, of_session, own_name, session_prefix
+from rpim_opt.robot.parameters import EXPANSION, frame_of, of_session, own_name, session_prefix
 
 FIRST, SECOND, MOMENTS = "first harmonic", "second harmonic", "moments"
 TURNED = {FIRST: 2.0, SECOND: 4.0}

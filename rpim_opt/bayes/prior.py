@@ -15,8 +15,7 @@ from rpim_opt.bayes import prior_terms as terms
 from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
 from rpim_opt.convex.given import places
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
-from rpim_opt.robot.parameter_names import is_joint_offset, of_session, own_name
-from rpim_opt.robot.parameters import Parameters, overlay
+from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, overlay, own_name
 
 OFFSETS = "joint offsets"
 """The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""

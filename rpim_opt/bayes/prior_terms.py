@@ -18,8 +18,7 @@ from rpim_opt.convex.formulation import NAMED, Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.blocks import Source
-from rpim_opt.robot.parameter_names import is_joint_offset
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
 FIXED = -1
 """The group of a parameter whose prior scale is not estimated: of frames, but for the base."""

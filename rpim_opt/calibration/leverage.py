@@ -21,7 +21,7 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
-from rpim_opt.robot.parameter_names import of_joint, own_name
+from rpim_opt.robot.parameters import of_joint, own_name
 
 TINY = 1e-300
 """Divisors are no smaller."""

@@ -46,7 +46,7 @@ from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.parameter_names import own_name
+from rpim_opt.robot.parameters import own_name
 
 COVERAGE_FACTOR = 2.0
 """Of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution."""

@@ -13,7 +13,7 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.diagnosis import decimals_of
-from rpim_opt.robot.parameter_names import own_name
+from rpim_opt.robot.parameters import own_name
 
 BAD = "Larger than expected"
 """Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""

@@ -20,7 +20,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.robot.extensions import EXPECTED
-from rpim_opt.robot.parameter_names import EXPANSION, is_joint_offset, of_session, own_name
+from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, own_name
 
 MOST_ROWS, MOST_BOUNDS = 8, 5
 """Number of outliers and active bounds named individually."""

@@ -16,7 +16,7 @@ from rpim_opt.basics.text import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
-from rpim_opt.robot.parameter_names import session_prefix
+from rpim_opt.robot.parameters import session_prefix
 
 ROW_FIELDS = ("q", "y", "torque", "payload", "approach", "point", "session")
 """What a block has of every row, besides its columns."""

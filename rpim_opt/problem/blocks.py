@@ -23,8 +23,7 @@ from rpim_opt.problem.linear import LinearModel, Reweigh, reduced_models
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem, RobotModel
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import frame_of, of_session, session_prefix
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, frame_of, of_session, session_prefix
 
 ROWS = 4096
 """Rows that are evaluated, weighed and reduced together."""

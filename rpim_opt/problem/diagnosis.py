@@ -27,7 +27,7 @@ from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.points import points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
 """A joint that moves less [rad, m] is hardly seen."""

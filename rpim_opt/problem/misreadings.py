@@ -26,7 +26,7 @@ from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import tool_prefix
 
 STEPS = 20
 """Steps of a fit of base and reflectors, joint zeros too if they are free."""

@@ -20,8 +20,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import met
-from rpim_opt.robot.parameter_names import frame_of, known_patterns, of_session, session_prefix
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
 MOST_PARAMETERS = 2000

@@ -33,11 +33,18 @@ from rpim_opt.problem.row_functions import (
     require_loads,
     require_same_torques,
 )
+from rpim_opt.robot.chain import ORIGIN, carried_by
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.origins import ORIGIN, carried_by
-from rpim_opt.robot.parameter_names import frame_of, of_session, own_name, session_prefix, tool_prefix
-from rpim_opt.robot.parameters import Parameters, with_terms
+from rpim_opt.robot.parameters import (
+    Parameters,
+    frame_of,
+    of_session,
+    own_name,
+    session_prefix,
+    tool_prefix,
+    with_terms,
+)
 from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
 
 GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")

@@ -18,9 +18,8 @@ from rpim_opt.data.measurements.registry import READY
 from rpim_opt.robot.extensions import Statics
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Gravity, Robot
-from rpim_opt.robot.parameter_names import EXPANSION, REFERENCE, of_term, tool_prefix
-from rpim_opt.robot.parameters import Parameters
-from rpim_opt.robot.terms import SYMBOLS, Dependencies, Posture, Symbol, Term, dependencies
+from rpim_opt.robot.parameters import EXPANSION, REFERENCE, Parameters, of_term, tool_prefix
+from rpim_opt.robot.terms import SYMBOLS, Dependencies, Posture, Symbol, Term, Weight, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
@@ -221,7 +220,7 @@ class Loads(NamedTuple):
         torque = parts.get("torque")
         if torque is None and not self.weighs:
             torque = [0.0] * dof
-        weight = None
+        weight = Weight()
         if self.gravity is not None:
             weight = Statics(joint_types, parts["q"], nominal, self.gravity, stated.get("payload"))
         return Posture(parts["q"], torque, parts.get("approach"), weight, self.named(stated))

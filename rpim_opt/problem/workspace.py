@@ -20,7 +20,7 @@ from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import tool_prefix
 
 SOME = 128
 """Configurations of a box, or of all joint ranges, that are always looked at; and those of all that move farthest."""

@@ -3,21 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
+import casadi as ca
 import numpy as np
 import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, numeric_link
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame, frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import MDH, Robot
+from rpim_opt.robot.terms import Entry, Joint, Symbol, Term
 
 NEAR_PARALLEL = 0.1
 """Axes nearer to parallel than this [rad] get Hayati's beta, as `identified.near_parallel` proposes."""
 ANOTHER_ARM = 0.1
 """A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
+ORIGIN, MOUNT = "origin_", "mount_"
+"""Prefixes of the parameters of joints that move, and of fixed joints at the ends of a chain."""
+ORIGIN_SCALES = {ORIGIN: 1.0, MOUNT: 10.0}
+"""Prior standard deviations of their deviations [mm and mrad]."""
 SAME_PLACE = (0.01, 0.1)
 """Two frames nearer than this [m], [rad] are one and the same, known twice."""
 
@@ -232,3 +240,72 @@ def origin_numbers(T: Array, old: Array, size: float) -> tuple[str | None, str |
     moved = np.abs(T[:3, 3] - old[:3, 3]).max() > ROUNDING * size
     turned = np.abs(T[:3, :3] - old[:3, :3]).max() > ROUNDING
     return texts[0] if moved else None, texts[1] if turned else None
+
+
+# Origins as parameters: the same six numbers in every chain that a joint is part of
+
+
+class Origin(NamedTuple):
+    """A joint's origin O, which becomes D O by six numbers in the frame of the joint's parent link."""
+
+    prefix: str  # of its parameters, origin_torso_1_joint_
+    frame: Array  # (4, 4) of the parent link in the frame behind the row that carries it
+    up: bool  # whether the chain goes up through the joint
+
+
+class Carried(NamedTuple):
+    """The origins that stand behind a row (from 1) of a robot's table, in their order."""
+
+    row: int
+    origins: tuple[Origin, ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Displaced(Term):
+    """The term of `displaced`, with what it is made of."""
+
+    carried: Carried = field(default_factory=lambda: Carried(1, ()))
+    ready = True
+
+    def __post_init__(self) -> None:
+        """Check nothing: the names are those of frames."""
+
+    def named(self, i: int) -> list[Entry]:
+        """Return the parameters, whose names are the joints' and not the row's."""
+        return list(self.entries)
+
+
+def displaced(carried: Carried) -> Displaced:
+    """Return the term of the origins behind a row of the table: all of them displace what follows, one by one.
+
+    With F the parent link's frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed
+    up by F D^-1 F^-1; D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx) is zero's identity.
+    """
+    units = dict(zip(FRAME, ("mm",) * 3 + ("mrad",) * 3, strict=True))
+    scales = {}
+    for origin in carried.origins:
+        scale = ORIGIN_SCALES[ORIGIN if origin.prefix.startswith(ORIGIN) else MOUNT]
+        scales |= {f"{origin.prefix}{axis}_{unit}": scale for axis, unit in units.items()}
+    return Displaced(partial(_moves, carried), scales, at="link", joints=(carried.row,), carried=carried)
+
+
+def _moves(carried: Carried, link: Joint, *sizes: Symbol) -> Symbol:
+    """Return the product of the displacements as six numbers."""
+    T = ca.SX.eye(4)
+    for k, (_, F, up) in enumerate(carried.origins):
+        six = sizes[6 * k : 6 * k + 6]
+        if not all(ca.SX(size).is_zero() for size in six):
+            D = frame((0,) * 6, six)
+            T = T @ F @ (_inverse(D) if up else D) @ np.linalg.inv(F)
+    pitch = ca.atan2(-T[2, 0], ca.sqrt(T[0, 0] ** 2 + T[1, 0] ** 2))
+    return ca.vertcat(T[:3, 3], ca.atan2(T[2, 1], T[2, 2]), pitch, ca.atan2(T[1, 0], T[0, 0]))
+
+
+def _inverse(T: ca.SX) -> ca.SX:
+    turned = T[:3, :3].T
+    return ca.vertcat(ca.horzcat(turned, -turned @ T[:3, 3]), ca.horzcat(0, 0, 0, 1))
+
+
+def carried_by(terms: Sequence[Term]) -> tuple[Carried, ...]:
+    """Return the origins among a robot's terms."""
+    return tuple(term.carried for term in terms if isinstance(term, Displaced))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import cached_property, lru_cache
 
@@ -9,9 +10,10 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.kinematics import call_rows, table_symbols, transforms
 from rpim_opt.robot.mdh import MDH, STANDARD, Gravity, Robot
-from rpim_opt.robot.terms import Posture, Symbol, Weight, term_of
+from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Posture, Symbol, Weight
 
 GUESS = ((5.0, None), (10.0, 4))
 """Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
@@ -219,19 +221,16 @@ def family_scales(robot: Robot, names: Iterable[str]) -> Array:
     q = _draws(robot)
     torques = np.abs(gravity_torques(robot, q)).max(axis=0)
     slopes = np.abs(moment_slopes(robot, q)).max(axis=0)
+    n = len(robot.mdh)
+    largest = {f"ratio{i}": np.pi for i in range(1, n + 1)}
+    largest |= {f"compliance{i}": torque for i, torque in enumerate(torques, start=1)}
+    largest |= {f"bend{i + 1}_{k + 1}{AXES[a]}": slopes[i, k, a] for i, k, a in np.ndindex(n, n, 3)}
+    usual = {term.name: term.entries[0].scale for term in JOINT_TERMS} | {"bend": BEND_SCALE}
     scales = []
     for name in names:
-        term, i = term_of(name, len(robot.mdh))
-        largest = 1.0
-        if term.name == "compliance":
-            largest = torques[i - 1]
-        if term.name == "bend":
-            k, axis = name.partition("_")[2][:-1], name[-1]
-            largest = slopes[i - 1, int(k) - 1, AXES.index(axis)]
-        if term.name == "ratio":
-            largest = np.pi
-        if largest > 1e-9:
-            scales.append(EXPECTED / largest)
-        else:
-            scales.append(term.entries[0].scale)
+        kind = re.fullmatch(r"(\w+?)\d+(_\d+[xyz])?", name)
+        if kind is None or kind[1] not in usual:
+            raise InputError("term of a joint", f"'{name}'", ", ".join(usual))
+        size = largest.get(name, 1.0)
+        scales.append(EXPECTED / size if size > 1e-9 else usual[kind[1]])
     return np.array(scales)

@@ -3,38 +3,26 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import SMALLEST, display, fits, quantities, split_unit
 from rpim_opt.robot.extensions import bend_names
 from rpim_opt.robot.kinematics import FRAME_DIMENSION, numeric_frame, roll_pitch_yaw
-from rpim_opt.robot.mdh import MDH_DIMENSION, Robot
-from rpim_opt.robot.parameter_names import (
-    EXPANSION,
-    JOINT_OFFSET,
-    REFERENCE,
-    group_of,
-    is_joint_offset,
-    known_patterns,
-    of_joint,
-    of_session,
-    own_name,
-    session_prefix,
-    tool_prefix,
-)
-from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Model, entries_of
+from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, Robot
+from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Entry, Model
 
-_PATTERN = re.compile(r"[*?\[]")
-Entry = tuple[str, str, float, float]
-"""Name, dimension, nominal value and usual size of its deviation [SI]."""
+EXPANSION, REFERENCE = "expansion", "reference_temperature"
+"""By how much all lengths of a robot grow with temperature, and the temperature at which they are nominal."""
+JOINT_OFFSET = "joint_offset"
+"""Stands in tables for every theta."""
 DEFAULT_SCALE = {
     ("length", "length"): 1e-3,
     ("angle", "angle"): 1e-3,
@@ -53,6 +41,85 @@ STEEL = 12e-6
 """By how much steel grows [1/K]; aluminium by 23e-6."""
 SHOWN = 4
 """Names in one line."""
+KNOWN = 2**14
+"""Names whose meaning is cached: those of a hundred robots."""
+_TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
+_TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|bend\d+_\d+[xyz]")
+
+
+# Names
+
+
+def own_name(name: str) -> str:
+    """Return what the robot itself calls a parameter: ``a2`` for ``left.a2`` of several robots."""
+    return name.rpartition(".")[2]
+
+
+@lru_cache(KNOWN)
+def of_joint(name: str) -> bool:
+    """Return whether a parameter is a robot's own, and not of a frame."""
+    own = own_name(name)
+    return own == EXPANSION or bool(_TABLE.fullmatch(own) or _TERM.fullmatch(own))
+
+
+def of_term(name: str) -> bool:
+    """Return whether a parameter is one of a joint's terms, and not of the table or of a frame."""
+    return _TERM.fullmatch(own_name(name)) is not None
+
+
+@lru_cache(KNOWN)
+def is_joint_offset(name: str) -> bool:
+    """Return whether a parameter is the offset of a revolute joint: set at assembly, and not machined."""
+    return re.fullmatch(r"theta\d+", own_name(name)) is not None
+
+
+@lru_cache(KNOWN)
+def group_of(name: str, dimension: str) -> str:
+    """Return the group whose scale a parameter has: ``tool``, ``session``, ``base``, or its dimension."""
+    frame = own_name(name).partition("_")[0]
+    if frame in ("tool", "session"):
+        return frame
+    return dimension if of_joint(name) else "base"
+
+
+def session_prefix(session: str) -> str:
+    """Return the prefix of a session's parameters: ``session_day_1_`` for "day 1"; letters, digits and _ alone."""
+    return f"session_{re.sub(r'[^0-9A-Za-z]+', '_', session)}_"
+
+
+def of_session(name: str) -> bool:
+    """Return whether a parameter is by how much the readings of a session are shifted or turned."""
+    return own_name(name).startswith("session_")
+
+
+def frame_of(name: str) -> str:
+    """Return the prefix of the frame that a parameter is of: ``session_day_1_`` of ``session_day_1_rx``."""
+    return own_name(name).rpartition("_")[0] + "_"
+
+
+def tool_prefix(marker: str) -> str:
+    """Return the prefix of a reflector's parameters: ``tool_``, or ``tool_A_`` for marker A."""
+    return f"tool_{marker}_" if marker else "tool_"
+
+
+def reflectors(names: Iterable[str]) -> list[str]:
+    """Return the markers whose reflectors are among the parameters; ``""`` for the only one."""
+    return [name[5:-2] for name in names if name.startswith("tool_") and name.endswith("_x")]
+
+
+def known_patterns(names: Sequence[str], pattern: str) -> str:
+    """List the known names, those of all joints in short: ``alpha1..6``, ``bend2_2x..bend6_6y``."""
+    runs: dict[str, list[str]] = {}
+    for name in names:
+        match = re.fullmatch(r"(.*?[a-z])(\d+)(?:_\d+[xyz])?", name)
+        runs.setdefault(match[1] if match else name, []).append(name)
+    known = [own[0] if len(own) == 1 else f"{own[0]}..{own[-1].removeprefix(stem)}" for stem, own in runs.items()]
+    # of what `choices` says of all the names only the guess: the list itself is shorter in runs
+    _, guess, close = choices(pattern, names).partition(" (did")
+    return "names or patterns of " + ", ".join(known) + guess + close
+
+
+# The table
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,29 +148,20 @@ class Parameters(Tabled):
 
     Examples
     --------
-    >>> import numpy as np
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
     >>> len(parameters), len(parameters.free), parameters.dimension_of("tool_x")
     (114, 34, 'length')
-    >>> parameters.take(np.array([0, 5])).names
-    ('alpha1', 'alpha2')
-    >>> [name for name, frame in zip(parameters.names, parameters.of_frames) if frame][:4]
-    ['base_x', 'base_y', 'base_z', 'base_rx']
-    >>> bool((parameters.placed == parameters.of_frames).all())  # the data name no session
-    True
     >>> few = parameters.identify(["d2", "theta2", "ecc_sin2", "tool_rx"]).free
-    >>> few.groups, few.periodic
-    (('angle', 'length', 'angle', 'tool'), array([ True, False, False,  True]))
+    >>> few.groups, few.periodic, few.of_frames
+    (('angle', 'length', 'angle', 'tool'), array([ True, False, False,  True]), array([False, False, False,  True]))
 
     Parameters of several robots bear the robot's name unless they are shared:
 
     >>> problem = ro.load("position").problem
     >>> both = ro.together(left=problem, right=problem, shared=["tool_*"]).parameters
-    >>> both.free.names[0], both.of_robot("left").free.names[0], "tool_x" in both.of_robot("right").names
-    ('left.alpha1', 'alpha1', True)
-    >>> both.called("left", "a2"), both.called("left", "tool_x"), len(both), len(both.places_of("right"))
-    ('left.a2', 'tool_x', 222, 114)
+    >>> both.free.names[0], both.of_robot("left").free.names[0], both.called("left", "tool_x"), len(both)
+    ('left.alpha1', 'alpha1', 'tool_x', 222)
     """
 
     names: tuple[str, ...]
@@ -128,19 +186,13 @@ class Parameters(Tabled):
 
     def _frame_rows(self) -> list[dict[str, Any]]:
         rows: list[dict[str, Any]] = []
-        for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
-            unit, si = display(dimension)
-            row = {
-                "parameter": name,
-                "unit": unit,
-                "nominal": float(self.nominal[i] / si),
-                "scale": float(self.scale[i] / si),
-                "tolerance": None,
-                "identified": bool(self.identified[i]),
-            }
-            if np.isfinite(self.tolerance[i]):
-                row["tolerance"] = float(self.tolerance[i] / si)
-            rows.append(row)
+        for i, name in enumerate(self.names):
+            unit, si = display(self.dimensions[i])
+            row: dict[str, Any] = {"parameter": name, "unit": unit}
+            for key in ("nominal", "scale", "tolerance"):
+                value = float(getattr(self, key)[i] / si)
+                row[key] = value if np.isfinite(value) else None
+            rows.append(row | {"identified": bool(self.identified[i])})
         return rows
 
     def __len__(self) -> int:
@@ -148,15 +200,9 @@ class Parameters(Tabled):
 
     def take(self, index: np.ndarray) -> Parameters:
         """Return the entries at ``index`` (K,), in that order."""
-        return replace(
-            self,
-            names=tuple(self.names[i] for i in index),
-            dimensions=tuple(self.dimensions[i] for i in index),
-            nominal=self.nominal[index],
-            scale=self.scale[index],
-            tolerance=self.tolerance[index],
-            identified=self.identified[index],
-        )
+        texts: dict[str, Any] = {key: tuple(getattr(self, key)[i] for i in index) for key in ("names", "dimensions")}
+        numbers = {key: getattr(self, key)[index] for key in ("nominal", "scale", "tolerance", "identified")}
+        return replace(self, **texts, **numbers)
 
     @cached_property
     def free(self) -> Parameters:
@@ -325,7 +371,7 @@ def overlay(
     offsets = [i for i, name in enumerate(parameters.names) if is_joint_offset(name)]
     if offsets:
         members[JOINT_OFFSET] = offsets
-    for key in filter(_PATTERN.search, table):
+    for key in filter(re.compile(r"[*?\[]").search, table):
         stem, _ = split_unit(key)
         members[stem] = [i for i, name in enumerate(parameters.names) if fits(name, stem)]
     members |= {name: [i] for i, name in enumerate(parameters.names)}
@@ -386,15 +432,17 @@ def model_parameters(
     >>> parameters.identify(["d1", "tool_A_z"]).free.nominal
     array([0.099927, 0.06    ])
     """
-    entries = [*_of_joints(robot), *_of_frame("base_", base)]
-    for marker, tool in (tools or {"": (0.0,) * 6}).items():
-        entries += _of_frame(tool_prefix(marker), tool)
-    for prefix in dict.fromkeys(map(session_prefix, sessions)):
-        entries += _of_frame(prefix, (0.0,) * 6)
+    frames = {"base_": base}
+    frames |= {tool_prefix(marker): tool for marker, tool in (tools or {"": (0.0,) * 6}).items()}
+    frames |= dict.fromkeys(map(session_prefix, sessions), (0.0,) * 6)
+    entries = _of_joints(robot)
+    for prefix, place in frames.items():
+        for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
+            entries.append(_usual(prefix + axis, dimension, value))
     if temperature is not None:
-        entries.append((EXPANSION, "ratio per temperature", 0.0, STEEL))
-        entries.append((REFERENCE, "temperature", temperature, 1.0))
-    entries += [(name, dimension, value, _usual(name, dimension)) for name, (dimension, value) in (own or {}).items()]
+        entries.append(Entry(EXPANSION, "ratio per temperature", STEEL, 0.0))
+        entries.append(Entry(REFERENCE, "temperature", 1.0, temperature))
+    entries += [_usual(name, dimension, value) for name, (dimension, value) in (own or {}).items()]
     none = np.empty(0)
     empty = Parameters((), (), none, none, none, none.astype(bool), own_frames)
     return with_terms(_extended(empty, entries), robot.model, robot.joint_types)
@@ -402,17 +450,17 @@ def model_parameters(
 
 def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str]) -> Parameters:
     """Return a table with the parameters of a model's terms behind its own, none of them identified yet."""
-    entries = [(name, each.dimension, each.nominal, each.scale) for name, each in entries_of(model, joint_types)]
-    for name, *_ in entries:
+    entries = model.entries(joint_types)
+    own = tuple(entry.name for entry in entries)
+    for name in own:
         if name in parameters.names:
             raise InputError("model, terms", f"parameter '{name}', which the model has", "a name of its own")
-    own = tuple(name for name, *_ in entries)
     return replace(_extended(parameters, entries), terms=(*parameters.terms, *own)) if own else parameters
 
 
 def _extended(parameters: Parameters, entries: Sequence[Entry]) -> Parameters:
     """Return a table with further entries, none of them identified."""
-    names, dimensions, nominal, scale = zip(*entries, strict=True)
+    names, dimensions, scale, nominal = zip(*entries, strict=True)
     return replace(
         parameters,
         names=(*parameters.names, *names),
@@ -424,29 +472,20 @@ def _extended(parameters: Parameters, entries: Sequence[Entry]) -> Parameters:
     )
 
 
-def _usual(name: str, dimension: str) -> float:
-    # own dimensions of a measurement have no usual size: their unit's
-    group = group_of(name, dimension)
-    if name.startswith(("camera_", "board_")):
-        group = "camera"
-    return DEFAULT_SCALE.get((group, dimension), 1.0)
+def _usual(name: str, dimension: str, nominal: float) -> Entry:
+    """Return an entry with the usual scale of its group; own dimensions of a measurement have that of their unit."""
+    group = "camera" if name.startswith(("camera_", "board_")) else group_of(name, dimension)
+    return Entry(name, dimension, DEFAULT_SCALE.get((group, dimension), 1.0), nominal)
 
 
-def _of_joints(robot: Robot) -> Iterator[Entry]:
-    """Yield the table's parameters row by row, then what the joints have besides, zero in a nominal robot."""
+def _of_joints(robot: Robot) -> list[Entry]:
+    """Return the table's parameters row by row, then what the joints have besides, zero in a nominal robot."""
+    entries = []
     for i, row in enumerate(robot.mdh, start=1):
         for (column, dimension), value in zip(MDH_DIMENSION.items(), row, strict=True):
-            yield f"{column}{i}", dimension, value, _usual(f"{column}{i}", dimension)
+            entries.append(_usual(f"{column}{i}", dimension, value))
     for i in range(1, len(robot.mdh) + 1):
         for term in JOINT_TERMS:
             if i in term.places(robot.joint_types):
-                for name, entry in zip(term.names(i), term.entries, strict=True):
-                    yield name, entry.dimension, entry.nominal, entry.scale
-    for name in bend_names(robot):
-        yield name, "angle", 0.0, BEND_SCALE
-
-
-def _of_frame(prefix: str, place: Sequence[float] | Array) -> Iterator[Entry]:
-    for (axis, dimension), value in zip(FRAME_DIMENSION.items(), place, strict=True):
-        name = prefix + axis
-        yield name, dimension, value, _usual(name, dimension)
+                entries += term.named(i)
+    return entries + [Entry(name, "angle", BEND_SCALE, 0.0) for name in bend_names(robot)]

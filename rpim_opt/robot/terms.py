@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
 from typing import Any, ClassVar, Literal, NamedTuple
@@ -25,6 +25,8 @@ SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}
 """How many numbers a term returns."""
 ENDS = ("base", "tool")
 """Places that an arm has once: parameters there have no number."""
+EXPECTED_WAVE = 1e-5
+"""Scale of one harmonic of a transmission error before it is estimated [rad]."""
 BEND_SCALE = 1e-4
 """Prior standard deviation of a joint's deflection by one component of one link's first moment [rad]."""
 
@@ -32,11 +34,11 @@ BEND_SCALE = 1e-4
 # What a term sees
 
 
+@dataclass(eq=False)
 class Weight:
     """Gravity of which nothing is known but that all it does is this symbol; `extensions.Statics` is an arm's."""
 
-    def __init__(self, payload: Symbol = 0.0) -> None:
-        self.payload = payload  # mass at the flange [kg]
+    payload: Symbol = 0.0  # mass at the flange [kg]
 
     def torque(self, i: int) -> Symbol:
         """Return the torque of gravity about joint i [Nm]."""
@@ -65,7 +67,7 @@ class Posture:
     q: Sequence[Symbol]  # of the model [rad or m]
     torque: Sequence[Symbol] | None = None  # measured [Nm]; None where those of gravity stand for them
     approach: Sequence[Symbol] | None = None  # directions of the last movement, -1, 0 or +1; None where not known
-    weight: Weight | None = None  # gravity; None for none
+    weight: Weight = field(default_factory=Weight)  # gravity; none by default
     columns: Mapping[str, Symbol] = field(default_factory=dict)  # further columns of the data by name [SI]
 
 
@@ -78,10 +80,8 @@ class Joint:
     >>> import rpim_opt as ro
     >>> posture = ro.robot.Posture(q=[0.1, 0.5], torque=[3.0, 7.0], approach=[-1, 1], columns={"hours": 8.0})
     >>> elbow = ro.robot.Joint(2, posture)
-    >>> elbow.q, elbow.every_q, elbow.torque, elbow.approach, elbow.column("hours")
-    (0.5, [0.1, 0.5], 7.0, 1, 8.0)
-    >>> elbow.gravity, elbow.payload, elbow.moment(2, "x"), elbow.down.shape  # of a posture without gravity
-    (0.0, 0.0, 0.0, (3, 1))
+    >>> elbow.q, elbow.every_q, elbow.torque, elbow.approach, elbow.gravity, elbow.column("hours")
+    (0.5, [0.1, 0.5], 7.0, 1, 0.0, 8.0)
     """
 
     number: int
@@ -100,39 +100,31 @@ class Joint:
     @property
     def torque(self) -> Symbol:
         """Measured torque [Nm] where the data have torques, that of gravity elsewhere."""
-        if self.posture.torque is None:
-            return self.gravity
-        return self.posture.torque[self.number - 1]
-
-    @property
-    def _weight(self) -> Weight:
-        return self.posture.weight or Weight()
+        return self.gravity if self.posture.torque is None else self.posture.torque[self.number - 1]
 
     @property
     def gravity(self) -> Symbol:
         """Torque of gravity about the joint [Nm] on the nominal arm, positive the way it turns the joint."""
-        return self._weight.torque(self.number)
+        return self.posture.weight.torque(self.number)
 
     @property
     def down(self) -> Symbol:
         """Where gravity points in the frame after the joint, of the nominal arm: a unit vector (3, 1)."""
-        return self._weight.down(self.number)
+        return self.posture.weight.down(self.number)
 
     @property
     def payload(self) -> Symbol:
         """Mass at the flange [kg]."""
-        return self._weight.payload
+        return self.posture.weight.payload
 
     @property
     def approach(self) -> Symbol:
         """Direction of the joint's last movement, -1, 0 or +1; 0 where it is not known."""
-        if self.posture.approach is None:
-            return 0.0
-        return self.posture.approach[self.number - 1]
+        return 0.0 if self.posture.approach is None else self.posture.approach[self.number - 1]
 
     def moment(self, k: int, axis: str) -> Symbol:
         """Return z_i . (R_k e_a x g_hat): what the first moment of link k along ``axis`` means to it."""
-        return self._weight.moment(self.number, k, axis)
+        return self.posture.weight.moment(self.number, k, axis)
 
     def column(self, name: str) -> Symbol:
         """Return a column of the data [SI] by its name; the term has to name it in its ``columns``."""
@@ -147,7 +139,7 @@ class Joint:
 class Entry(NamedTuple):
     """A parameter of a term; nominal value and scale in SI."""
 
-    stem: str
+    name: str
     dimension: str
     scale: float
     nominal: float
@@ -190,19 +182,8 @@ class Term:
     >>> import casadi as ca
     >>> import rpim_opt as ro
     >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1})
-    >>> third.name, third.names(2), third.entries[0].dimension, third.entries[0].scale  # [rad]
-    ('third', ('third2',), 'angle', 0.0001)
-    >>> float(third.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, ca.pi / 3])), 2e-4))
-    -0.0002
-    >>> warm = ro.robot.Term(
-    ...     lambda link, rate: [0, 0, rate * link.column("temperature"), 0, 0, 0],
-    ...     {"warm_um_per_K": 10},
-    ...     at="link",
-    ...     joints=(2, 3),
-    ...     columns={"temperature": "temperature"},
-    ... )
-    >>> warm.places(("revolute",) * 6), warm.names(3)
-    ((2, 3), ('warm3',))
+    >>> third.names(2), float(third.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, ca.pi / 3])), 2e-4))
+    (('third2',), -0.0002)
     """
 
     moves: Callable[..., Symbol]
@@ -218,48 +199,57 @@ class Term:
             raise InputError("term, at", repr(self.at), ", ".join(map(repr, SIZES)))
         require_columns(self.columns, "term")
         for entry in self.entries:
-            where = f"term, scales, parameter '{entry.stem}'"
-            if not _STEM.fullmatch(entry.stem) or _FRAME.fullmatch(entry.stem):
+            where = f"term, scales, parameter '{entry.name}'"
+            if not _STEM.fullmatch(entry.name) or _FRAME.fullmatch(entry.name):
                 accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx of frames"
                 raise InputError(where, "a name that is another's", accepted)
-            if self.at in ENDS and "{}" in entry.stem:
+            if self.at in ENDS and "{}" in entry.name:
                 raise InputError(where, "a place for a number", f"none: the {self.at} has one parameter")
             if not entry.scale >= SMALLEST:
                 raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
-        if len({entry.stem for entry in self.entries}) < len(self.entries):
+        if len({entry.name for entry in self.entries}) < len(self.entries):
             raise InputError("term, scales", "one name in two units", "one of them")
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
         """The parameters, in the order in which ``moves`` takes them."""
-        nominal = {key: _quantity(key, value, "nominal")[2] for key, value in self.nominal.items()}
-        unknown = nominal.keys() - self.scales.keys()
+        unknown = self.nominal.keys() - self.scales.keys()
         if unknown:
             raise InputError("term, nominal", f"'{min(unknown)}'", "a key of its scales")
-        found = [(key, *_quantity(key, value, "scales")) for key, value in self.scales.items()]
-        return tuple(Entry(stem, dimension, scale, nominal.get(key, 0.0)) for key, stem, dimension, scale in found)
+        entries = []
+        for key, scale in self.scales.items():
+            where = f"key {key}"
+            stem, unit = split_unit(key)
+            if unit is None or unit.dimension not in DISPLAY:
+                units = [name for name, each in UNITS.items() if each.dimension in DISPLAY]
+                accepted = f"a name with one of {', '.join(units)}"
+                raise InputError(f"term, scales, {where}", "no unit of the right dimension", accepted)
+            nominal = number(self.nominal.get(key, 0.0), f"term, nominal, {where}")
+            scale = number(scale, f"term, scales, {where}")
+            entries.append(Entry(stem, unit.dimension, scale * unit.si, nominal * unit.si))
+        return tuple(entries)
 
     @property
     def name(self) -> str:
         """The parameters' names without the joint's number."""
-        return ", ".join(entry.stem.partition("{}")[0] for entry in self.entries) or "without parameters"
+        return ", ".join(entry.name.partition("{}")[0] for entry in self.entries) or "without parameters"
 
     def names(self, i: int) -> tuple[str, ...]:
         """Return the names of joint or link i's parameters; of the base's and the tool's, which have no number."""
-        stems = (entry.stem for entry in self.entries)
+        return tuple(entry.name for entry in self.named(i))
+
+    def named(self, i: int) -> list[Entry]:
+        """Return the parameters of joint or link i with their names."""
         if self.at in ENDS:
-            return tuple(stems)
-        return tuple(stem.format(i) if "{}" in stem else f"{stem}{i}" for stem in stems)
+            return list(self.entries)
+        stems = [entry.name if "{}" in entry.name else entry.name + "{}" for entry in self.entries]
+        return [entry._replace(name=stem.format(i)) for entry, stem in zip(self.entries, stems, strict=True)]
 
     def places(self, joint_types: Sequence[str]) -> tuple[int, ...]:
         """Return the numbers of the joints or links that have it; the first for the base, the last for the tool."""
-        if self.at == "base":
-            return (1,)
-        if self.at == "tool":
-            return (len(joint_types),)
-        wanted = tuple(self.joints)
-        if not wanted:
-            wanted = ("revolute",) if self.at == "joint" else ("revolute", "prismatic")
+        if self.at in ENDS:
+            return (1 if self.at == "base" else len(joint_types),)
+        wanted = tuple(self.joints) or (("revolute",) if self.at == "joint" else ("revolute", "prismatic"))
         return tuple(i for i, kind in enumerate(joint_types, start=1) if i in wanted or kind in wanted)
 
 
@@ -268,16 +258,6 @@ def require_columns(columns: Mapping[str, str], where: str) -> None:
     for name, dimension in columns.items():
         if dimension not in ("", *DISPLAY):
             raise InputError(f"{where}, column {name}", repr(dimension), f"'' (no unit), {', '.join(DISPLAY)}")
-
-
-def _quantity(key: str, value: float, where: str) -> tuple[str, str, float]:
-    """Return the name, dimension and value [SI] of a number whose key carries a unit."""
-    place = f"term, {where}, key {key}"
-    stem, unit = split_unit(key)
-    if unit is None or unit.dimension not in DISPLAY:
-        units = [name for name, each in UNITS.items() if each.dimension in DISPLAY]
-        raise InputError(place, "no unit of the right dimension", f"a name with one of {', '.join(units)}")
-    return stem, unit.dimension, number(value, place) * unit.si
 
 
 def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
@@ -289,7 +269,7 @@ def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | N
     try:
         moves = term.moves(joint, *sizes)
     except (AttributeError, TypeError) as error:
-        accepted = f"moves({', '.join([term.at, *(entry.stem for entry in term.entries)])}) of what `Joint` has"
+        accepted = f"moves({', '.join([term.at, *(entry.name for entry in term.entries)])}) of what `Joint` has"
         raise InputError(f"term '{term.name}'", f"{type(error).__name__}: {error}", accepted) from error
     if isinstance(moves, list | tuple):
         moves = ca.vertcat(*moves)
@@ -342,10 +322,6 @@ def transmission(curve: Curve) -> Transmission:
     return Transmission(partial(_series, curve), dict.fromkeys(keys, EXPECTED_WAVE), joints=(curve.joint,), curve=curve)
 
 
-EXPECTED_WAVE = 1e-5
-"""Scale of one harmonic of a transmission error before it is estimated [rad]."""
-
-
 def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
     half = curve.period / 2
     u = math.pi / half * ca.fmin(ca.fmax(joint.q - curve.centre, -half), half)
@@ -376,11 +352,8 @@ class Model:
     >>> import rpim_opt as ro
     >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1}, joints=(2, 3))
     >>> problem = ro.load("position").problem.with_model(ro.Model(terms=[third]))
-    >>> problem.parameters.free.names[-2:], problem.robot.model.terms == (third,)
-    (('third2', 'third3'), True)
-    >>> result = ro.calibrate(problem, ro.tikhonov, weight=1.0)
-    >>> bool(abs(result.x[-2:]).max() < 1e-4)  # [rad]; this arm has none
-    True
+    >>> problem.parameters.free.names[-2:]
+    ('third2', 'third3')
 
     A tool that drifts with the hours of a column of the data:
 
@@ -395,14 +368,13 @@ class Model:
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", tuple(self.terms))
         own = [term for term in self.terms if not isinstance(term, Transmission)]  # those are one a joint
-        stems = [entry.stem for term in own for entry in term.entries]
+        stems = [entry.name for term in own for entry in term.entries]
         for stem in stems:
             if stems.count(stem) > 1:
                 raise InputError("model, terms", f"parameter '{stem}' twice", "a name of its own for every parameter")
-        for term in self.terms:
-            for name, dimension in term.columns.items():
-                if self.columns[name] != dimension:
-                    raise InputError("model, terms", f"column '{name}' in two dimensions", "one of them")
+        for name, dimension in (item for term in self.terms for item in term.columns.items()):
+            if self.columns[name] != dimension:
+                raise InputError("model, terms", f"column '{name}' in two dimensions", "one of them")
 
     @cached_property
     def columns(self) -> Mapping[str, str]:
@@ -416,14 +388,11 @@ class Model:
 
     def names(self, joint_types: Sequence[str]) -> tuple[str, ...]:
         """Return the names of all its parameters on an arm with these joints."""
-        return tuple(name for name, _ in entries_of(self, joint_types))
+        return tuple(entry.name for entry in self.entries(joint_types))
 
-
-def entries_of(model: Model, joint_types: Sequence[str]) -> Iterator[tuple[str, Entry]]:
-    """Yield the parameters of a model's terms by name."""
-    for term in model.terms:
-        for i in term.places(joint_types):
-            yield from zip(term.names(i), term.entries, strict=True)
+    def entries(self, joint_types: Sequence[str]) -> list[Entry]:
+        """Return all its parameters on an arm with these joints."""
+        return [entry for term in self.terms for i in term.places(joint_types) for entry in term.named(i)]
 
 
 class Dependencies(NamedTuple):
@@ -486,16 +455,6 @@ def terms_of(dof: int) -> tuple[Term, ...]:
         for axis in "xyz"
     ]
     return (*JOINT_TERMS, *bends)
-
-
-@lru_cache(2**14)
-def term_of(name: str, dof: int) -> tuple[Term, int]:
-    """Return the term of a parameter, and the joint (from 1) whose parameter it is."""
-    for i in range(1, dof + 1):
-        for term in terms_of(dof):
-            if name in term.names(i):
-                return term, i
-    raise InputError("term of a joint", f"'{name}'", ", ".join([*(term.name for term in JOINT_TERMS), "bend"]))
 
 
 def motion(

@@ -33,8 +33,8 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import together
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
+from rpim_opt.robot.chain import MOUNT, ORIGIN
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.origins import MOUNT, ORIGIN
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (

@@ -16,8 +16,7 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.robot.parameter_names import JOINT_OFFSET, is_joint_offset
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import JOINT_OFFSET, Parameters, is_joint_offset
 
 
 class PriorTable(Table):

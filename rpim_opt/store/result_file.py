@@ -36,8 +36,8 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.noise import Scatter
 from rpim_opt.problem.problem import CalibrationProblem, around
 from rpim_opt.problem.registration.global_start import JointMapping
+from rpim_opt.robot.chain import Carried, carried_by, displaced
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.origins import Carried, carried_by, displaced
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Curve, Model, Term, transmission
 from rpim_opt.store.own_code import is_own, own_object

@@ -33,8 +33,7 @@ from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, re
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import reflectors, tool_prefix
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
 from rpim_opt.use.export import noted
 from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
 from rpim_opt.use.reading import Targets, read_targets

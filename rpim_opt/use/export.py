@@ -29,13 +29,12 @@ from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.record import Requirement
-from rpim_opt.robot.chain import Described, placed, same_place
+from rpim_opt.robot.chain import MOUNT, ORIGIN, Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
-from rpim_opt.robot.origins import MOUNT, ORIGIN
-from rpim_opt.robot.parameter_names import frame_of, of_term, own_name, reflectors, tool_prefix
+from rpim_opt.robot.parameters import frame_of, of_term, own_name, reflectors, tool_prefix
 
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""

@@ -29,8 +29,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import knowing_sessions
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.parameter_names import is_joint_offset, of_session
-from rpim_opt.robot.parameters import Parameters
+from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
 
 FALSE_ALARM = 0.01

@@ -12,7 +12,7 @@ import scipy.linalg  # noqa: F401 - its BLAS, and NumPy's, are counted
 from threadpoolctl import threadpool_info, threadpool_limits
 
 from rpim_opt.basics import threads
-from rpim_opt.basics.threads import clock, one_blas_thread, phase
+from rpim_opt.basics.threads import one_blas_thread
 
 
 def test_linear_algebra_runs_on_one_thread_and_gets_its_threads_back() -> None:
@@ -130,21 +130,3 @@ def test_a_fork_has_threads_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
         os.waitpid(child, 0)
         pytest.fail("the child waits for threads that it does not have")
     assert os.waitstatus_to_exitcode(status) == 0
-
-
-def test_phases_of_threads_count_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(threads, "cores", lambda: 2)
-
-    def work(_: int) -> None:
-        with phase("evaluation"):
-            time.sleep(0.02)
-
-    with clock() as running:
-        threads.on_all_cores(work, range(4))
-        with phase("reduction"):
-            threads.on_all_cores(work, range(2))  # counts as the caller's
-        seconds = dict(running.rows())
-        whole = time.perf_counter() - running.started
-    assert seconds["evaluation"] >= 0.04  # four of 0.02 s on two threads
-    assert seconds["reduction"] >= 0.02
-    assert sum(seconds.values()) <= whole

@@ -16,8 +16,7 @@ from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem.blocks import PartitionedProblem
 from rpim_opt.problem.multi_robot import unknown_sessions
-from rpim_opt.robot.parameter_names import of_session
-from rpim_opt.robot.parameters import model_parameters
+from rpim_opt.robot.parameters import model_parameters, of_session
 from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
 
 SHIFT, TURN = 3e-4, 1e-4

@@ -35,8 +35,7 @@ from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
-from rpim_opt.robot.parameters import Parameters, model_parameters
+from rpim_opt.robot.parameters import Parameters, model_parameters, tool_prefix
 
 ENOUGH = 2000
 """Rows of a measurement that register frames, where there are more."""

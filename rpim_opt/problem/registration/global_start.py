@@ -20,7 +20,7 @@ from rpim_opt.problem.registration.closed_forms import proper, rigid, transforme
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import tool_prefix
 
 UNEXPLAINED = 0.01
 """Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""

@@ -15,7 +15,7 @@ from rpim_opt.problem.registration.camera import posed
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, proper, rigid, transforms
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameter_names import tool_prefix
+from rpim_opt.robot.parameters import tool_prefix
 
 MOST_ROWS = 300
 """Rows that are tried, evenly spread where there are more."""

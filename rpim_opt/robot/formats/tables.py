@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -154,6 +155,13 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     return replace(robot, limits=np.array([limits[i] for i in robot.leading], dtype=float))
 
 
+def _ending(path: Path) -> str:
+    ending = path.suffix.lower()
+    if ending not in ENDINGS:
+        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(ENDINGS), path)
+    return ending
+
+
 # Reading
 
 
@@ -188,13 +196,6 @@ def read_robot(path: str | Path) -> Robot:
     if not isinstance(content, dict):
         raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
     return _robot(content, path)
-
-
-def _ending(path: Path) -> str:
-    ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(ENDINGS), path)
-    return ending
 
 
 def read_sheet(path: Path, convention: str = "") -> Described:
@@ -252,28 +253,22 @@ def _from_standard(robot: Robot) -> Described:
     return Described(replace(robot, mdh=mdh), frame_numbers(base), frame_numbers(tool))
 
 
-def _joint(cells: dict[str, Any]) -> dict[str, Any]:
+def _joint(cells: dict[str, str]) -> dict[str, Any]:
     """Return the keys of ``[[joint]]`` from a row, whose empty cells are left out."""
     joint: dict[str, Any] = {}
     for name, text in cells.items():
         if text and name != "note":
+            joint[name] = text
             if name.startswith("theta"):
                 text = ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0"
-            joint[name] = _cell(text)
+            for kind in (float, int):
+                with suppress(ValueError):
+                    joint[name] = kind(text)
     for unit in UNITS:
         pair = [joint.pop(f"{which}_{unit}", None) for which in LIMITS]
         if any(value is not None for value in pair):
             joint[f"limits_{unit}"] = pair
     return joint
-
-
-def _cell(text: str) -> Any:
-    for kind in (int, float):
-        try:
-            return kind(text)
-        except ValueError:
-            pass
-    return text
 
 
 # Writing
@@ -302,13 +297,11 @@ def write_robot(robot: Robot, path: str | Path) -> None:
     if ending == ".json":
         write_json(path, content)
     elif ending == ".csv":
-        write_text(path, _csv(robot, content, path))
+        write_text(path, _csv(content, _in_si(robot), path))
     else:
         joints = content.pop("joint")
-        carried = content.pop("payload", None)
-        blocks = [("", content)]
-        if carried:
-            blocks.append(("[payload]\n", carried))
+        payload = content.pop("payload", None)
+        blocks = [("", content), *([("[payload]\n", payload)] if payload else [])]
         blocks += [("[[joint]]\n", joint) for joint in joints]
         lines = [head + "\n".join(f"{key} = {toml(value)}" for key, value in keys.items()) for head, keys in blocks]
         write_text(path, "\n\n".join(lines) + "\n")
@@ -367,9 +360,8 @@ def _content(robot: Robot) -> dict[str, Any]:
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
     joints = [_keys(robot, i, _in_si(robot)) for i in range(n)]
-    for joint, sign in zip(joints, signs, strict=False):
-        if plain and sign < 0:
-            joint["sign"] = -1
+    for joint, sign in zip(joints, signs if plain else (), strict=False):
+        joint |= {"sign": -1} if sign < 0 else {}
     gravity = robot.gravity
     if gravity.direction != MOUNTINGS["floor"]:
         words = {direction: word for word, direction in MOUNTINGS.items()}
@@ -430,24 +422,18 @@ def toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _csv(robot: Robot, content: dict[str, Any], path: Path) -> str:
+def _csv(content: dict[str, Any], in_si: bool, path: Path) -> str:
     for key, what in WITHOUT_COLUMN.items():
         if key in content:
             raise InputError("robot", what, "a name ending in .toml or .json", path)
-    in_si = _in_si(robot)
-    rows = [_cells(_keys(robot, i, in_si) | {"sign": joint.get("sign", 1)}) for i, joint in enumerate(content["joint"])]
     units = {column: SI[kind] if in_si else display(kind)[0] for column, kind in MDH_DIMENSION.items()}
     header = [f"{column}_{unit}" for column, unit in units.items()]
-    signs = {"sign"} if all(row["sign"] == 1 for row in rows) else set()
-    header += sorted({key for row in rows for key in row} - set(header) - signs)
-    table = ([*(row.get(key, 0.0 if key in header[:5] else "") for key in header), "modified"] for row in rows)
-    return csv_text([*header, "convention"], table)
-
-
-def _cells(joint: dict[str, Any]) -> dict[str, Any]:
-    """Return a joint's keys with the two limits in cells of their own."""
-    cells = {key: value for key, value in joint.items() if not key.startswith("limits_")}
-    for key in joint.keys() - cells.keys():
-        unit = key.removeprefix("limits_")
-        cells |= {f"{which}_{unit}": value for which, value in zip(LIMITS, joint[key], strict=True)}
-    return cells
+    rows = [dict.fromkeys(header, 0.0) | joint for joint in content["joint"]]
+    for row in rows:
+        for unit in UNITS:  # the two limits in cells of their own
+            pair = zip(LIMITS, row.pop(f"limits_{unit}", ()), strict=False)
+            row |= {f"{which}_{unit}": value for which, value in pair}
+    if any("sign" in row for row in rows):
+        rows = [{"sign": 1} | row for row in rows]
+    header += sorted({key for row in rows for key in row} - set(header))
+    return csv_text([*header, "convention"], ([*(row.get(key, "") for key in header), "modified"] for row in rows))

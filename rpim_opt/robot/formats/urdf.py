@@ -9,7 +9,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
@@ -25,12 +25,18 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import read_bytes, write_bytes
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
+    MOUNT,
+    ORIGIN,
     ROUNDING,
     XACRO,
+    Carried,
     Chain,
     Described,
+    Displaced,
+    Origin,
     corrected,
     describe,
+    displaced,
     origin_numbers,
     reach,
     require_same_arm,
@@ -38,7 +44,6 @@ from rpim_opt.robot.chain import (
 )
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Gravity, Robot, Vector
-from rpim_opt.robot.origins import Carried, Displaced, Origin, displaced, origin_prefix
 from rpim_opt.robot.terms import Model
 
 DEEPEST = 100
@@ -83,32 +88,30 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     ('origin_j1_x', 'origin_j1_y')
     """
     urdf = _read(Path(path))
-    steps = urdf.path_between(base, tip)
-    chain = _chain(urdf, steps)
-    if origins:
-        steps = [_still(steps[0].start, urdf.path), *steps]
-        chain = _chain(urdf, steps)
+    way = _Way(urdf, urdf.steps_between(base, tip))
+    chain = way.chain
+    joints, names, joint_map, offsets = way.followed
+    if origins:  # a row that no joint moves stands before the others
         urdf.prefixes()
-    joints = [step.joint for step in steps if step.joint.kind]
+        chain = Chain(np.array([np.eye(4), *chain.origins]), np.array([[0.0, 0.0, 1.0], *chain.axes]), chain.tail)
+        joint_map, offsets = (np.vstack([0 * numbers[:1], numbers]) for numbers in (joint_map, offsets))
     table, T_base, T_tool, G = describe(chain)
-    names, joint_map, offsets = _followed(urdf, joints)
-    if origins:  # the first row has no joint
-        names, joint_map = names[1:], joint_map[:, 1:]
-    T_top_base = np.linalg.inv(_product([step.constant for step in steps if step.up]))
+    T_top_base = np.linalg.inv(_product([step.constant for step in way.steps if step.up]))
     robot = Robot(
         name=urdf.name,
         mdh=table + offsets,
-        joint_types=tuple(joint.kind for joint in joints),
+        joint_types=(*["revolute"] * origins, *(joint.kind for joint in joints)),
         joint_map=joint_map,
         limits=np.array([urdf.joints[name].limits for name in names]),
-        source=f"{urdf.path.name}, {steps[0].start} to {steps[-1].end}",
-        gravity=_masses(urdf, steps, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
-        model=Model(_displacements(steps, table, G) if origins else ()),
+        source=f"{urdf.path.name}, {way.steps[0].start} to {way.steps[-1].end}",
+        gravity=_masses(way, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
+        model=Model(_displacements(way, table, G) if origins else ()),
     )
     for name, i in zip(names, robot.leading, strict=True):
-        if joints[i].kind != urdf.joints[name].kind:
+        joint = joints[i - origins]
+        if joint.kind != urdf.joints[name].kind:
             found = f"motion that follows joint '{name}' of another kind, which is not between base and tip"
-            raise joints[i].error("mimic", found, "a joint of its own kind, or on the way")
+            raise joint.error("mimic", found, "a joint of its own kind, or on the way")
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), names)
 
 
@@ -154,33 +157,53 @@ def write_urdf(
     if Path(target).suffix.lower() == XACRO:
         raise InputError("the target", "a xacro file", "a file .urdf, for what it expands to", target)
     urdf = _read(Path(source))
-    steps = urdf.path_between(base, tip)
-    chain = _chain(urdf, steps)
-    table, T_base, T_tool, G = describe(chain)
-    joints = [step.joint for step in steps if step.joint.kind]
-    _, joint_map, offsets = _followed(urdf, joints)
+    way = _Way(urdf, urdf.steps_between(base, tip))
+    table, T_base, T_tool, G = describe(way.chain)
+    joints, _, joint_map, offsets = way.followed
     require_same_arm(robot, table + offsets, tuple(joint.kind for joint in joints), urdf.path, joint_map)
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
     origins, tail = corrected(G, robot.mdh - offsets, T_base, T_tool)
     size = reach(robot.mdh, T_base, T_tool)
     edits: dict[tuple[int, int], str] = {}
-    for between, old, new in zip(_rigid_parts(steps), [*chain.origins, chain.tail], [*origins, tail], strict=True):
+    before = [*way.chain.origins, way.chain.tail]
+    for between, old, new in zip(way.parts, before, [*origins, tail], strict=True):
         if between:  # one origin takes the whole correction
             taker = _taker(between)
-            before = _product([step.constant for step in between[:taker]])
-            after = _product([step.constant for step in between[taker + 1 :]])
             step = between[taker]
-            T = _inverse(before) @ new @ _inverse(after)
+            left = _product([each.constant for each in between[:taker]])
+            right = _product([each.constant for each in between[taker + 1 :]])
+            T = _inverse(left) @ new @ _inverse(right)
             edits |= step.joint.origin_edits(urdf.data, _inverse(T) if step.up else T, size)
         elif np.abs(new - old).max() > 10 * ROUNDING * size:
             at_tip = new is tail
-            step = steps[-1 if at_tip else 0]
+            step = way.steps[-1 if at_tip else 0]
             what = f"a tool or beta{len(table)}" if at_tip else "a base"
             found = f"{what} that moves link '{step.end if at_tip else step.start}'"
             accepted = f"a link that a fixed joint holds, as joint '{step.joint.name}' cannot express it"
             raise InputError("robot", found, f"{accepted}, or no such correction", urdf.path)
     write_bytes(Path(target), spliced(urdf.data, edits))
+
+
+def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
+    """Write a URDF file with displaced origins, every other byte as in the original.
+
+    ``deviations`` are six numbers each [m, rad], by the prefix of the parameters, ``origin_{joint}_``: x, y, z, roll,
+    pitch, yaw in the parent link's frame of what comes before the origin. Prefixes that no joint has are refused.
+    """
+    urdf = _read(Path(source))
+    edits: dict[tuple[int, int], str] = {}
+    known = urdf.prefixes()
+    for prefix, six in deviations.items():
+        if prefix not in known:
+            raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known), urdf.path)
+        joint = known[prefix]
+        T = numeric_frame(six) @ joint.origin
+        edits |= joint.origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
+    write_bytes(Path(target), spliced(urdf.data, edits))
+
+
+# The way between two links
 
 
 @dataclass(frozen=True, eq=False)
@@ -204,47 +227,73 @@ class _Step:
         return self.joint.parent if self.up else self.joint.child
 
 
-def _still(link: str, path: Path) -> _Step:
-    """Return a joint about z that carries a link and does not move."""
-    element = _Placed("joint", {"type": "revolute"})
-    for tag, attributes in (("parent", {"link": link}), ("child", {"link": link}), ("axis", {"xyz": "0 0 1"})):
-        element.append(_Placed(tag, attributes))
-    return _Step(_Joint(element, "", path), up=False)
+@dataclass(frozen=True, eq=False)
+class _Way:
+    """The steps from one link to another."""
+
+    urdf: _Urdf
+    steps: Sequence[_Step]
+
+    @cached_property
+    def parts(self) -> list[list[_Step]]:
+        """The steps whose origins stand before the first motion, between the motions and after the last one."""
+        parts: list[list[_Step]] = [[]]
+        for step in self.steps:
+            if step.up and step.joint.kind:
+                parts.append([step])
+                continue
+            parts[-1].append(step)
+            if step.joint.kind:
+                parts.append([])
+        return parts
+
+    @cached_property
+    def chain(self) -> Chain:
+        """The geometry of the joints that move."""
+        moving = [step for step in self.steps if step.joint.kind]
+        if not moving:
+            accepted = "a revolute, continuous or prismatic joint"
+            raise InputError("the chain", "no joint that moves", accepted, self.urdf.path)
+        *origins, tail = [_product([step.constant for step in part]) for part in self.parts]
+        axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
+        return Chain(np.array(origins), np.array(axes), tail)
+
+    @cached_property
+    def followed(self) -> tuple[list[_Joint], tuple[str, ...], Array, Array]:
+        """The n joints, those that they follow by name, the joint map (n, k), and offsets (n, 5) of theta and d.
+
+        A mimic joint is at multiplier times the followed joint's value plus offset, which the table's row takes.
+        """
+        joints = [step.joint for step in self.steps if step.joint.kind]
+        motions = [self.urdf.followed(joint) for joint in joints]
+        names = tuple(dict.fromkeys(name for name, _, _ in motions))
+        joint_map = np.zeros((len(joints), len(names)))
+        offsets = np.zeros((len(joints), 5))
+        for i, (joint, (name, multiplier, offset)) in enumerate(zip(joints, motions, strict=True)):
+            joint_map[i, names.index(name)] = multiplier
+            offsets[i, 2 if joint.kind == "revolute" else 3] = offset
+        return joints, names, joint_map, offsets
 
 
-def _displacements(steps: Sequence[_Step], table: Array, G: Array) -> list[Displaced]:
+def _taker(part: Sequence[_Step]) -> int:
+    """Return which origin of a rigid part takes its correction: of the joint after, before, or a fixed one."""
+    return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
+
+
+def _displacements(way: _Way, table: Array, G: Array) -> list[Displaced]:
     """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
     terms = []
-    for row, part in enumerate(_rigid_parts(steps)[1:], start=1):
+    for row, part in enumerate(way.parts, start=1):
         F = numeric_link(beta=-table[row - 1, 4]) @ G[row - 1]
         taker = _taker(part)
         origins = []
         for i, step in enumerate(part):
             before, F = F, F @ step.constant
             if step.joint.kind or i == taker:
-                prefix = origin_prefix(step.joint.name, bool(step.joint.kind))
-                origins.append(Origin(prefix, F if step.up else before, step.up))
+                origins.append(Origin(step.joint.prefix, F if step.up else before, step.up))
         if origins:
             terms.append(displaced(Carried(row, tuple(origins))))
     return terms
-
-
-def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
-    """Write a URDF file with displaced origins, every other byte as in the original.
-
-    ``deviations`` are six numbers each [m, rad], by the prefix of the parameters, ``origin_{joint}_``: x, y, z, roll,
-    pitch, yaw in the parent link's frame of what comes before the origin. Prefixes that no joint has are refused.
-    """
-    urdf = _read(Path(source))
-    edits: dict[tuple[int, int], str] = {}
-    known = urdf.prefixes()
-    for prefix, six in deviations.items():
-        if prefix not in known:
-            raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known), urdf.path)
-        joint = known[prefix]
-        T = numeric_frame(six) @ joint.origin
-        edits |= joint.origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
-    write_bytes(Path(target), spliced(urdf.data, edits))
 
 
 def _inverse(T: Array) -> Array:
@@ -253,49 +302,6 @@ def _inverse(T: Array) -> Array:
 
 def _product(transforms: Sequence[Array]) -> Array:
     return functools.reduce(np.matmul, transforms, np.eye(4))
-
-
-def _rigid_parts(steps: Sequence[_Step]) -> list[list[_Step]]:
-    """Return the steps whose origins stand before the first motion, between the motions and after the last one."""
-    parts: list[list[_Step]] = [[]]
-    for step in steps:
-        if step.up and step.joint.kind:
-            parts.append([step])
-            continue
-        parts[-1].append(step)
-        if step.joint.kind:
-            parts.append([])
-    return parts
-
-
-def _taker(part: Sequence[_Step]) -> int:
-    """Return which origin of a rigid part takes its correction: of the joint after, before, or a fixed one."""
-    return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
-
-
-def _chain(urdf: _Urdf, steps: Sequence[_Step]) -> Chain:
-    """Return the geometry of the joints that move."""
-    moving = [step for step in steps if step.joint.kind]
-    if not moving:
-        raise InputError("the chain", "no joint that moves", "a revolute, continuous or prismatic joint", urdf.path)
-    *origins, tail = [_product([step.constant for step in part]) for part in _rigid_parts(steps)]
-    axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
-    return Chain(np.array(origins), np.array(axes), tail)
-
-
-def _followed(urdf: _Urdf, joints: Sequence[_Joint]) -> tuple[tuple[str, ...], Array, Array]:
-    """Return the joints that others follow by name, the joint map (n, k), and offsets (n, 5) of theta and d.
-
-    A mimic joint is at multiplier times the followed joint's value plus offset, which the table's row takes.
-    """
-    motions = [urdf.followed(joint) for joint in joints]
-    names = tuple(dict.fromkeys(name for name, _, _ in motions))
-    joint_map = np.zeros((len(joints), len(names)))
-    offsets = np.zeros((len(joints), 5))
-    for i, (joint, (name, multiplier, offset)) in enumerate(zip(joints, motions, strict=True)):
-        joint_map[i, names.index(name)] = multiplier
-        offsets[i, 2 if joint.kind == "revolute" else 3] = offset
-    return names, joint_map, offsets
 
 
 # Elements
@@ -332,17 +338,15 @@ class _Joint:
         return InputError(f"joint '{self.name}', {what}", found, accepted, self.path)
 
     def _only(self, tag: str) -> _Element | None:
-        elements = self.element.findall(tag)
-        if len(elements) > 1:
-            raise self.error(tag, f"{len(elements)} of them", "one")
-        return elements[0] if elements else None
+        elements = [*self.element.findall(tag), None]
+        if len(elements) > 2:
+            raise self.error(tag, f"{len(elements) - 1} of them", "one")
+        return elements[0]
 
     def _numbers(self, tag: str, attribute: str, default: str, count: int) -> Array:
         """Return the numbers of an attribute, its default where it or its element is absent."""
         element = self._only(tag)
-        text = default
-        if element is not None:
-            text = element.get(attribute, default)
+        text = default if element is None else element.get(attribute, default)
         numbers = _numbers(text, count, LARGEST_NUMBER if count > 1 else math.inf)  # limits may be any number
         if numbers is None:
             wanted = "a finite number" if count == 1 else f"{count} finite numbers"
@@ -360,14 +364,18 @@ class _Joint:
         return KINDS[kind]
 
     @property
+    def prefix(self) -> str:
+        """Of the parameters of its origin: ``origin_torso_1_joint_``, of a fixed joint ``mount_..``."""
+        return f"{ORIGIN if self.kind else MOUNT}{re.sub(r'[^0-9A-Za-z]+', '_', self.name)}_"
+
+    @property
     def mimic(self) -> tuple[str, float, float] | None:
         """The joint that it follows, the multiplier and the offset [rad or m]; None for one that moves on its own."""
         element = self._only("mimic")
         if element is None:
             return None
-        multiplier, offset = (
-            float(self._numbers("mimic", *each, 1)[0]) for each in (("multiplier", "1"), ("offset", "0"))
-        )
+        multiplier = float(self._numbers("mimic", "multiplier", "1", 1)[0])
+        offset = float(self._numbers("mimic", "offset", "0", 1)[0])
         if not 0 < abs(multiplier) <= LARGEST_NUMBER:
             raise self.error("mimic multiplier", f"{multiplier:g}", "a number that is not zero")
         return element.get("joint", ""), multiplier, offset
@@ -449,20 +457,31 @@ class _Urdf:
         """Return the joints by the prefix of their origins' parameters; InputError where two have the same."""
         known: dict[str, _Joint] = {}
         for joint in self.joints.values():
-            prefix = origin_prefix(joint.name, bool(joint.kind))
-            if prefix in known:
-                found = f"the parameters {prefix}* of joint '{known[prefix].name}', too"
+            other = known.setdefault(joint.prefix, joint)
+            if other is not joint:
+                found = f"the parameters {joint.prefix}* of joint '{other.name}', too"
                 raise joint.error("name", found, "names that differ in letters or digits")
-            known[prefix] = joint
         return known
 
-    def path_between(self, base: str | None, tip: str | None) -> list[_Step]:
+    def steps_between(self, base: str | None, tip: str | None) -> list[_Step]:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
         for given in (base, tip):
             if given is not None and given not in self.links:
                 raise InputError(f"link '{given}'", "nothing", choices(given, self.links), self.path)
-        base = base or self._root()
-        tip = tip or self._leaf(base)
+        if base is None:
+            roots = [link for link in self.links if link not in self.above]
+            if len(roots) > 1:
+                accepted = "one of them: --urdf-base, urdf_base in problem.toml, or the argument base"
+                raise InputError("links without a parent", ", ".join(roots), accepted, self.path)
+            base = roots[0]
+        if tip is None:
+            parents = {joint.parent for joint in self.above.values()}
+            leaves = [link for link in self.links if link not in parents and link != base] or [base]
+            below = [link for link in leaves if any(joint.parent == base for joint in self._to_root(link))] or leaves
+            if len(below) > 1:
+                accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
+                raise InputError(f"links at the end of chains from '{base}'", ", ".join(below), accepted, self.path)
+            tip = below[0]
         up, down = self._to_root(base), self._to_root(tip)
         while up and down and up[-1] is down[-1]:
             up.pop()
@@ -478,14 +497,6 @@ class _Urdf:
             joints.append(self.above[link])
             link = joints[-1].parent
         return joints
-
-    def above_until(self, link: str, known: Collection[str]) -> list[_Joint] | None:
-        """Return the joints from a link up to the first known one; None where no known one is above."""
-        if link in known:
-            return []
-        joints = self._to_root(link)
-        count = next((i for i, joint in enumerate(joints, start=1) if joint.parent in known), None)
-        return None if count is None else joints[:count]
 
     @cached_property
     def joints(self) -> dict[str, _Joint]:
@@ -506,25 +517,6 @@ class _Urdf:
                 raise seen[-1].error("mimic", f"joint '{name}'", "a joint that moves, and does not follow this one")
             seen.append(self.joints[name])
         return seen[-1].name, factor, offset
-
-    def _root(self) -> str:
-        roots = [link for link in self.links if link not in self.above]
-        if len(roots) > 1:
-            accepted = "one of them: --urdf-base, urdf_base in problem.toml, or the argument base"
-            raise InputError("links without a parent", ", ".join(roots), accepted, self.path)
-        return roots[0]
-
-    def _leaf(self, base: str) -> str:
-        parents = {joint.parent for joint in self.above.values()}
-        leaves = [link for link in self.links if link not in parents and link != base]
-        below = [link for link in leaves if any(joint.parent == base for joint in self._to_root(link))]
-        if not leaves:
-            return base
-        if len(below) != 1:
-            accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
-            found = ", ".join(below or leaves)
-            raise InputError(f"links at the end of chains from '{base}'", found, accepted, self.path)
-        return below[0]
 
 
 def _read(path: Path) -> _Urdf:
@@ -625,34 +617,39 @@ def _urdf_text(path: Path) -> bytes:
 # Masses
 
 
-def _masses(urdf: _Urdf, steps: Sequence[_Step], table: Array, G: Array) -> Gravity:
-    """Return the mass that each moving joint of a chain carries up to the next, and its centre in the table's frames.
+def _masses(way: _Way, table: Array, G: Array) -> Gravity:
+    """Return the mass that each row of the table carries up to the next, and its centre in the table's frames.
 
     Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
     cannot be read beside the chain is left out, as it is elsewhere. No masses where nothing that moves has one, or the
     base itself is moved.
     """
-    if any(step.up and step.joint.kind for step in steps):
+    if any(step.up and step.joint.kind for step in way.steps):
         return Gravity()
-    frames = {steps[0].start: (0, np.eye(4))}  # which moving joint (from 1; 0: none) carries a link, and where it is
-    for step in steps:
+    first = len(table) - len(way.chain.axes)  # rows that no joint moves
+    frames = {way.steps[0].start: (first, np.eye(4))}  # the row (from 1; 0: none) that carries a link, and its place
+    for step in way.steps:
         i, T = frames[step.start]
         frames[step.end] = (i + 1, np.eye(4)) if step.joint.kind else (i, T @ step.constant)
     masses = np.zeros(len(table))
     moments = np.zeros((len(table), 3))
-    for name, body in urdf.links.items():
-        mass, centre = _inertial(urdf, name, body, name in frames)
-        above = urdf.above_until(name, frames)
-        if not mass or above is None:
-            continue
-        i, T = frames[above[-1].parent if above else name]
+    for name, body in way.urdf.links.items():
+        place = np.eye(4)  # of the link in that of the chain that carries it
+        carrier = name
         try:
-            T = T @ _product([joint.origin for joint in reversed(above)])
+            while carrier not in frames and carrier in way.urdf.above:
+                joint = way.urdf.above[carrier]
+                place = joint.origin @ place
+                carrier = joint.parent
+            mass, centre = _inertial(way.urdf, name, body)
         except InputError:
+            if name in frames:
+                raise
             continue
+        i, T = frames.get(carrier, (0, place))
         if i:
             masses[i - 1] += mass
-            moments[i - 1] += mass * (T[:3, :3] @ centre + T[:3, 3])
+            moments[i - 1] += mass * (T @ place @ [*centre, 1])[:3]
     if not masses.any():
         return Gravity()
     centres: list[Vector] = []
@@ -663,18 +660,13 @@ def _masses(urdf: _Urdf, steps: Sequence[_Step], table: Array, G: Array) -> Grav
     return Gravity(masses=tuple(masses.tolist()), centres=tuple(centres))
 
 
-def _inertial(urdf: _Urdf, name: str, body: _Element, required: bool) -> tuple[float, Array]:
+def _inertial(urdf: _Urdf, name: str, body: _Element) -> tuple[float, Array]:
     """Return the mass [kg] of a link and its centre (3,) in the link's frame [m]; no mass where none is stated."""
-    inertial = body.findall("inertial")
-    if not inertial:
-        return 0.0, np.zeros(3)
-    attributes = {each.tag: each.attrib for each in inertial[0]}
-    mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
-    centre = _numbers(attributes.get("origin", {}).get("xyz", "0 0 0"), 3)
-    if mass is not None and centre is not None and mass[0] >= 0:
-        return float(mass[0]), centre
-    if not required:
-        return 0.0, np.zeros(3)
-    found = f"mass {attributes.get('mass')}, origin {attributes.get('origin')}"
-    accepted = "a mass that is not negative, and three finite numbers"
-    raise InputError(f"link '{name}', inertial", found[:80], accepted, urdf.path)
+    found = {each.tag: each.attrib for inertial in body.findall("inertial")[:1] for each in inertial}
+    mass = _numbers(found.get("mass", {}).get("value", "0"), 1)
+    centre = _numbers(found.get("origin", {}).get("xyz", "0 0 0"), 3)
+    if mass is None or centre is None or mass[0] < 0:
+        shown = f"mass {found.get('mass')}, origin {found.get('origin')}"
+        accepted = "a mass that is not negative, and three finite numbers"
+        raise InputError(f"link '{name}', inertial", shown[:80], accepted, urdf.path)
+    return float(mass[0]), centre
