@@ -159,11 +159,8 @@ class Dataset(Tabled):
     @property
     def robot(self) -> tuple[str, ...]:
         """Whose rows they are, N names; ``""`` for the only robot."""
-        names = [""] * len(self)
-        for block in self.blocks:
-            for row in block.row:
-                names[row] = block.robot
-        return tuple(names)
+        names = {row: block.robot for block in self.blocks for row in block.row}
+        return tuple(names[row] for row in range(len(self)))
 
     @property
     def sessions(self) -> tuple[str, ...]:
@@ -180,12 +177,6 @@ class Dataset(Tabled):
         """Return the numbers (k,) of the configurations of every session, for cross-validation by sessions (`k_fold`).
 
         Rows that name no session are one more. Sessions that share a configuration stand together.
-
-        >>> import rpim_opt as ro
-        >>> data = ro.load("position").problem.data
-        >>> days = ro.Dataset.of(data.q, data.blocks[0].y, 3e-5, session=["Monday"] * 15 + ["Tuesday"] * 25)
-        >>> [len(part) for part in days.by_session()], days.sessions
-        ([15, 25], ('Monday', 'Tuesday'))
         """
         parts: list[np.ndarray] = []
         for name in ("", *self.sessions):
@@ -205,14 +196,7 @@ class Dataset(Tabled):
 
     @classmethod
     def of_robots(cls, parts: Mapping[str, Dataset]) -> Dataset:
-        """Return the measurements of several robots, by their names, as one, as a problem of `together` takes them.
-
-        >>> import rpim_opt as ro
-        >>> data = ro.load("paper_arm").problem.data
-        >>> both = ro.Dataset.of_robots({"left": data, "right": data})
-        >>> len(both), both.label[0], both.robot[-1], len(both.of_robot("right"))
-        (18, 'left:T2-1', 'right', 9)
-        """
+        """Return the measurements of several robots, by their names, as one, as a problem of `together` takes them."""
         for name, part in parts.items():
             if any(part.robot):
                 raise InputError(f"data of '{name}'", "rows of several robots", "those of one")
@@ -242,24 +226,16 @@ class Dataset(Tabled):
         for i, block in enumerate(self.blocks):
             owner[block.row] = i
             place[block.row] = np.arange(len(block.row))
-        blocks = []
-        for i, block in enumerate(self.blocks):
-            row = np.flatnonzero(owner[index] == i)
-            if len(row):
-                blocks.append(block.take(place[index[row]], row))
-        return Dataset(tuple(blocks), tuple(self.label[i] for i in index), self.configuration[index])
+        rows = [np.flatnonzero(owner[index] == i) for i in range(len(self.blocks))]
+        parts = zip(self.blocks, rows, strict=True)
+        blocks = tuple(block.take(place[index[row]], row) for block, row in parts if len(row))
+        return Dataset(blocks, tuple(self.label[i] for i in index), self.configuration[index])
 
     def grouped_by_points(self) -> Dataset:
         """Return measurements in which rows that one unknown point ties together have one number of configuration.
 
         Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
         configuration: a fold of a cross-validation has all of them or none.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> touched = ro.data.touches(np.zeros((4, 6)), ["A", "B", "A", "B"], sigma=2e-5)
-        >>> touched.grouped_by_points().configuration.tolist()
-        [0, 1, 0, 1]
         """
         group: dict[Any, Any] = {}
 
@@ -282,13 +258,7 @@ class Dataset(Tabled):
         return self.take([i for i, label in enumerate(self.label) if label not in labels])
 
     def configurations(self, count: int, seed: int) -> Dataset:
-        """Return the rows of so many configurations drawn at random; the same seed gives the same rows.
-
-        >>> import rpim_opt as ro
-        >>> data = ro.load("markers").problem.data  # three reflectors: three rows a configuration
-        >>> len(data), len(data.configurations(5, seed=0))
-        (75, 15)
-        """
+        """Return the rows of so many configurations drawn at random; the same seed gives the same rows."""
         known = np.unique(self.configuration)
         if not 0 < count <= len(known):
             raise InputError("count", f"{count}", f"1 to {len(known)} configurations")
@@ -358,12 +328,9 @@ class Dataset(Tabled):
         N = len(q)
         points, c = measurement.points, len(measurement.columns)
         fits = q.ndim == 3 and q.shape[:2] == (len(y), points) and y.shape[1:] == (c,)
-        if not fits or not np.isfinite(q).all() or not np.isfinite(y).all():
-            accepted = f"finite numbers, {points} x dof joint and {c} measured values a row"
+        if not fits or not (np.abs(q) <= LARGEST).all() or not (np.abs(y) <= LARGEST).all():
+            accepted = f"numbers up to {LARGEST:g} m or rad, {points} x dof joint and {c} measured values a row"
             raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
-        largest = max(np.abs(q).max(initial=0.0), np.abs(y).max(initial=0.0))
-        if largest > LARGEST:
-            raise InputError("q and y", f"{largest:g}", f"magnitudes of at most {LARGEST:g} m or rad")
         k = len(measurement.components)
         rows = np.arange(N)
         covariance = np.array(sigma, dtype=float)
@@ -395,12 +362,6 @@ class Dataset(Tabled):
 
         Rows of different parts belong to the same configuration when their joint values are equal. The ``names`` of the
         parts precede labels, ``name:label``, where labels occur twice.
-
-        >>> import rpim_opt as ro
-        >>> data = ro.load("paper_arm").problem.data
-        >>> twice = ro.Dataset.together([data, data], ["morning", "evening"])
-        >>> len(twice), twice.label[0], len(set(twice.configuration))
-        (18, 'morning:T2-1', 9)
         """
         whole = cls.concatenated(parts, names)
         stop = np.unique(whole.q, axis=0, return_inverse=True)[1].reshape(-1)

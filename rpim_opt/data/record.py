@@ -60,36 +60,30 @@ class Requirement:
     @property
     def where(self) -> str:
         """The region in words."""
-        said: list[str] = []
+        box = ""
         if self.box is not None:
             sides = [f"{axis} {1e3 * a:g} to {1e3 * b:g}" for axis, (a, b) in zip("xyz", self.box, strict=True)]
-            said.append(f"the box {', '.join(sides)} mm of the base frame")
+            box = f"the box {', '.join(sides)} mm of the base frame, "
         if not self.joints:
-            return ", ".join([*said, "joints within the measured ranges"])
+            return f"{box}joints within the measured ranges"
         stated = ", ".join(str(joint) for joint, _ in self.joints)
-        return ", ".join([*said, f"joints {stated} within the stated ranges, others within the measured ones"])
+        return f"{box}joints {stated} within the stated ranges, others within the measured ones"
 
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
     """Errors on rows that a calibration did not see, kept when these rows are used in their turn.
 
-    They validate the procedure: data, model, formulation and weight rule. The parameters that are delivered come from
-    all rows.
+    They validate the procedure; the parameters that are delivered come from all rows.
 
     ``label`` are N held-out rows, ``used`` is how many rows the parameters that were judged came from; ``nominal`` and
     ``error`` (N,) are errors before and after [m], NaN for rows that measure no length. ``sigmas`` and ``allowed`` (N,)
-    are as of `Validation`: the residual in standard deviations of its prediction, and what of it is allowed; NaN where
-    there is no covariance. ``coverage`` is the share of the lengths that lay in the 95 % interval of a reading; None
-    without covariance.
+    are as of `Validation`; ``coverage`` is the share of the lengths in the 95 % interval of a reading; None without
+    covariance.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
-    >>> instance = ro.load("position")
-    >>> result = ro.calibration.refit_all(instance.calibrate())
-    >>> held_out = result.record.held_out
-    >>> len(held_out.label), held_out.used, len(result.problem.data)
+    >>> result = ro.calibration.refit_all(ro.load("position").calibrate())
+    >>> len(result.record.held_out.label), result.record.held_out.used, len(result.problem.data)
     (40, 40, 80)
     """
 

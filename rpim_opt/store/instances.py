@@ -36,7 +36,6 @@ from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.robot.chain import MOUNT, ORIGIN
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.terms import Model as KinematicModel
-from rpim_opt.store.prior_file import stated_prior
 from rpim_opt.store.problem_file import (
     AngleTable,
     DistanceTable,
@@ -48,7 +47,7 @@ from rpim_opt.store.problem_file import (
     read_problem,
     stated_scatter,
 )
-from rpim_opt.store.statements import place_fixtures, stated_details, stated_requirement
+from rpim_opt.store.statements import place_fixtures, stated_details, stated_prior, stated_requirement
 
 ROLES = ("identification", "validation")
 Tools = Mapping[str, tuple[float, ...]]
@@ -188,7 +187,7 @@ def load(
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         details = stated_details(table.record)
         TableOptions.stated(table.reading)
-        requirement = stated_requirement(table.acceptance, problem.robot)
+        requirement = stated_requirement(table.acceptance, problem.robot, path)
     except InputError as error:
         raise error.within(path) from None
     for file in table.published:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -30,8 +30,7 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.robot.terms import Term
 from rpim_opt.store.own_code import is_own, own_object
-from rpim_opt.store.prior_file import PriorTable
-from rpim_opt.store.statements import Constraints
+from rpim_opt.store.statements import Constraints, PriorTable, part
 
 Layout = Literal["named", "robodk"]
 Model = Literal["geometry", "auto"]
@@ -330,7 +329,7 @@ def read_problem(
     if isinstance(table.target, str):
         board = read_board(inside(path.parent, table.target, "key target", path))
     elif table.target is not None:
-        pattern = _part(GridTable, table.target, "key target", path)
+        pattern = part(GridTable, table.target, "key target", path)
         try:
             board = grid_board(pattern.columns, pattern.rows, pattern.spacing)
         except InputError as error:
@@ -386,7 +385,7 @@ def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
             accepted = choices(table.scatter, LEARNED_NOISE) + ", or a table"
             raise InputError("key scatter", f"'{table.scatter}'", accepted, path)
         return None
-    found = _part(ScatterTable, table.scatter, "key scatter", path)
+    found = part(ScatterTable, table.scatter, "key scatter", path)
     for name, value in found:
         if value < 0:
             raise InputError(f"key scatter.{name}", f"{value}", "a standard deviation, zero or more", path)
@@ -396,19 +395,5 @@ def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
 def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
     if not isinstance(table, dict):
         raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
-    place = _part(FrameTable, table, f"key {where}", path)
+    place = part(FrameTable, table, f"key {where}", path)
     return tuple(getattr(place, c) for c in FRAME)
-
-
-Part = TypeVar("Part", bound=Table)
-
-
-def _part(kind: type[Part], content: dict[str, Any], where: str, path: Path) -> Part:
-    """Return a table of the file as a model; errors say where it stands."""
-    try:
-        return validate(kind, content, path)
-    except InputError as error:
-        key = error.where.removeprefix("key ")
-        if key != "the top level":
-            where = f"{where}.{key}"
-        raise InputError(where, error.found, error.accepted, path) from None

@@ -53,26 +53,12 @@ RELATIVE = 1e-4
 ABSOLUTE = 1e-6
 """Largest difference of a small figure [mm, deg] and the one that follows from the data."""
 FUNCTIONS: dict[str, Callable[..., Any]] = {
-    "sum_squares": SQUARES,
-    "sum": SUM,
-    "max": LARGEST,
-    "norm1": NORM1,
-    "norm2": NORM2,
-    "within_tolerance": constraints.within_tolerance,
-    "by_link": constraints.by_link,
-    "by_kind": constraints.by_kind,
-}
-"""Functions of a formulation that a file names; those that the next ones make are named with their arguments."""
-MAKERS: dict[str, Callable[..., Any]] = {
-    "huber": huber,
+    "sum_squares": SQUARES, "sum": SUM, "max": LARGEST, "norm1": NORM1, "norm2": NORM2, "huber": huber,
     "prior_penalty": prior_penalty,
-    "at_nominal": constraints.at_nominal,
-    "signed": constraints.signed,
-    "equal": constraints.equal,
-    "in_ball": constraints.in_ball,
-    "differences": constraints.differences,
-    "parse": constraints.parse,
-}
+    **{name: getattr(constraints, name) for name in ("within_tolerance", "by_link", "by_kind", "at_nominal", "signed",
+                                                     "equal", "in_ball", "differences", "parse")},
+}  # fmt: skip
+"""Functions of a formulation that a file names; those that make one are named in a list with their arguments."""
 
 
 def save_result(result: Calibration, path: str | Path) -> None:
@@ -137,20 +123,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     path = _result_path(path)
     stored = read_json(path)
     try:
-        if not isinstance(stored, dict) or stored.get("format") != FORMAT:
-            raise InputError(
-                "the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()"
-            )
-        written, known = stored.get("version"), stored.get("digest")
-        if written != VERSION:
-            accepted = f"{VERSION}; the rpim-opt that wrote it reads others"
-            raise InputError("key version", repr(written)[:40], accepted)
-        if not isinstance(known, str):
-            found = repr(stored.get("digest", "nothing"))[:40].strip("'")
-            raise InputError("key digest", found, "the digest of the rest")
-        if known != digest(stored):
-            found = f"'{known[:12]}...' for a content of '{digest(stored)[:12]}...'"
-            raise InputError("key digest", found, "the file as it was written: something in it was changed")
+        _require_whole(stored)
         file = structured(stored, Stored)
         ready = {**READY, **{m.name: m for m in measurements}}
         kinds = {str(block.measurement) for part in file.data.values() for block in part.blocks}
@@ -161,11 +134,13 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         result = _calibration(file, ready, model)
         for name, rows in _rows(result).items():
             for before, now in zip(file.rows.get(name, ()), rows, strict=True):
-                if not all(_agree(a, b) for a, b in zip(before, now, strict=True)):
+                same = np.allclose(*_errors(before, now), rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True)
+                if before.label != now.label or not same:
+                    found = f"{before.identified_mm} mm"
                     accepted = (
                         f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
                     )
-                    raise InputError(f"key rows.{name}, row {before.label}", f"{before.identified_mm} mm", accepted)
+                    raise InputError(f"key rows.{name}, row {before.label}", found, accepted)
         result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
     except InputError as error:
         raise error.within(path) from None
@@ -174,6 +149,19 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         found = f"parts that do not fit together ({error})"
         raise InputError("the file", found, "one as it was written", path) from None
     return result
+
+
+def _require_whole(stored: Any) -> None:
+    """Refuse what is no result file of this version, or was changed since it was written."""
+    if not isinstance(stored, dict) or stored.get("format") != FORMAT:
+        raise InputError("the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()")
+    if stored.get("version") != VERSION:
+        accepted = f"{VERSION}; the rpim-opt that wrote it reads others"
+        raise InputError("key version", repr(stored.get("version"))[:40], accepted)
+    known = stored.get("digest", "nothing")
+    if known != digest(stored):
+        found = f"{str(known)[:12]} for a content of {digest(stored)[:12]}"
+        raise InputError("key digest", found, "the file as it was written: something in it was changed")
 
 
 def _result_path(path: str | Path) -> Path:
@@ -193,9 +181,8 @@ class OwnTerm(NamedTuple):
 
     def __str__(self) -> str:
         """Return it in words."""
-        what = ", ".join(self.parameters) or "without parameters"
-        columns = [f", column {name} ({dimension or 'no unit'})" for name, dimension in self.columns.items()]
-        return f"a term of the {self.at} ({what}{''.join(columns)})"
+        columns = [f"column {name} ({dimension or 'no unit'})" for name, dimension in self.columns.items()]
+        return f"a term of the {self.at} ({', '.join([*self.parameters, *columns]) or 'without parameters'})"
 
 
 class Trust(NamedTuple):
@@ -361,6 +348,11 @@ def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
     return rows
 
 
+def _errors(*rows: RowErrors) -> Array:
+    """Return the errors of rows (K, 2) [mm], NaN for those that have none."""
+    return np.array([row[1:] for row in rows], dtype=float)
+
+
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
@@ -425,17 +417,15 @@ def _name(function: Callable[..., Any] | None) -> str | list[Any] | None:
     """Return the name of a ready function, or of its maker and the arguments; ``none`` for no function."""
     if function is None:
         return "none"
-    for name, ready in FUNCTIONS.items():
-        if ready == function:
-            return name
+    known = next((name for name, ready in FUNCTIONS.items() if ready == function), None)
     stated = getattr(function, "stated", None)
-    if stated is None or stated[0] != prior_penalty.__name__:
-        return stated
-    maker, penalty, *numbers = stated
-    return [maker, _name(penalty), *numbers]
+    if known or stated is None:
+        return known
+    maker, *arguments = stated
+    return [maker, *(_name(each) if callable(each) else each for each in arguments)]
 
 
-def _function(stated: str | list[Any] | None, name: str) -> Any:
+def _function(stated: Any, name: str) -> Any:
     if stated is None:
         return lost(name)
     if stated == "none":
@@ -445,7 +435,7 @@ def _function(stated: str | list[Any] | None, name: str) -> Any:
     maker, *arguments = stated
     if maker == prior_penalty.__name__:
         arguments[0] = _function(arguments[0], name)
-    return pick(MAKERS, str(maker), "key definition")(*arguments)
+    return pick(FUNCTIONS, str(maker), "key definition")(*arguments)
 
 
 # --- reading -----------------------------------------------------------------------------------------------------
@@ -529,9 +519,3 @@ def _kept(file: Stored, program: Program) -> Kept:
     factor = file.trust.factor**2
     equations = kept_equations(program.model, keep, factor)
     return Kept(file.held, equations, factor, tuple(file.trust.left_out), file.prices)
-
-
-def _agree(stated: str | float | None, found: str | float | None) -> bool:
-    if isinstance(stated, float) and isinstance(found, float):
-        return math.isclose(stated, found, rel_tol=RELATIVE, abs_tol=ABSOLUTE)
-    return stated == found

@@ -1,24 +1,30 @@
-"""What a problem file states besides data: ``[constraints]``, ``[record]``, ``[acceptance]``, places of fixtures."""
+"""What a problem file states besides data: constraints, prior, record, acceptance, places of fixtures."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from datetime import date, datetime
 from functools import partial
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import Field
+from pydantic import ConfigDict, Field, create_model
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.schema import Name, Table
-from rpim_opt.basics.units import number, quantities
+from rpim_opt.basics.files import inside
+from rpim_opt.basics.schema import Length, Name, Table, validate
+from rpim_opt.basics.units import fits, number, quantities, split_unit
+from rpim_opt.bayes.prior import Prior
+from rpim_opt.bayes.prior_terms import FRAMES
+from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
 from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse, signed
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.data.record import CONFIDENCE, Requirement, Side
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.parameters import JOINT_OFFSET, Parameters, is_joint_offset
 
 MEASURED = "measured"
 """The place that every problem has: the configurations of its identification data."""
@@ -39,6 +45,20 @@ FIELDS = {
 """Keys of ``[record]``, and what a report calls them."""
 LONGEST_TEXT = 1000
 """Characters of a text that somebody may want to read."""
+
+
+Part = TypeVar("Part", bound=Table)
+
+
+def part(kind: type[Part], content: dict[str, Any], where: str, path: Path) -> Part:
+    """Return a table of the file as a model; errors say where it stands."""
+    try:
+        return validate(kind, content, path)
+    except InputError as error:
+        key = error.where.removeprefix("key ")
+        if key != "the top level":
+            where = f"{where}.{key}"
+        raise InputError(where, error.found, error.accepted, path) from None
 
 
 def _joints(robot: Robot) -> dict[str, tuple[str, ...]]:
@@ -121,6 +141,99 @@ def _rows(data: Dataset, labels: Any, where: str = "") -> Array:
     return np.unique(np.concatenate(chosen), axis=0)
 
 
+# --- [prior] -------------------------------------------------------------------------------------------------------
+
+
+class PriorTable(Table):
+    """The keys of ``[prior]``; tails may be infinite."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=True)
+
+    known: list[str] = Field(default_factory=list)
+    earlier: str = Field(default="", alias="from")
+    without: list[str] = Field(default_factory=list)
+    inflate: float | int = 1.0
+    fleet: list[str] = Field(default_factory=list)
+    tails: float | int = 3.0
+    groups: list[str] = Field(default_factory=list)
+    joint_offset: float | int = FACTOR
+    frames: float | int = FRAMES
+    centre: dict[str, float | int] = Field(default_factory=dict)
+    scale: dict[str, float | int] = Field(default_factory=dict)
+
+    def files(self, path: Path) -> dict[str, Path]:
+        """Return the files that the prior is read from, inside the problem's folder, by their names in its file."""
+        named = [(file, "key prior.fleet") for file in self.fleet]
+        if self.earlier:
+            named.append((self.earlier, "key prior.from"))
+        found = {}
+        for name, key in named:
+            try:
+                found[name] = inside(path.parent, name, key, path)
+                if found[name].is_dir():
+                    found[name] = inside(path.parent, str(Path(name) / "result.json"), key, path)
+            except InputError as error:
+                accepted = f"{error.accepted}; a copy there, `rpim-opt update`, or calibrate(prior=...) in a script"
+                raise InputError(key, error.found, accepted, path) from None
+        return found
+
+
+def stated_prior(
+    table: PriorTable,
+    scale: Mapping[str, float],
+    parameters: Parameters,
+    path: Path,
+    measurements: Sequence[Measurement],
+) -> Prior:
+    """Return the prior that a problem file states, which fits the problem's parameters.
+
+    What ``scale`` says of joint offsets alone, or of a parameter by its name, is taken at its word: somebody has
+    thought of it, as of a certificate's standard uncertainty of a reflector's place.
+    """
+    for key in ("inflate", "without"):
+        if key in table.model_fields_set and not table.earlier:
+            raise InputError(f"key prior.{key}", "no key from beside it", "from = 'other/result.json'", path)
+    offsets = {}
+    for key, value in scale.items():
+        stem = split_unit(key)[0]
+        matches = [name for name in parameters.names if fits(name, stem)]
+        if stem == JOINT_OFFSET or stem in parameters.names or (matches and all(map(is_joint_offset, matches))):
+            offsets[key] = value
+    try:
+        prior = Prior(
+            centre=table.centre,
+            scale={**offsets, **table.scale},
+            tails=float(table.tails),
+            groups=tuple(tuple(group.split()) for group in table.groups),
+            joint_offset=float(table.joint_offset),
+            frames=float(table.frames),
+        )
+    except InputError as error:
+        raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
+    files = table.files(path)
+    parts: list[tuple[str, Callable[[], Prior]]] = []
+    parts += [(f"known {i}", partial(Prior.known, text)) for i, text in enumerate(table.known, start=1)]
+    if files:
+        from rpim_opt.store.result_file import load_result  # most folders name no earlier result
+
+        load = partial(load_result, measurements=measurements)
+        results = {name: partial(load, file) for name, file in files.items()}
+        if table.earlier:
+            earlier = results[table.earlier]
+            parts.append(("from", lambda: Prior.from_result(earlier(), table.inflate, table.without)))
+        if table.fleet:
+            parts.append(("fleet", lambda: Prior.from_population({name: results[name]() for name in table.fleet})))
+    for key, read in parts:
+        try:
+            prior &= read()
+        except InputError as error:
+            if error.file:
+                raise
+            raise InputError(f"key prior.{key}", error.found, error.accepted, path) from None
+    prior.stated(parameters)
+    return prior
+
+
 # --- [record] and [acceptance] -----------------------------------------------------------------------------------
 
 
@@ -137,7 +250,7 @@ def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
     return {key: str(table[key]).strip() for key in FIELDS if key in table}
 
 
-def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | None:
+def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requirement | None:
     """Return what ``[acceptance]`` requires; None for an empty table.
 
     ::
@@ -150,30 +263,29 @@ def stated_requirement(table: Mapping[str, Any], robot: Robot) -> Requirement | 
     """
     if not table:
         return None
-    plain = {key: table[key] for key in ("confidence", "marker") if key in table}
-    known = dict.fromkeys(("limit", *BOX), ("length",)) | _joints(robot)
-    rest = {key: value for key, value in table.items() if key not in plain}
-    values = {stem: value for (stem, _), value in quantities(rest, known, "table acceptance", _numbers, plain).items()}
-    limit = values.pop("limit", None)
-    if not isinstance(limit, float):
-        raise InputError("table acceptance", "no limit", "limit_mm = 0.1")
-    sides: dict[str, Side] = {}
-    for stem, value in values.items():
-        if not isinstance(value, list) or len(value) != 2 or not all(isinstance(each, float) for each in value):
-            raise InputError(f"key acceptance.{stem}", "not two numbers", "[low, high]")
-        sides[stem] = value[0], value[1]
-    marker = plain.get("marker", "")
-    if not isinstance(marker, str):
-        raise InputError("key acceptance.marker", repr(marker)[:60], "the name of a reflector")
+    joints = _joints(robot)
+    pair = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
+    known = dict.fromkeys(BOX, ("length",)) | joints
+    sides_of: dict[str, Any] = {name: (Annotated[pair, dimension], None) for name, (dimension,) in known.items()}
+    schema: type[Table] = create_model(
+        "Acceptance",
+        __base__=Table,
+        limit=(Length, ...),
+        confidence=(float, CONFIDENCE),
+        marker=(str, ""),
+        **sides_of,
+    )
+    stated = dict(part(schema, table, "key acceptance", path))
+    sides = {name: (stated[name][0], stated[name][1]) for name in (*BOX, *joints) if stated[name] is not None}
     axes = [axis for axis in BOX if axis in sides]
     if axes and len(axes) < len(BOX):
-        raise InputError("table acceptance", f"{', '.join(axes)} alone", "x_mm, y_mm and z_mm of a box, or none")
+        raise InputError("table acceptance", f"{', '.join(axes)} alone", "x_mm, y_mm and z_mm of a box, or none", path)
     return Requirement(
-        limit=limit,
+        limit=stated["limit"],
         box=(sides["x"], sides["y"], sides["z"]) if axes else None,
-        joints=tuple((int(stem[1:]), side) for stem, side in sides.items() if stem not in BOX),
-        marker=marker,
-        confidence=number(plain.get("confidence", CONFIDENCE), "key acceptance.confidence"),
+        joints=tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX),
+        marker=stated["marker"],
+        confidence=stated["confidence"],
     )
 
 

@@ -30,17 +30,9 @@ VALIDATION_COUNT = 200
 class SimulatedArm(NamedTuple):
     """What a tracker saw of an arm whose truth is known.
 
-    Parameters
-    ----------
-    problem
-        Identification data, with generic scales.
-    true
-        Positions of validation configurations as they are [m].
-    read
-        The same as the tracker reads them.
+    ``problem`` has the identification data and generic scales, ``true`` the positions of validation configurations as
+    they are [m], ``read`` the same as the tracker reads them.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.study.simulated_arm(seed=0, count=10)
     >>> len(arm.problem.data), len(arm.read), arm.problem.robot.name

@@ -140,20 +140,10 @@ def compare(
         if count is not None and not drawn:
             drawn = count < len(np.unique(source.instance(0).problem.data.configuration))
         folds = range(1, split.folds + 1)
-        cases += [
-            {
-                "problem": source.label,
-                "method": method.label,
-                "formulation": method.formulation,
-                "selector": method.selector,
-                "split": split.label,
-                "fold": fold,
-                "count": count,
-                "noise_factor": factor,
-                "seed": seed,
-            }
-            for seed, fold, method in product(numbered if drawn else numbered[:1], folds, compared.values())
-        ]
+        for seed, fold, method in product(numbered if drawn else numbered[:1], folds, compared.values()):
+            case = {"problem": source.label, "method": method.label, "formulation": method.formulation}
+            case |= {"selector": method.selector, "split": split.label, "fold": fold}
+            cases.append({**case, "count": count, "noise_factor": factor, "seed": seed})
     path = None if journal is None else Path(journal)
     code: dict[str, str] = {}
     if path is not None:
@@ -222,33 +212,19 @@ def replicate(
 class Comparison:
     """Replicates of methods on problems, one row each.
 
-    Parameters
-    ----------
-    rows
-        Plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count`` and
-        ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not converged``, ``impossible``, ``failed``) with
-        its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the metrics.
-    metrics
-        Their columns; summaries are of the first.
-    drawn
-        Problems that every seed draws anew.
-    asked
-        The axes of the grid, in words.
-    made
-        What made the rows: script, package, versions and time.
+    ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
+    and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not converged``, ``impossible``, ``failed``) with
+    its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``, of the
+    first of which summaries are. ``drawn`` are problems that every seed draws anew, ``asked`` the axes of the grid in
+    words, ``made`` what made the rows: script, package, versions and time.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> def arms(seed):
     ...     return ro.study.simulated_arm(seed, count=15)
     >>> found = ro.compare(arms, selectors=["learned", "reml"], seeds=5)
     >>> found
     Comparison: 2 methods on 1 problem, 10 replicates (10 ok)
-    >>> found.metric, found.reference(), found.methods, found.problems
-    ('rms_mm', 'tikhonov, learned', ('tikhonov, learned', 'tikhonov, reml'), ('arms',))
-    >>> best = found.summary().standings[0]
-    >>> best.method, len(found.to_frame()), len(found.plot("max_mm").axes)
+    >>> found.summary().standings[0].method, len(found.to_frame()), len(found.plot("max_mm").axes)
     ('tikhonov, learned', 10, 1)
     >>> page = found.report("arms_compared")
     >>> page.name, sorted(path.name for path in page.parent.iterdir())

@@ -117,7 +117,7 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
             methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
     for label, each in _listed(functions):
         name, function = _named(label, each, BASELINES, "methods", "the problem")
-        methods.append(Method(name, partial(_apply, function)))
+        methods.append(Method(name, partial(_on_problem, function)))
     if not methods:
         raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
     return each_once("methods", methods, "...")
@@ -145,7 +145,7 @@ def _name(function: Any) -> str:
     return getattr(function, "__name__", type(function).__name__)
 
 
-def _apply(function: Callable[[CalibrationProblem], Any], instance: Instance) -> Any:
+def _on_problem(function: Callable[[CalibrationProblem], Any], instance: Instance) -> Any:
     return function(instance.problem)
 
 
@@ -174,26 +174,14 @@ def _selector(label: str, each: Any) -> tuple[str, Any]:
 class Fitted:
     """The answer of a method, and the data that it did not see: what a metric of one's own is a function of.
 
-    Parameters
-    ----------
-    problem
-        What was fitted.
-    held_out
-        The rows that were not.
-    answer
-        The method's: its errors of data, and the ``result`` of a calibration.
-    seconds
-        Its time.
+    The ``problem`` was fitted and the rows ``held_out`` were not; ``answer`` has the method's errors of data, and the
+    ``result`` of a calibration; ``seconds`` is its time.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> def p95_mm(fitted):
     ...     return 1e3 * float(np.percentile(fitted.errors(), 95))
-    >>> def over_fit(fitted):
-    ...     return float(fitted.errors().mean() / fitted.fit_errors().mean())
-    >>> found = ro.compare("position", "tikhonov", "reml", metrics=[p95_mm, over_fit])
+    >>> found = ro.compare("position", "tikhonov", "reml", metrics=[p95_mm])
     >>> round(found.rows[0]["p95_mm"], 3)
     0.039
     """
@@ -223,9 +211,8 @@ def _milli(errors: Array, figure: Callable[[Array], Any]) -> float | None:
 
 
 def _coverage(fitted: Fitted) -> float | None:
-    if fitted.answer.result is None:
-        return None
-    share = validate(fitted.answer.result, fitted.held_out).coverage
+    result = fitted.answer.result
+    share = None if result is None else validate(result, fitted.held_out).coverage
     return None if share is None else 100 * share
 
 

@@ -37,24 +37,12 @@ Rows = Sequence[Mapping[str, Any]]
 class Standing:
     """How a method does, and how it does against the reference on the same replicates.
 
-    Parameters
-    ----------
-    method
-        Its label.
-    replicates, missing, unconverged
-        How many there are, how many of them have no figure, and how many did not converge (their figures count).
-    median, worst
-        Of its figures.
-    ratio
-        Geometric mean of its figures over those of the reference; every problem counts the same. None without pairs.
-    low, high
-        Ends of the 95 % interval of that ratio; None where there is too little to say.
-    wins, ties, losses
-        Replicates on which it is better than the reference, as good within 1 %, or worse; one without a figure loses
-        against one with.
+    Of its ``replicates`` some are ``missing`` (without a figure) or ``unconverged`` (their figures count); ``median``
+    and ``worst`` are of its figures. ``ratio`` is the geometric mean of its figures over those of the reference, every
+    problem counting the same (None without pairs), ``low`` and ``high`` the ends of its 95 % interval (None where there
+    is too little to say). On ``wins``, ``ties`` and ``losses`` replicates it is better than the reference, as good
+    within 1 %, or worse; one without a figure loses against one with.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> found = ro.compare("position", ["tikhonov", "least_squares"], "reml", splits=5)
     >>> second = found.summary().standings[1]
@@ -85,30 +73,16 @@ class Standing:
 class Summary:
     """Methods by their figures, those that are best in the geometric mean first.
 
-    Parameters
-    ----------
-    metric
-        What is compared; less is better.
-    reference
-        The method that the others are compared with.
-    standings
-        One a method that has figures.
-    notes
-        What a reader must know: of what the intervals speak, and what has no figures, with the reason.
+    Less of the ``metric`` is better; others are compared with the ``reference``. ``standings`` are one a method that
+    has figures; ``notes`` say of what the intervals speak, and what has no figures, with the reason.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
     >>> summary = found.summary(against="tikhonov, 1")
     >>> [each.method for each in summary.standings]
     ['tikhonov, 1', 'tikhonov, reml', 'lasso, 1']
-    >>> summary.header[:2], summary.cells()[0][3:]
-    (('method', 'median rms_mm'), ['1', 'reference', ''])
     >>> summary.notes[-1]
     "lasso, reml: impossible, 5 of 5 replicates. Selector reml: found formulation 'lasso', accepted: ..."
-    >>> len(summary.to_frame())
-    3
     """
 
     metric: str

@@ -27,7 +27,6 @@ NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 FILE = "study.py"
 """The study of a folder."""
 MOST_FILES = 10_000
-MOST_BYTES = 4_000_000_000
 """Of the files beside a study, each of which is read before its replicates are resumed."""
 REPLICATES = "replicates"
 
@@ -36,15 +35,8 @@ REPLICATES = "replicates"
 class Metric:
     """A figure of a study that must not get worse: its direction, and by how much of the baseline it may vary.
 
-    Parameters
-    ----------
-    better
-        ``"lower"`` or ``"higher"``.
-    tolerance
-        What part of the baseline it may be worse by.
+    ``better`` is ``"lower"`` or ``"higher"``, ``tolerance`` what part of the baseline it may be worse by.
 
-    Examples
-    --------
     >>> from rpim_opt.study import Metric
     >>> METRICS = {"mean error [mm]": Metric("lower", 0.1)}  # of a file in the folder studies
     """
@@ -55,19 +47,8 @@ class Metric:
 
 @dataclass(frozen=True)
 class Report:
-    """The answer of a study.
+    """The answer of a study: a Markdown text, ``metrics`` by the names of its METRICS, matplotlib figures by name.
 
-    Parameters
-    ----------
-    text
-        Markdown.
-    metrics
-        Figures that a baseline is compared with, by the names of the study's METRICS.
-    figures
-        matplotlib figures by name.
-
-    Examples
-    --------
     >>> from rpim_opt.study import Report
     >>> Report("The error falls with the root of the number of poses.", {"mean error [mm]": 0.03}).metrics
     {'mean error [mm]': 0.03}
@@ -174,20 +155,17 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
 def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
     """Yield the files in a folder and below it, with or without results of studies."""
     count = 0
-    size = 0
     for place, folders, names in os.walk(folder):
         folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
         if not results and any(name.startswith(f"{REPLICATES}.") for name in names):
             folders.clear()
             continue
-        for file in (Path(place, name) for name in names if not name.startswith(".")):
-            if file.is_file():
-                count += 1
-                size += file.stat().st_size
-                yield file
-            if count > MOST_FILES or size > MOST_BYTES:
-                found = f"more than {MOST_FILES} files or {MOST_BYTES / 1e9:g} GB in {folder}"
-                raise InputError("DEPENDS", found, "DEPENDS = [...] in the study: names of the files that it reads")
+        files = [Path(place, name) for name in names if not name.startswith(".")]
+        count += len(files)
+        if count > MOST_FILES:
+            found = f"more than {MOST_FILES} files in {folder}"
+            raise InputError("DEPENDS", found, "DEPENDS = [...] in the study: names of the files that it reads")
+        yield from filter(Path.is_file, files)
 
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:

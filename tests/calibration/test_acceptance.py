@@ -277,13 +277,13 @@ def test_a_problem_file_states_who_and_what_for(folder) -> None:
     [
         ('[record]\nwho = "me"\n', "key record.who"),
         ("[record]\nby = [1]\n", "key record.by"),
-        ("[acceptance]\nx_mm = [0, 1]\n", "no limit"),
+        ("[acceptance]\nx_mm = [0, 1]\n", "key acceptance.limit: found nothing"),
         ("[acceptance]\nlimit_mm = 0.1\nx_mm = [0, 1]\n", "x_mm, y_mm and z_mm"),
-        ("[acceptance]\nlimit_mm = 0.1\nq1_deg = [0, 1, 2]\n", "two numbers"),
+        ("[acceptance]\nlimit_mm = 0.1\nq1_deg = [0, 1, 2]\n", "key acceptance.q1"),
         ("[acceptance]\nlimit_mm = 0.1\nq9_deg = [0, 1]\n", "q9_deg"),
         ("[acceptance]\nlimit_mm = -0.1\n", "greater than zero"),
         ("[acceptance]\nlimit_mm = 0.1\nconfidence = 2\n", "probability"),
-        ("[acceptance]\nlimit_mm = 0.1\nmarker = 3\n", "reflector"),
+        ("[acceptance]\nlimit_mm = 0.1\nmarker = 3\n", "key acceptance.marker"),
     ],
 )
 def test_a_wrong_statement_is_named(folder, text: str, said: str) -> None:

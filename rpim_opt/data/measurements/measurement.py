@@ -117,23 +117,6 @@ class Measurement(Brief):
     >>> probed = arm.on(ro.Dataset.of(arm.data.q, z[:, None], sigma=1e-5, measurement=height))
     >>> bool(abs(probed.residual(0 * arm.parameters.free.nominal)).max() < 1e-12)
     True
-
-    The same probe on a column that grows with its temperature, which a column ``temperature_K`` of the data states:
-
-    >>> def grown(T, growth, temperature):
-    ...     return T[2, 3] - growth * temperature
-    >>> warm = ro.data.Measurement(
-    ...     "warm height",
-    ...     grown,
-    ...     {"z": "length"},
-    ...     parameters={"growth": "length per temperature"},
-    ...     sees=("temperature",),
-    ...     extra={"temperature": "temperature"},
-    ... )
-    >>> data = ro.Dataset.of(arm.data.q, z[:, None], 1e-5, measurement=warm, columns={"temperature": [3.0] * 9})
-    >>> parameters = ro.problem.starting_parameters(arm.robot, data).identify(["d2", "growth"])
-    >>> ro.CalibrationProblem(arm.robot, parameters, data).jacobian([0, 0])[0].round(9)  # [m/m], [m/(m/K)]
-    array([ 0., -3.])
     """
 
     name: str
