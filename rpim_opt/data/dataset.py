@@ -26,36 +26,16 @@ ROW_FIELDS = ("q", "y", "torque", "payload", "approach", "point", "session")
 class Block(Brief):
     """Rows of a dataset that one function evaluates: one measurement model, the same reflectors and fixture.
 
-    Parameters
-    ----------
-    measurement
-        What the instrument sees.
-    q
-        (N, p, dof) joint values of the controller [rad or m] at the p points of a row.
-    y
-        (N, c) measured values [SI], in the order of the measurement's columns.
-    covariance
-        (N, k, k) of the residual's components [SI], or (1, k, k) when it is the same for all rows.
-    row
-        (N,) which row of the dataset each one is.
-    markers
-        The reflector of each point; ``""`` for the only one.
-    fixture
-        Which anchor, plane or sphere; ``""`` for the only one.
-    torque
-        (N, p, dof) joint torques of the controller's joints [Nm], or None.
-    payload
-        (N,) mass at the flange [kg], or None: that of the robot's `Gravity`.
-    approach
-        (N, p, dof) direction in which the controller's joints moved last, -1, 0 or +1, or None.
-    columns
-        Further columns by name, (N,) each [SI], which terms and measurements of a user's own see.
-    robot
-        Whose rows these are; ``""`` for the only robot.
-    point
-        (N, p) names of the points that were touched or seen, or None.
-    session
-        (N,) names of the sessions in which they were measured, or None.
+    ``q`` (N, p, dof) are the controller's joint values [rad or m] at the p points of a row, ``y`` (N, c) the measured
+    values [SI] in the order of the measurement's columns, ``covariance`` (N, k, k) that of the residual's components
+    [SI], or (1, k, k) when it is the same for all rows, ``row`` (N,) which row of the dataset each one is. ``markers``
+    are the reflectors of the points and ``fixture`` is which anchor, plane or sphere, ``""`` for the only one;
+    ``robot`` is whose rows these are.
+
+    Perhaps there are ``torque`` (N, p, dof) of the controller's joints [Nm], ``payload`` (N,) at the flange [kg] (else
+    that of the robot's `Gravity`), ``approach`` (N, p, dof), the direction in which the joints moved last (-1, 0 or
+    +1), names (N, p) of the points that were touched or seen and (N,) of the ``session``, and further ``columns`` (N,)
+    [SI] by name, which terms and measurements of a user's own see.
     """
 
     measurement: Measurement

@@ -12,8 +12,9 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import SMALLEST, quantities, with_unit
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.tables.columns import Numbers
 
+Numbers = dict[tuple[str, str], Array]
+"""Columns of numbers [SI] by (stem, dimension), and by (stem, "") where a stem has one dimension."""
 TRACKER = {"range": ("length", "ratio"), "transverse": ("length",), "angle": ("angle",),
            "x": ("length",), "y": ("length",), "z": ("length",)}  # fmt: skip
 """The keys of ``[noise.tracker]`` and their dimensions."""

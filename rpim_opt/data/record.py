@@ -126,39 +126,17 @@ class Earlier(NamedTuple):
 class Record:
     """Where a calibration's data come from, and what was held out.
 
-    Parameters
-    ----------
-    title, source
-        What was calibrated, and where every figure comes from.
-    validation
-        Measurements that no step of the calibration saw.
-    files
-        SHA-256 of the input files, by name.
-    excluded
-        Rows that were left out, label to reason.
-    simulated
-        Whether the measurements are simulated.
-    made
-        When, UTC (ISO 8601).
-    versions
-        Of the packages that made it, by name.
-    details
-        Who measured, when, with which instrument, ... as somebody stated it, by name.
-    requirement
-        What the robot is accepted by; None without a requirement.
-    held_out
-        Rows that were held out and judged before they were used; None where validation data are still unused.
-    earlier
-        The calibrations that this one carries on (`use.update`), the last one last.
-    digest
-        Of the file that it was read from; empty where there is none.
-    reading
-        How the tables were read, as `TableOptions.stated` takes it: later ones are read alike.
-    terms
-        Names of the model's terms in a Python file of the problem's folder, ``mine:droop``.
+    ``title`` and ``source`` say what was calibrated and where every figure comes from. ``validation`` are measurements
+    that no step of the calibration saw, ``files`` the SHA-256 of the input files by name, ``excluded`` the rows that
+    were left out, label to reason; ``simulated`` is whether the measurements are. It was ``made`` then (UTC, ISO 8601),
+    by packages of these ``versions``. ``details`` say who measured, when, with which instrument, as somebody stated it.
 
-    Examples
-    --------
+    The ``requirement`` is what the robot is accepted by, if anything is; ``held_out`` are rows that were judged before
+    they were used, None where validation data are still unused; ``earlier`` the calibrations that this one carries on
+    (`use.update`), the last one last; ``digest`` that of the file that it was read from. Later tables are read as
+    ``reading`` says (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder,
+    ``mine:droop``.
+
     >>> import rpim_opt as ro
     >>> record = ro.data.Record("Cell 7", source="Tracker campaign of May", excluded={"P17": "reflector bumped"})
     >>> record.made, sorted(record.dated().versions)[:3]

@@ -62,23 +62,13 @@ RIGHT = (0.0, 90.0)
 class Instance(Tabled):
     """A calibration problem as its folder states it.
 
-    Parameters
-    ----------
-    problem
-        Robot, parameters and identification data.
-    formulation, weight, prior, model, noise
-        As for `calibrate`; weight None where hyperparameters are estimated.
-    record
-        What a saved result and its report say of the data; validation data, which no step of the calibration may see.
-    published
-        Mean errors [mm] that the source prints for the same table, by role (identification, validation) and method.
-    reference
-        Figures that a run must reproduce, by name: (value, tolerance).
-    held_out
-        Whether the validation data were drawn from the same table: once they have validated, all rows are used.
+    ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None where hyperparameters
+    are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result says of
+    the data, with the validation data; ``published`` are mean errors [mm] that the source prints for the same table, by
+    role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
+    tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,
+    all rows are used.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = instance.calibrate()
@@ -115,17 +105,7 @@ class Instance(Tabled):
     def calibrate(self, **changes: Any) -> Calibration:
         """Return the calibration as the folder wants it, with its record.
 
-        Parameters
-        ----------
-        changes
-            Arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``, ``model="auto"``.
-
-        Examples
-        --------
-        >>> import rpim_opt as ro
-        >>> result = ro.load("paper_arm").calibrate()
-        >>> result.selector, result.record.title
-        ('l_curve', "The paper's cooperative manipulator")
+        ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``.
         """
         asked = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
         asked |= {"model": self.model, "noise": self.noise}

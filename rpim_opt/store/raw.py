@@ -20,7 +20,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
-from rpim_opt.data.tables.joining import time_column, together
+from rpim_opt.data.tables.joining import together
 from rpim_opt.data.tables.orientations import ORDERS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
@@ -46,21 +46,10 @@ Files = Sequence[tuple[Path | None, RawTable]]
 class Understanding:
     r"""What raw tables say.
 
-    Parameters
-    ----------
-    kind
-        What was measured.
-    columns, raw
-        One table with our names, texts and numbers as the files have them; with theirs, of the same rows.
-    tables
-        What was understood of every file.
-    notes
-        How the tables were put together and what was checked, a sentence each.
-    options, file
-        What was stated of them; the file, or the first of them.
+    ``kind`` is what was measured, ``columns`` one table with our names (texts and numbers as the files have them),
+    ``raw`` the same rows with theirs, ``tables`` what was understood of every file, ``notes`` how they were joined and
+    what was checked, ``options`` what was stated of them, ``file`` the first of them.
 
-    Examples
-    --------
     >>> from pathlib import Path
     >>> import rpim_opt as ro
     >>> rows = ["Point;" + ";".join(f"J{i} [deg]" for i in range(1, 7)) + ";X [mm];Y [mm];Z [mm]"]
@@ -267,19 +256,12 @@ def _whole(
         whole = together(tables, arm.robot, kind, options.key, options.within)
     except InputError as error:
         raise error.within(files[0][0] if len(files) == 1 else None) from None
-    by = [note.removeprefix("joined by ").partition(":")[0] for note in whole.notes if note.startswith("joined by ")]
     shown = []  # in what is shown the columns by which rows were joined are not left out
     for each in tables:
-        used = {name for name in each.raw if f"column '{name.lower()}'" in by or name in " = ".join(by).split(" = ")}
-        if "the nearest time" in by:
-            clock = time_column(each.raw) if options.key.lower() in ("", "time") else options.key
-            used = {name for name in each.raw if name.lower() == str(clock).lower()}
-        meant = list(each.meant)
-        for i, column in enumerate(meant):
-            if column.column in used and column.meaning == "left out":
-                why = "rows of equal keys or of the nearest times"
-                meant[i] = column._replace(meaning="joins the files", why=why)
-        shown.append(replace(each, meant=tuple(meant)))
+        joins = [m.column.lower() in whole.keys and m.meaning == "left out" for m in each.meant]
+        said = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
+        meant = tuple(m._replace(**said) if joined else m for m, joined in zip(each.meant, joins, strict=True))
+        shown.append(replace(each, meant=meant))
     return Understanding(kind, whole.columns, whole.raw, tuple(shown), whole.notes, options, str(files[0][0] or ""))
 
 
@@ -301,15 +283,10 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
         if misfit[USUAL] <= CLEARLY * misfit[best]:
             return first
         missed = f"turns that the nominal robot misses by {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
-        raise InputError(
-            "rx, ry, rz", missed, f"--rotation '{best}' if that is what they are, or '{USUAL}'", first.file
-        )
+        accepted = f"--rotation '{best}' if that is what they are, or '{USUAL}'"
+        raise InputError("rx, ry, rz", missed, accepted, first.file)
     if misfit[second] <= CLEARLY * misfit[best]:
-        where = "the order of the quaternion"
         accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
-        raise InputError(where, f"no clear one ({figures})", accepted, first.file)
-    note = (
-        f"the quaternion's order is {best}: on the nominal robot it leaves {misfit[best]:.2f} deg, "
-        f"{second} {misfit[second]:.1f} deg."
-    )
+        raise InputError("the order of the quaternion", f"no clear one ({figures})", accepted, first.file)
+    note = f"the quaternion's order is {best}: the nominal robot misses {figures}."
     return replace(found[best], notes=(*found[best].notes, note))

@@ -56,18 +56,10 @@ def run_cases(
 ) -> list[Row]:  # fmt: skip
     """Return every case with its figures, in the order of the cases.
 
-    Parameters
-    ----------
-    cases, work
-        Plain tables, and the function that returns what computes one.
-    workers, scheduler, progress
-        As `compute` has them; called whenever a replicate is done.
-    journal
-        A file that every finished replicate is written to before the next one counts.
-    code
-        Digests of what replicates follow from; those of other code are refused.
-    resume
-        Whether replicates of an interrupted run are resumed (true), dropped (false), or refused (None).
+    ``cases`` are plain tables, and ``work`` returns what computes one; ``workers`` and ``scheduler`` are as `compute`
+    has them, ``progress`` is called whenever a replicate is done. Every finished replicate is written to the
+    ``journal`` before the next one counts; ``code`` are digests of what replicates follow from, and those of other code
+    are refused. Replicates of an interrupted run are resumed (true), dropped (false), or refused (None).
     """
     keyed = [(json.dumps(case, sort_keys=True), case) for case in cases]
     code = code or {}

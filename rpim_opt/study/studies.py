@@ -192,20 +192,11 @@ def run_study(
     """Run a study; return its report and the folder with ``README.md``, ``metrics.json``, replicates and figures.
 
     Every replicate is a case, a table of plain values with the seed among them, so that results do not depend on who
-    computes them. A finished replicate is written down at once.
-
-    Parameters
-    ----------
-    name
-        A file ``mine.py``, a folder with ``study.py``, or a study of the checkout without its ending.
-    quick
-        The small version.
-    workers, scheduler, resume, progress
-        As `run_cases` has them.
-    redraw
-        Compute nothing: write the report anew from the replicates of the last run, which say what made them.
-    out
-        Where results go; ``results/NAME`` or ``results/NAME-quick`` beside the study by default.
+    computes them. A finished replicate is written down at once. The ``name`` is a file ``mine.py``, a folder with
+    ``study.py``, or a study of the checkout without its ending; ``quick`` is the small version; ``workers``,
+    ``scheduler``, ``resume`` and ``progress`` are as `run_cases` has them. ``redraw`` computes nothing: the report is
+    written anew from the replicates of the last run. Results go to ``out``, by default ``results/NAME`` or
+    ``results/NAME-quick`` beside the study.
     """
     path = find_study(name)
     require_package("pyarrow", "the study")

@@ -127,7 +127,7 @@ def test_the_order_of_a_quaternion_is_checked_and_said(monkeypatch, capsys, tmp_
     path = write(tmp_path)
     assert new(monkeypatch, arm, tmp_path / "cell", path, *options(stated), "--dry-run") == 0
     said = capsys.readouterr().out
-    assert f"the quaternion's order is {right}: on the nominal robot it leaves 0.09 deg, {wrong} " in said
+    assert f"the quaternion's order is {right}: the nominal robot misses {right} 0.09 deg, {wrong} " in said
     assert f"order {right}" in said
     # a stated order is not checked here: it is the user's word
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--quaternion", wrong, "--dry-run") == 0

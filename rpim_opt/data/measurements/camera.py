@@ -20,7 +20,7 @@ from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split, split_unit
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement, Words
-from rpim_opt.data.tables.columns import quantities_of, require_unique
+from rpim_opt.data.tables.reading import quantities_of, require_unique
 
 INTRINSICS = {
     "fx": "pixel", "fy": "pixel", "cx": "pixel", "cy": "pixel",

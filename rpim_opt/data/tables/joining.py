@@ -33,15 +33,16 @@ SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
 
-Rows = Sequence[int]
-
-
 class Whole(NamedTuple):
-    """One table: cells by our names, the same rows' by the files' names, and how it was put together in sentences."""
+    """One table: cells by our names, the same rows' by the files' names, how it was put together in sentences.
+
+    ``keys`` are the files' names of the columns by which rows were joined, in lower case.
+    """
 
     columns: Columns
     raw: Columns
     notes: tuple[str, ...]
+    keys: Sequence[str] = ()
 
 
 def together(
@@ -65,11 +66,11 @@ def together(
     values = _stacked(seen)
     notes = [*joints.notes, *values.notes]
     if within is None:
-        how, keys, others = _keys(moving, seen, joints.columns, values.columns, key)
-        place: dict[str, int] = {}
-        for i, name in enumerate(keys):
-            if place.setdefault(name, i) != i:
-                raise InputError(f"the key {how}", f"'{name}' twice in {moving[0].file}", "every configuration once")
+        how, used, keys, others = _keys(moving, seen, joints, values, key)
+        place = {name: i for i, name in enumerate(keys)}
+        if len(place) < len(keys):
+            twice = next(name for name in keys if keys.count(name) > 1)
+            raise InputError(f"the key {how}", f"'{twice}' twice in {moving[0].file}", "every configuration once")
         right = [i for i, name in enumerate(others) if name in place]
         if not right:
             found = f"no value that {moving[0].file} and {seen[0].file} share"
@@ -85,14 +86,17 @@ def together(
     else:
         if not (np.isfinite(within) and within >= 0):
             raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
-        there, then = _times(moving, key), _times(seen, key)
+        clocks = [_clocks(side, key) for side in (moving, seen)]
+        used = [name.lower() for names in clocks for name in names]
+        there, then = (
+            np.concatenate([seconds(name, table.raw[name]) for name, table in zip(names, side, strict=True)])
+            for names, side in zip(clocks, (moving, seen), strict=True)
+        )
         rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
         at, of, apart = partners(there, then, within + rounding)
         if not len(at):
             nearest = float(np.abs(there - then[0]).min())
-            found = (
-                f"no two within {within:g} s; the first measured row is {nearest:.6g} s from the nearest with joints"
-            )
+            found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
             raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
         left, right = at.tolist(), of.tolist()
         labels = _labels(values.columns)
@@ -105,18 +109,15 @@ def together(
         if lonely:
             several = f"{len(lonely)} measured rows without a partner within {within:g} s, left out"
             notes.append(f"{several}: {listed(lonely)}.")
-    whole = _chosen(joints.columns, left) | _chosen(values.columns, right)
+    sides = ((joints, left), (values, right))
+    whole = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.columns.items()}
+    raw = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.raw.items()}
     whole.pop("label", None)
     if len(set(names)) == len(names):
         whole = {"label": names, **whole}
     else:  # several measured values of a configuration
         whole.setdefault("configuration", names)
-    raw = _chosen(joints.raw, left) | _chosen(values.raw, right)
-    return Whole(whole, raw, tuple(notes))
-
-
-def _chosen(columns: Columns, rows: Rows) -> dict[str, Sequence[Any]]:
-    return {name: [cells[i] for i in rows] for name, cells in columns.items()}
+    return Whole(whole, raw, tuple(notes), used)
 
 
 # --- below each other ----------------------------------------------------------------------------------------------
@@ -142,33 +143,31 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
             if old is not None and new is not None and old.si != new.si:
                 cells = [repr(float(cell) * old.si / new.si) for cell in cells]
             whole[name].extend(cells)
-    counts = ", ".join(f"{table.file} {_count(table.columns)}" for table in tables)
+    labels = [_labels(table.columns) for table in tables]
+    counts = ", ".join(f"{table.file} {len(own)}" for table, own in zip(tables, labels, strict=True))
     notes = [f"rows of the files below each other: {counts}."]
-    names = [name for table in tables for name in _labels(table.columns)]
+    names = [name for own in labels for name in own]
     if len(set(names)) < len(names):
         files = [Path(table.file).stem for table in tables]
         if len(set(files)) < len(files):
             files = [str(i) for i in range(1, len(files) + 1)]
-        names = [f"{file}:{name}" for file, table in zip(files, tables, strict=True) for name in _labels(table.columns)]
+        names = [f"{file}:{name}" for file, own in zip(files, labels, strict=True) for name in own]
         notes.append("labels are there in several files: the file's name is put before them.")
     return Whole({"label": names, **whole}, _raw(tables), tuple(notes))
 
 
-def _count(columns: Columns) -> int:
-    return len(next(iter(columns.values())))
-
-
 def _labels(columns: Columns) -> list[str]:
-    return [str(label) for label in columns.get("label", range(1, _count(columns) + 1))]
+    count = len(next(iter(columns.values())))
+    return [str(label) for label in columns.get("label", range(1, count + 1))]
 
 
 # --- by a key ------------------------------------------------------------------------------------------------------
 
 
 def _keys(
-    moving: Sequence[Understood], seen: Sequence[Understood], joints: Columns, values: Columns, key: str
-) -> tuple[str, list[str], list[str]]:
-    """Return what the key is, and those of the rows with joints and of the measured ones."""
+    moving: Sequence[Understood], seen: Sequence[Understood], joints: Whole, values: Whole, key: str
+) -> tuple[str, Sequence[str], list[str], list[str]]:
+    """Return what the key is, its columns, and the keys of the rows with joints and of the measured ones."""
     left, right = _raw(moving), _raw(seen)
     # columns of either side, labels or left out, that name every row alike
     sides = []
@@ -176,50 +175,52 @@ def _keys(
         free = [each.column for each in tables[0].meant if each.name in ("", "label", "configuration")]
         cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
         sides.append({name: set(keys) for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)})
-    alike = [
+    pairs = [
         (name, other)
         for (name, keys), (other, others) in product(sides[0].items(), sides[1].items())
         if len(keys & others) >= SAME * min(len(keys), len(others))
+        and (key in ("", "row") or key.lower() in (name.lower(), other.lower()))
     ]
-    pairs = [pair for pair in alike if key in ("", "row") or key.lower() in map(str.lower, pair)]
-    names = [pair for pair in pairs if not _running(left[pair[0].lower()])]
+    names = [pair for pair in pairs if not _running(_normal(left[pair[0].lower()]))]
     pair = next(iter(names or pairs), None) if len(names or pairs) == 1 else None
+    own: list[str] = []
+    others: list[str] = []
+    if pair:
+        own, others = _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
     if key == "row":
-        count = _count(joints)
-        if _count(values) != count:
-            found = f"{count} rows of joints and {_count(values)} measured"
+        count, other = (len(next(iter(side.columns.values()))) for side in (joints, values))
+        if count != other:
+            found = f"{count} rows of joints and {other} measured"
             raise InputError("--key row", found, "as many of both, or a column that both have")
-        if names and pair:
-            own, others = _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
-            there = set(others)
-            wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
-            if wrong:
-                found = f"{wrong} of {len(own)} rows whose {pair[0]} is the {pair[1]} of another row"
-                raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
+        there = set(others)
+        wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
+        if names and pair and wrong:
+            found = f"{wrong} of {len(own)} rows whose {pair[0]} is the {pair[1]} of another row"
+            raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
         numbers = [str(i) for i in range(1, count + 1)]
-        return "the number of the row", numbers, numbers
-    if "label" in joints and key in ("", "label"):
-        labels = _normal(joints["label"])
+        return "the number of the row", (), numbers, numbers
+    if "label" in joints.columns and key in ("", "label"):
+        labels = _normal(joints.columns["label"])
         for column in ("label", "configuration"):
-            others = _normal(values.get(column, ()))
-            if set(labels) & set(others) and not (names and _running(labels)):
-                return "label", labels, others
+            measured = _normal(values.columns.get(column, ()))
+            if set(labels) & set(measured) and not (names and _running(labels)):
+                return "label", (), labels, measured
     common = [name for name in left if name in right]
     name = key.lower()
     if not key and len(common) == 1 and not (names and pair):
         name = common[0]
-    if pair and name not in common:
-        return " = ".join(pair), _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
-    if name not in common:
-        found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {moving[0].file} and {seen[0].file}"
-        accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
-        raise InputError("--key", found, f"{accepted} for the nearest time")
-    return f"column '{name}'", _normal(left[name]), _normal(right[name])
+    if name in common:
+        return f"column '{name}'", (name,), _normal(left[name]), _normal(right[name])
+    if pair:
+        return " = ".join(pair), [each.lower() for each in pair], own, others
+    found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {moving[0].file} and {seen[0].file}"
+    accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
+    raise InputError("--key", found, f"{accepted} for the nearest time")
 
 
-def _running(cells: Sequence[Any]) -> bool:
-    """Whether cells count the rows."""
-    return _normal(cells) == [str(i) for i in range(1, len(cells) + 1)]
+def _running(keys: Sequence[str]) -> bool:
+    """Whether keys count the rows."""
+    return keys == [str(i) for i in range(1, len(keys) + 1)]
 
 
 def _raw(tables: Sequence[Understood]) -> Mapping[str, list[Any]]:
@@ -262,8 +263,8 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     return partner[kept], kept, apart[kept]
 
 
-def _times(tables: Sequence[Understood], key: str) -> Array:
-    """Return the times [s] of all rows of some tables."""
+def _clocks(tables: Sequence[Understood], key: str) -> list[str]:
+    """Return the columns of times of some tables."""
     found = []
     for table in tables:
         name = time_column(table.raw)
@@ -273,8 +274,8 @@ def _times(tables: Sequence[Understood], key: str) -> Array:
             lacks = f"no column '{key}'" if key else "no column of times"
             where = f"--time-tolerance, {table.file}"
             raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
-        found.append(seconds(name, table.raw[name]))
-    return np.concatenate(found)
+        found.append(name)
+    return found
 
 
 def time_column(names: Iterable[str]) -> str | None:

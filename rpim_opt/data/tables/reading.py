@@ -1,8 +1,8 @@
-"""Tables of measurements become a dataset, row by row."""
+"""Tables of measurements become a dataset: the columns that they may have, their numbers in SI, and their rows."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
@@ -12,15 +12,17 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, RowError
+from rpim_opt.basics.exceptions import InputError, RowError, choices
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
-from rpim_opt.basics.units import joint_columns
+from rpim_opt.basics.units import LARGEST, SMALLEST, joint_columns, spelled, split_unit, with_unit
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
-from rpim_opt.data.noise import covariances, declared_noise
-from rpim_opt.data.tables.columns import Numbers, further_columns, labels, numeric, values_form
+from rpim_opt.data.noise import Numbers, covariances, declared_noise
 from rpim_opt.robot.mdh import Robot
+
+SPREADS = ("sigma", "u95")
+"""Stems of standard and expanded uncertainties."""
 
 
 def read_data(
@@ -90,9 +92,8 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     if payload is not None and not (payload >= 0).all():
         row = int(np.argmin(payload))
         raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
-    approach = None
-    if ("approach1", "") in columns:
-        approach = _of_joints("approach", columns, robot, kind, N)
+    torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("tau", "approach"))
+    if approach is not None:
         for row, point, joint in np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0))):
             where = f"row {label[row]}, column approach{joint + 1}"
             raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
@@ -106,7 +107,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         y=y,
         covariance=covariances(columns, declared, kind, y, label),
         row=np.arange(N),
-        torque=_of_joints("tau", columns, robot, kind, N) if ("tau1", "") in columns else None,
+        torque=torque,
         payload=payload,
         approach=approach,
         columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
@@ -143,8 +144,13 @@ def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:
     return np.column_stack([columns[stem, ""] for stem in stems]) if stems else np.empty((N, 0))
 
 
-def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Array:
-    """Return joint values, torques or directions (N, p, dof); a second point without its own has the first's."""
+def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Any:
+    """Return joint values, torques or directions (N, p, dof), or None; a second point without its own has the first's.
+
+    Of one point they are no copy.
+    """
+    if (f"{stem}1", "") not in columns:
+        return None
     own = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
     points = [own, [f"to_{name}" for name in own] if (f"to_{stem}1", "") in columns else own][: kind.points]
     values = [_beside_each_other(columns, names, N) for names in points]
@@ -155,6 +161,128 @@ def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
     """Return the texts of the first of the columns that is there, or N empty ones."""
     column = next((each for each in columns if each in table), None)
     return texts(table[column], column) if column else ("",) * N
+
+
+# --- columns ---------------------------------------------------------------------------------------------------------
+
+
+def text_columns(kind: Measurement) -> list[str]:
+    """Return the columns of names that a table may have."""
+    second = ["to_marker"] if kind.points == 2 else []
+    return ["label", "configuration", "marker", "fixture", "session", *second, *kind.names]
+
+
+def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
+    """Return the columns of numbers that a table may have, name without unit to its dimensions; "" is a plain one."""
+    joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
+    joints |= {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
+    joints |= {f"approach{i}": "" for i in range(1, robot.dof + 1)}
+    plain = {**further_columns(robot, kind), **joints, **kind.columns, "payload": "mass"}
+    for form, _ in kind.forms:
+        plain |= form
+    if kind.points == 2:
+        plain |= {f"to_{stem}": dimension for stem, dimension in joints.items()}
+    known = {stem: [dimension] for stem, dimension in plain.items()}
+    for spread in SPREADS:
+        known[spread] = sorted(set(kind.components.values()))
+        known |= {f"{spread}_{name}": [dimension] for name, dimension in kind.components.items()}
+    components = list(kind.components.items())
+    for i, (a, of_a) in enumerate(components):
+        for b, of_b in components[i:]:
+            known[f"cov_{a}_{b}"] = [f"{of_a}2" if of_a == of_b else f"{of_a} {of_b}"]
+    return known
+
+
+def further_columns(robot: Robot, kind: Measurement) -> dict[str, str]:
+    """Return the columns that terms and measurement see, name to dimension: temperature, and a user's own."""
+    return {"temperature": "temperature", **robot.model.columns, **kind.extra}
+
+
+def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str]) -> Numbers:
+    """Return the columns of numbers [SI]; refuse those that are unknown, in two units, or missing."""
+    known = number_columns(robot, kind)
+    columns = quantities_of(table, known, text_columns(kind), label)
+    # joints, measured values, and whole groups of what is there in part
+    joints, *groups = ([f"{stem}{i}" for i in range(1, robot.dof + 1)] for stem in ("q", "tau", "approach"))
+    required = [*joints, *values_form(columns, kind)[0], *(name for name in kind.sees if name in kind.extra)]
+    if kind.points == 2:
+        groups += [[f"to_{stem}" for stem in group] for group in (joints, *groups)]
+    for group in groups:
+        if any((stem, "") in columns for stem in group):
+            required += group
+    for stem in required:
+        if (stem, "") not in columns:
+            accepted = kind.accepted.get(stem, " or ".join(with_unit(stem, known[stem][0])))
+            if stem[0] == "q" and stem[1:].isdigit():
+                accepted += ", or rpim-opt new --constants for a joint that did not move"
+            raise InputError("the header", f"no column for '{stem}' among {', '.join(table)}", accepted)
+    return columns
+
+
+def quantities_of(
+    table: Columns, known: Mapping[str, Sequence[str]], names: Sequence[str], label: Sequence[str]
+) -> Numbers:
+    """Return all columns but those of names in SI; refuse those that are not known, stem to its dimensions."""
+    columns: Numbers = {}
+    for name in table:
+        if name in names:
+            continue
+        stem, unit = split_unit(name)
+        dimension = unit.dimension if unit else ""
+        si = unit.si if unit else 1.0
+        if stem not in known:
+            others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
+            accepted = [each for key, dimensions in others.items() for each in spelled(key, dimensions, 1)]
+            raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
+        if dimension not in known[stem]:
+            accepted = ", ".join(spelled(stem, known[stem]))
+            raise InputError("the header", f"column '{name}' without a unit of the right dimension", accepted)
+        if (stem, dimension) in columns:
+            raise InputError("the header", f"column '{stem}' in two units", "one of them")
+        values = si * numbers(table[name], name, label) + (unit.zero if unit else 0.0)
+        fits = np.abs(values) <= LARGEST
+        accepted = f"a magnitude of at most {LARGEST / si:g}"
+        if stem.startswith(SPREADS) and fits.all():
+            fits = values >= SMALLEST
+            accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
+        if not fits.all():
+            i = int(np.argmin(fits))
+            raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", accepted)
+        columns[stem, dimension] = values
+        if len(known[stem]) == 1:
+            columns[stem, ""] = values
+    return columns
+
+
+def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callable[[Array], Array]]:
+    """Return the columns that state the measured values, and the function from them to y."""
+    plain = all((stem, "") in columns for stem in kind.columns)
+    for form, convert in () if plain else kind.forms:
+        if all((stem, "") in columns for stem in form):
+            return list(form), convert
+    return list(kind.columns), lambda y: y
+
+
+def labels(table: Columns, N: int) -> tuple[str, ...]:
+    """Return the rows' labels, numbers from 1 by default; refuse names that are missing or there twice."""
+    label = tuple(map(str, range(1, N + 1)))
+    if "label" in table:
+        label = texts(table["label"], "label")
+        require_unique(label, "label")
+    for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane", "session"):
+        for i, name in enumerate(texts(table.get(column, ()), column)):
+            if not name:
+                raise InputError(f"row {label[i]}, column {column}", "''", "a name")
+    return label
+
+
+def require_unique(names: Sequence[str], column: str) -> None:
+    """Refuse a row without a name, or with one that an earlier row has."""
+    seen: set[str] = set()
+    for i, name in enumerate(names, start=1):
+        if not name or name in seen:
+            raise InputError(f"row {i}, column {column}", f"'{name}'", f"a {column} that no other row has")
+        seen.add(name)
 
 
 # --- RoboDK ----------------------------------------------------------------------------------------------------------

@@ -16,7 +16,6 @@ from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import FOREIGN, UNITS, dimension_of, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.tables.columns import number_columns, text_columns
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import (
     IN_SI,
@@ -30,6 +29,7 @@ from rpim_opt.data.tables.names import (
     ur_joint,
 )
 from rpim_opt.data.tables.orientations import EULER, numbered, quaternion_columns, quaternions
+from rpim_opt.data.tables.reading import number_columns, text_columns
 from rpim_opt.robot.mdh import Robot
 
 TURNED = ("rx", "ry", "rz")
@@ -135,16 +135,15 @@ def understand(
             turned = [names[turn] for turn in TURNED]
             angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns.pop(name), name) for name in turned]
             columns |= quaternions(np.column_stack(angles), how)
-            said = "rotation vector" if how == "vector" else f"turn, {how}"
-            new = "qw, qx, qy, qz"
-            meant = [each._replace(meaning=said, name=new, unit="") if each.name in turned else each for each in meant]
+            said = {"meaning": "rotation vector" if how == "vector" else f"turn, {how}", "name": "qw, qx, qy, qz"}
+            meant = [each._replace(**said, unit="") if each.name in turned else each for each in meant]
         kept, notes = range(len(next(iter(columns.values()), ()))), []
         if not targets:
             kept, columns, notes = _rows_with_values(columns, robot, kind)
     except InputError as error:
         raise error.within(path) from None
-    for each in {dimension_of(m.unit): m for m in meant if "unit in the header" in m.why and m.unit}.values():
-        unit = stated.get(dimension_of(each.unit), each.unit)
+    for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
+        unit = stated.get(dimension, each.unit)
         if unit != each.unit:
             notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
     doubt = ""
@@ -307,9 +306,8 @@ def _counted(read: Readings, robot: Robot) -> Readings:
         if match and each.unit and not each.why:
             why = f"'{match[1]}' counted from 1, in units of joints"
             found.setdefault(match[1], {})[name] = Reading(f"q{match[2]}", each.unit, why, each.kind)
-    wanted = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    said = [{each.stem: dimension_of(each.unit) for each in of.values()} for of in found.values()]
-    whole = [of for of, stems in zip(found.values(), said, strict=True) if wanted.items() <= stems.items()]
+    wanted = {(f"q{i}", dimension) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
+    whole = [of for of in found.values() if wanted <= {(each.stem, dimension_of(each.unit)) for each in of.values()}]
     return whole[0] if len(whole) == 1 else {}
 
 
@@ -442,7 +440,7 @@ def _rows_with_values(
         rows = [i for i in range(count) if own and all(is_missing(str(cells[i])) for cells in own)]
         if rows:
             notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
-        out |= set(rows)
+        out.update(rows)
     kept = [i for i in range(count) if i not in out]
     if columns and not kept:
         raise InputError("the table", "no row with values", "at least one")
