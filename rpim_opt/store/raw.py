@@ -21,7 +21,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
-from rpim_opt.data.tables.orientations import ORDERS
+from rpim_opt.data.tables.names import ORDERS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
 from rpim_opt.problem.misreadings import pose_misfit

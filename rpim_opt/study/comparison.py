@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
@@ -18,9 +17,8 @@ from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import counted, progress_bar
 from rpim_opt.study import replicates
-from rpim_opt.study.methods import USUAL, Method, answer_of, measure, methods_of, metrics_of
-from rpim_opt.study.problems import FOLDER, Source, Split, divide, sources_of, splits_of
-from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED, WITH_FIGURES, Summary, figures, summarize
+from rpim_opt.study.methods import FOLDER, USUAL, methods_of, metrics_of, replicate, sources_of, splits_of
+from rpim_opt.study.ranking import WITH_FIGURES, Summary, figures, summarize
 from rpim_opt.study.replicates import Row, content_hash, require_package, run_cases
 
 MOST_DRAWS = 100_000
@@ -179,33 +177,6 @@ def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -
     ):
         raise InputError(where, f"{stated!r}", accepted)
     return list(dict.fromkeys(map(kind, values)))
-
-
-def replicate(
-    source: Source, split: Split, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
-) -> Row:
-    """Return the figures of a method on a problem's split; whatever goes wrong becomes a status and a reason."""
-    row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
-    seed = case["seed"]
-    try:
-        instance = divide(source.instance(seed), split, case["fold"], case["count"], case["noise_factor"], seed)
-        begun = time.perf_counter()
-        returned = method.solve(instance)
-        seconds = time.perf_counter() - begun
-        answer = answer_of(returned, instance.problem, method.label)
-        values = measure(instance, answer, seconds, metrics)
-        row["configurations"] = len(np.unique(instance.problem.data.configuration))
-        row["parameters"] = len(instance.problem.parameters.free)
-        if answer.result is not None:
-            row["weight"] = float(answer.result.weight)
-            if not answer.result.converged:
-                row |= {"status": UNCONVERGED, "reason": answer.result.message}
-        return {**row, **values}
-    except InputError as error:
-        row |= {"status": IMPOSSIBLE, "reason": str(error)}
-    except Exception as error:  # somebody's function, a solver: the other replicates go on
-        row |= {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
-    return {**row, **dict.fromkeys(metrics)}
 
 
 @dataclass(frozen=True, eq=False)

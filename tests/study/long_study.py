@@ -28,7 +28,7 @@ import os, time
 import numpy as np
 import rpim_opt as ro
 from rpim_opt.study import Metric, Report
-from rpim_opt.study.problems import add_noise
+from rpim_opt.study.methods import add_noise
 
 QUESTION = "Do results depend on how often a study was killed?"
 METRICS = {{"error": Metric("lower", 0.1)}}

@@ -146,7 +146,7 @@ def test_seeds_repeat_only_what_they_change() -> None:
 
 
 def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
-    from rpim_opt.study.problems import add_noise
+    from rpim_opt.study.methods import add_noise
 
     data = ro.load("pose").problem.data
     draws = [add_noise(data, 3.0, seed) for seed in range(60)]

@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.study.figures import headline
-from rpim_opt.study.problems import sources_of, splits_of
+from rpim_opt.study.methods import sources_of, splits_of
 from rpim_opt.study.ranking import UNCONVERGED, number
 from rpim_opt.study.replicates import compute
 from rpim_opt.study.studies import Report, load_study, write

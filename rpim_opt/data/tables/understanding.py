@@ -16,19 +16,9 @@ from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import FOREIGN, UNITS, dimension_of, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.tables import names as known_names
 from rpim_opt.data.tables.formats.registry import read_raw
-from rpim_opt.data.tables.names import (
-    IN_SI,
-    JOINTS,
-    TURNS,
-    UR_JOINTS,
-    Reading,
-    Readings,
-    endings,
-    recognize,
-    ur_joint,
-)
-from rpim_opt.data.tables.orientations import EULER, numbered, quaternion_columns, quaternions
+from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize, ur_joint
 from rpim_opt.data.tables.reading import number_columns, text_columns
 from rpim_opt.robot.mdh import Robot
 
@@ -117,7 +107,7 @@ def understand(
     raw = source if isinstance(source, RawTable) else read_raw(source, options)
     stated = options.units
     options = replace(options, units={**raw.units, **stated})
-    if options.rotation not in ("", "vector") and not EULER.fullmatch(options.rotation):
+    if options.rotation not in ("", "vector") and not known_names.EULER.fullmatch(options.rotation):
         accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
         raise InputError("--rotation", f"'{options.rotation}'", accepted)
     known = number_columns(robot, kind)
@@ -134,7 +124,7 @@ def understand(
                 raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
             turned = [names[turn] for turn in TURNED]
             angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns.pop(name), name) for name in turned]
-            columns |= quaternions(np.column_stack(angles), how)
+            columns |= known_names.quaternions(np.column_stack(angles), how)
             said = {"meaning": "rotation vector" if how == "vector" else f"turn, {how}", "name": "qw, qx, qy, qz"}
             meant = [each._replace(**said, unit="") if each.name in turned else each for each in meant]
         kept, notes = range(len(next(iter(columns.values()), ()))), []
@@ -175,10 +165,10 @@ def _readings(
     read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
     rotation = ""
     stems = {found.stem for found in read.values()}
-    for words, why in JOINTS:
+    for words, why in known_names.JOINTS:
         if dof == len(words) and stems >= set(words):
             _rename(read, {word: f"q{i}" for i, word in enumerate(words, start=1)}, why)
-    for letters, new, why, turns in TURNS:
+    for letters, new, why, turns in known_names.TURNS:
         if {"x", "y", "z", *letters} <= stems:
             _rename(read, dict(zip(letters, new, strict=True)), why)
             rotation = turns
@@ -197,7 +187,7 @@ def _readings(
             places[f"q{i}"] = ur_joint(joint)
             if joints:
                 places[f"q{i}"] = joints.index(joint) + 1 if joint in joints else 0
-            elif not places[f"q{i}"] or dof != len(UR_JOINTS):
+            elif not places[f"q{i}"] or dof != len(known_names.UR_JOINTS):
                 accepted = "a robot from a URDF, which names its joints"
                 raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
         why = "the joint that its column of names names"
@@ -406,7 +396,7 @@ def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[s
         return units[dimension], "--units"
     if dimension == "pixel":
         return "px", "the only unit"
-    why = next((why for pattern, why in IN_SI.items() if re.fullmatch(pattern, name)), "")
+    why = next((why for pattern, why in known_names.IN_SI.items() if re.fullmatch(pattern, name)), "")
     unit = {"angle": "rad", "length": "m"}.get(dimension, "")
     return (unit, why) if unit and why else ("", "")
 
