@@ -37,7 +37,6 @@ from rpim_opt.robot.chain import MOUNT, ORIGIN
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.problem_file import (
-    AngleTable,
     DistanceTable,
     Observation,
     ProblemFile,
@@ -54,8 +53,6 @@ Tools = Mapping[str, tuple[float, ...]]
 Files = Mapping[str, list[str]]
 UNSTATED = 1e-5
 """Standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool."""
-RIGHT = (0.0, 90.0)
-"""Angles [deg] that two planes may be known to have."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -211,9 +208,8 @@ def load(
 def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
     """Return the problem of several chains of one URDF: formulation, prior and record are the first one's."""
     count = Counter(name for part in parts.values() for name in part.problem.parameters.terms)
-    shared = [
-        f"{prefix}*" for prefix in (ORIGIN, MOUNT) if any(count[name] > 1 for name in count if name.startswith(prefix))
-    ]
+    several = tuple(name for name in count if count[name] > 1)
+    shared = [f"{prefix}*" for prefix in (ORIGIN, MOUNT) if any(name.startswith(prefix) for name in several)]
     more = stated.table.shared
     if isinstance(more, list):
         more = dict.fromkeys(parts, more)
@@ -345,17 +341,11 @@ def _read(stated: ProblemFile, each: Observation, path: Path, tcps: dict[str, li
 def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Dataset:
     """Return the measurements of a role with the known distances and angles of what they touch."""
     known: list[Known] = []
-    distances = [(f"key known_distance {i}", each) for i, each in enumerate(table.known_distance, start=1)]
-    angles = [(f"key known_angle {i}", each) for i, each in enumerate(table.known_angle, start=1)]
+    distances = [(f"key known_distance {i}.sigma_mm", each) for i, each in enumerate(table.known_distance, start=1)]
+    angles = [(f"key known_angle {i}.sigma_mrad", each) for i, each in enumerate(table.known_angle, start=1)]
     for where, each in (*distances, *angles):
-        if isinstance(each, AngleTable) and each.deg not in RIGHT:
-            raise InputError(f"{where}.deg", f"{each.deg:g}", "0 (parallel) or 90 (square)", path)
-        if len(each.between) != 2:
-            raise InputError(f"{where}.between", f"{len(each.between)} names", "two", path)
         if each.sigma is None and not each.validation:
-            unit = "mm" if isinstance(each, DistanceTable) else "mrad"
-            accepted = "the standard deviation of the stated value"
-            raise InputError(f"{where}.sigma_{unit}", "nothing", accepted, path)
+            raise InputError(where, "nothing", "the standard deviation of the stated value", path)
         if each.validation != (role == "validation"):
             continue
         first, second = each.between

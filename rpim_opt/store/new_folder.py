@@ -29,7 +29,7 @@ from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import find_source, read_arm
 from rpim_opt.robot.mdh import MDH
-from rpim_opt.store.raw import NOISE, Understanding, rows_of, understand_of
+from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
 
 IDENTIFICATION, VALIDATION, TARGET = "identification.csv", "validation.csv", "target.csv"
 """Files of a new folder."""
@@ -117,7 +117,7 @@ def new_problem(
         understood(found)
     board = stated_target(target)
     kind, how = _kind(arm, found, board, measurement)
-    noise = {f"{name}_{NOISE[d][0]}": NOISE[d][1] for name, d in kind.noise.items()}
+    noise = usual_noise(kind)
     notes = list(found.sentences)
     rows = rows_of(found, board.under(found.columns), arm, kind)
     columns = found.columns

@@ -21,8 +21,6 @@ _ALLOWED: ContextVar[bool] = ContextVar("allow_code", default=False)
 def allow_code() -> Iterator[None]:
     """Allow that problem folders and results that are read meanwhile run the Python files that they name.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> with ro.store.allow_code():
     ...     problem = ro.load("position").problem  # its file could name a measurement type "mine:height"
@@ -42,10 +40,7 @@ def is_own(name: object) -> bool:
 def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
     """Return an object of a Python file that lies beside ``file``, which names it as the value of ``where``.
 
-    Raises
-    ------
-    InputError
-        Where code is not allowed, the Python file is missing or cannot be run, or the object is of another kind.
+    InputError where code is not allowed, the Python file is missing or cannot be run, or the object is of another kind.
     """
     module, _, attribute = name.partition(":")
     source = inside(file.parent, f"{module}.py", where, file)

@@ -104,9 +104,9 @@ class FrameTable(Table):
 class ScatterTable(Table):
     """The robot's repeatability, where it is known."""
 
-    position: Length = 0.0
-    orientation: Angle = 0.0
-    joint: Angle = 0.0
+    position: Length = Field(default=0.0, ge=0)
+    orientation: Angle = Field(default=0.0, ge=0)
+    joint: Angle = Field(default=0.0, ge=0)
 
 
 class GridTable(Table):
@@ -117,10 +117,13 @@ class GridTable(Table):
     spacing: Length
 
 
+Pair = Annotated[list[Name], Field(min_length=2, max_length=2)]
+
+
 class DistanceTable(Table):
     """A known distance; ``mm = 50`` is short for ``distance_mm = 50``. One that validates identifies nothing."""
 
-    between: list[Name]
+    between: Pair
     validation: bool = False
     distance: Length
     sigma: Annotated[float | None, "length"] = None
@@ -135,11 +138,11 @@ class DistanceTable(Table):
 
 
 class AngleTable(Table):
-    """A known angle, 0 or 90 degrees."""
+    """A known angle, 0 (parallel) or 90 degrees (square)."""
 
-    between: list[Name]
+    between: Pair
     validation: bool = False
-    deg: float
+    deg: Literal[0, 90]
     sigma: Annotated[float | None, "angle"] = None
 
 
@@ -334,18 +337,7 @@ def read_problem(
             board = grid_board(pattern.columns, pattern.rows, pattern.spacing)
         except InputError as error:
             raise InputError("key target", error.found, error.accepted, path) from None
-    return ProblemFile(
-        path=path,
-        table=table,
-        placed=placed,
-        robot=arm.robot,
-        kinds=kinds,
-        observations=tuple(observations),
-        tools=tools,
-        base=base,
-        chains=chains,
-        board=board,
-    )
+    return ProblemFile(path, table, placed, arm.robot, kinds, tuple(observations), tools, base, chains, board)
 
 
 def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
@@ -386,9 +378,6 @@ def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
             raise InputError("key scatter", f"'{table.scatter}'", accepted, path)
         return None
     found = part(ScatterTable, table.scatter, "key scatter", path)
-    for name, value in found:
-        if value < 0:
-            raise InputError(f"key scatter.{name}", f"{value}", "a standard deviation, zero or more", path)
     return Scatter(found.position, found.orientation, found.joint)
 
 

@@ -37,8 +37,6 @@ READINGS = {
                  "intrinsic zxy"),
 }  # fmt: skip
 """What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
-NOISE = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
-"""Standard deviations where the data state none."""
 Files = Sequence[tuple[Path | None, RawTable]]
 
 
@@ -170,6 +168,12 @@ def understand_tables(
     return found
 
 
+def usual_noise(kind: Measurement) -> dict[str, float]:
+    """Return standard deviations for data that state none, as ``[noise]`` has them."""
+    usual = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
+    return {f"{name}_{usual[dimension][0]}": usual[dimension][1] for name, dimension in kind.noise.items()}
+
+
 def rows_of(
     found: Understanding,
     columns: Columns,
@@ -178,10 +182,8 @@ def rows_of(
     noise: Mapping[str, float] | None = None,
 ) -> Dataset:
     """Return the measurements in understood columns; an error names the column as the file does."""
-    if noise is None:
-        noise = {f"{name}_{NOISE[dimension][0]}": NOISE[dimension][1] for name, dimension in kind.noise.items()}
     try:
-        return read_data(columns, arm.robot, noise, kind)
+        return read_data(columns, arm.robot, usual_noise(kind) if noise is None else noise, kind)
     except InputError as error:
         row, mark, ours = error.where.partition(", column ")
         own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
@@ -243,7 +245,7 @@ def _tables(
     for path, raw in files:
         try:
             found = understand(raw, arm.robot, kind, options, arm.names, targets)
-            tables.append(replace(found, file=path.name if path else "the table"))
+            tables.append(replace(found, file=path.name) if path else found)
         except InputError as error:
             raise error.within(path) from None
     return tables

@@ -95,30 +95,11 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     for each, role in product(stated.observations, ("identification", "validation")):
         file = getattr(each, role)
         if file:
-            if not file.lower().endswith(".csv"):
-                raise InputError(f"key {role}", f"{file!r}", "a name ending in .csv, to be written", stated.path)
             place = inside(stated.path.parent, file, f"key {role}", stated.path).resolve()
-            if place in taken:
-                raise InputError(f"key {role}", f"{file!r} twice", "a name of its own for every table", stated.path)
+            if place.suffix.lower() != ".csv" or place in taken:
+                raise InputError(f"key {role}", f"{file!r}", "a name of its own for every table, in .csv", stated.path)
             taken.add(place)
-    fixtures: list[tuple[str, ...]] = []
-    none = np.empty(0, dtype=int)
-    blocks = []  # without rows, for every measurement and fixture: what has parameters of its own
-    for each in stated.observations:
-        kind = stated.kinds[each.measurement]
-        places = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
-        nested = [key for table in places for key, value in table.items() if isinstance(value, dict)]
-        fixtures.append(tuple(dict.fromkeys(nested)) or ("",))  # one without a name is the only one
-        empty = np.empty((0, kind.points, stated.robot.dof)), np.empty((0, len(kind.columns))), np.empty((0, 1, 1))
-        blocks += [Block(kind, *empty, none, fixture=fixture) for fixture in fixtures[-1]]
-    nothing = Dataset(tuple(blocks), (), none)
-    own = place_fixtures(stated.placed, nothing)
-    entries = {}
-    for block in blocks:
-        named = {of_fixture(name, block.fixture): of for name, of in block.measurement.parameters.items()}
-        entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
-    base = (0.0,) * 6 if stated.base is None else stated.base
-    parameters = stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
+    fixtures, parameters = _parameters(stated)
     free = parameters.free
     x = plan.spread * rng.normal(size=len(free)) * free.scale
     dimensions = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
@@ -146,6 +127,28 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     return Simulated(tables, {name: (dimension, value) for name, dimension, value in truth}, tuple(blunders))
 
 
+def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]:
+    """Return the fixtures of every observation, and the parameters that the file identifies."""
+    fixtures: list[tuple[str, ...]] = []
+    none = np.empty(0, dtype=int)
+    blocks = []  # without rows, for every measurement and fixture: what has parameters of its own
+    for each in stated.observations:
+        kind = stated.kinds[each.measurement]
+        places = [stated.placed.get(name.partition("_")[0], {}) for name in kind.parameters]
+        nested = [key for table in places for key, value in table.items() if isinstance(value, dict)]
+        fixtures.append(tuple(dict.fromkeys(nested)) or ("",))  # one without a name is the only one
+        empty = np.empty((0, kind.points, stated.robot.dof)), np.empty((0, len(kind.columns))), np.empty((0, 1, 1))
+        blocks += [Block(kind, *empty, none, fixture=fixture) for fixture in fixtures[-1]]
+    nothing = Dataset(tuple(blocks), (), none)
+    own = place_fixtures(stated.placed, nothing)
+    entries = {}
+    for block in blocks:
+        named = {of_fixture(name, block.fixture): of for name, of in block.measurement.parameters.items()}
+        entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
+    base = (0.0,) * 6 if stated.base is None else stated.base
+    return fixtures, stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
+
+
 def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
     """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files.
 
@@ -170,11 +173,7 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """One table: what it holds, its draws, whose order is that of the making, and whether it is noisy.
-
-    ``x`` are the true deviations (n,) [SI]. A table that identifies has noise and blunders; one that validates has
-    none, though they are drawn all the same.
-    """
+    """One table of the true deviations ``x`` (n,) [SI]; it is noisy where it identifies, and draws alike where not."""
 
     stated: ProblemFile
     plan: Simulation
@@ -197,7 +196,7 @@ class _Table:
 
     def _measured(self, random: Array) -> tuple[Columns, list[str]]:
         """Return a table of measured values, or of configurations on a plane or sphere."""
-        kind, truth = self.kind, self.x
+        kind = self.kind
         count = len(random) // 2
         columns, rows = self._labelled(count)
         q = np.array([[random[k], random[count + k]][: kind.points] for k in rows])
@@ -214,29 +213,25 @@ class _Table:
             sigma = np.sqrt(data.blocks[0].covariance[0, 0, 0])
             errors = sigma * self.rng.normal(size=len(data)) * self.noisy
             return columns | self._joints(self._touching(problem, errors)[:, None], EXACT_DIGITS), []
-        for block, modelled in zip(data.blocks, problem.modelled(truth), strict=True):
+        for block, modelled in zip(data.blocks, problem.modelled(self.x), strict=True):
             values[block.row] = modelled
         # covariances at the true values: a tracker's depend on them
         for block in self._read({**columns, **self._values(values)}).blocks:
             errors = self._errors(block)
             if self.noisy:
                 values[block.row] = kind.plus(block.y, errors)
-        wrong: list[int] = []
+        wrong: list[str] = []
         if self.noisy and self.plan.blunders:  # moved by the length of a blunder, in random directions
             hit = self.rng.choice(len(values), self.plan.blunders, replace=False)
             lengths = [i for i, dimension in enumerate(kind.columns.values()) if dimension == "length"]
             direction = self.rng.normal(size=(len(hit), len(lengths)))
             direction /= np.linalg.norm(direction, axis=1, keepdims=True)
             values[hit[:, None], np.array(lengths)] += self.plan.blunder * direction
-            wrong = sorted(hit.tolist())
-        return columns | self._values(values), [columns["label"][i] for i in wrong]
+            wrong = [columns["label"][i] for i in sorted(hit.tolist())]
+        return columns | self._values(values), wrong
 
     def _touching(self, problem: CalibrationProblem, wanted: Array) -> Array:
-        """Return joint values (N, dof) at which a constraint's residuals are the wanted ones (N,) [m].
-
-        From random configurations by Newton's steps (`Target`); the generator advances by the same amount however many
-        are needed.
-        """
+        """Return joint values (N, dof) at which a constraint's residuals are the wanted ones (N,) [m]."""
 
         def away(q: Array, rows: np.ndarray) -> Array:
             data = problem.data.take(rows)
@@ -247,6 +242,7 @@ class _Table:
             return (residual - wanted[rows])[:, None]
 
         target = Target(problem.robot, away, damping=1e-20)  # more would change the last digits of tables
+        # a generator of its own: draws of other tables do not depend on how many are needed
         q, beyond = target.reached(len(wanted), self.rng.spawn(1)[0], self.plan.joint_share)
         if beyond is not None:
             found = "a plane or sphere out of reach"
@@ -285,11 +281,8 @@ class _Table:
         """Return measured values (N, c): millimetres to a nanometre, quaternions to 1e-12."""
         columns = {}
         for i, (name, dimension) in enumerate(self.kind.columns.items()):
-            if dimension:
-                unit, si = display(dimension)
-                columns[f"{name}_{unit}"] = [f"{v:.6f}" for v in y[:, i] / si]
-            else:
-                columns[name] = [f"{v:.12f}" for v in y[:, i]]
+            unit, si = display(dimension) if dimension else ("", 1.0)
+            columns[f"{name}_{unit}".rstrip("_")] = [f"{v:.{6 if unit else 12}f}" for v in y[:, i] / si]
         return columns
 
     def _read(self, columns: Mapping[str, Sequence[Any]]) -> Dataset:
@@ -359,16 +352,18 @@ class _Table:
         if planes:
             things = {}
             for name, square in planes.items():
-                normal = _vector(square.normal)
-                normal = normal / np.sqrt(np.sum(normal**2))
+                normal = _unit(_vector(square.normal))
                 axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
-                first = axis - normal * np.sum(axis * normal)
-                first = first / np.sqrt(np.sum(first**2))
+                first = _unit(axis - normal * np.sum(axis * normal))
                 second = np.cross(normal, first)
                 places = square.size * (self.rng.uniform(size=(each, 2)) - 0.5)  # uniform on the square
                 things[name] = _vector(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
             return "plane", things
         return "point", {name: np.tile(_vector(place) / 1e3, (each, 1)) for name, place in points.items()}
+
+
+def _unit(vector: Array) -> Array:
+    return np.asarray(vector / np.sqrt(np.sum(vector**2)), dtype=float)
 
 
 def _vector(values: Sequence[float]) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,7 +33,11 @@ def write(folder: Path, text: str | bytes, name: str = "raw.csv") -> Path:
 
 
 def read(path: Path, joints: Any = (), robot: Any = ARM, kind: Any = position, **asked: Any) -> Understood:
-    return understand(path, robot, kind, ro.data.TableOptions(**asked), joints)
+    options = ro.data.TableOptions(**asked)
+    try:
+        return replace(understand(read_raw(path, options), robot, kind, options, joints), file=path.name)
+    except ro.InputError as error:
+        raise error.within(path) from None
 
 
 def book(folder: Path) -> Path:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +16,6 @@ from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import FOREIGN, UNITS, dimension_of, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
-from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize, ur_joint
 from rpim_opt.data.tables.reading import number_columns, text_columns
 from rpim_opt.robot.mdh import Robot
@@ -58,12 +56,12 @@ class Understood:
     says how orientations are to be read where only a check against the robot shows it: ``quaternion``, ``rotation``.
     """
 
-    file: str
     columns: Columns
     raw: Columns
     meant: tuple[Meant, ...]
     notes: tuple[str, ...]
     doubt: str = ""
+    file: str = "the table"
 
     @property
     def stems(self) -> set[str]:
@@ -77,7 +75,7 @@ class Understood:
 
 
 def understand(
-    source: Path | RawTable,
+    raw: RawTable,
     robot: Robot,
     kind: Measurement,
     options: TableOptions | None = None,
@@ -90,48 +88,44 @@ def understand(
     recognized is left out, and so are rows without any measured or any joint value. ``joints`` are the names that the
     robot's file has. Of ``targets`` what was commanded counts, and rows may lack either values.
 
-    >>> from pathlib import Path
     >>> import numpy as np
+    >>> from rpim_opt.basics.layout import RawTable
     >>> from rpim_opt.data.measurements.position import position
     >>> from rpim_opt.data.tables.understanding import understand
     >>> from rpim_opt.robot import Robot
     >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
-    >>> text = "Point;J1 [deg];J2 [deg];X [mm];Y [mm];Z [mm]\nP1;1,5;2;401;0,5;0\nP2;3;4;-;-;-\n"
-    >>> _ = Path("raw.csv").write_text(text)
-    >>> found = understand(Path("raw.csv"), arm, position)
+    >>> cells = {"Point": ["P1", "P2"], "J1 [deg]": ["1.5", "3"], "J2 [deg]": ["2", "4"]}
+    >>> cells |= {f"{axis} [mm]": ["1", "-"] for axis in "XYZ"}
+    >>> found = understand(RawTable(cells), arm, position)
     >>> found.columns["q1_deg"], found.meant[1].meaning, found.notes[-1]
     (['1.5'], 'joint 1', 'rows without measured values are left out: P2.')
     """
     options = options or TableOptions()
-    path = source if isinstance(source, Path) else None
-    raw = source if isinstance(source, RawTable) else read_raw(source, options)
     stated = options.units
     options = replace(options, units={**raw.units, **stated})
     if options.rotation not in ("", "vector") and not known_names.EULER.fullmatch(options.rotation):
         accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
         raise InputError("--rotation", f"'{options.rotation}'", accepted)
     known = number_columns(robot, kind)
-    try:
+    read, rotation = _readings(raw, robot, kind, options, joints, targets)
+    if options.constants and any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
+        raw = raw.with_constants(options.constants)  # of several files that with the joints
         read, rotation = _readings(raw, robot, kind, options, joints, targets)
-        if options.constants and any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
-            raw = raw.with_constants(options.constants)  # of several files that with the joints
-            read, rotation = _readings(raw, robot, kind, options, joints, targets)
-        columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
-        if "rx" in known and (options.rotation or rotation) not in ("", "extrinsic xyz"):
-            how = options.rotation or rotation
-            names = {split_unit(name)[0]: name for name in columns}
-            if any(turn not in names for turn in TURNED):
-                raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
-            turned = [names[turn] for turn in TURNED]
-            angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns.pop(name), name) for name in turned]
-            columns |= known_names.quaternions(np.column_stack(angles), how)
-            said = {"meaning": "rotation vector" if how == "vector" else f"turn, {how}", "name": "qw, qx, qy, qz"}
-            meant = [each._replace(**said, unit="") if each.name in turned else each for each in meant]
-        kept, notes = range(len(next(iter(columns.values()), ()))), []
-        if not targets:
-            kept, columns, notes = _rows_with_values(columns, robot, kind)
-    except InputError as error:
-        raise error.within(path) from None
+    rotation = options.rotation or rotation
+    columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
+    if "rx" in known and rotation not in ("", "extrinsic xyz"):
+        names = {split_unit(name)[0]: name for name in columns}
+        if any(turn not in names for turn in TURNED):
+            raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
+        turned = [names[turn] for turn in TURNED]
+        angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns.pop(name), name) for name in turned]
+        columns |= known_names.quaternions(np.column_stack(angles), rotation)
+        said = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
+        new = {"meaning": said, "name": "qw, qx, qy, qz", "unit": ""}
+        meant = [each._replace(**new) if each.name in turned else each for each in meant]
+    kept, notes = range(len(next(iter(columns.values()), ()))), []
+    if not targets:
+        kept, columns, notes = _rows_with_values(columns, robot, kind)
     for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
         unit = stated.get(dimension, each.unit)
         if unit != each.unit:
@@ -141,16 +135,10 @@ def understand(
     named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
     if not options.quaternion and quaternion_columns(read, robot.dof):
         doubt = "quaternion"
-    elif len(turns) == 3 and not named and not (options.rotation or rotation):
+    elif len(turns) == 3 and not named and not rotation:
         doubt = "rotation"
-    return Understood(
-        path.name if path else "",
-        columns,
-        {name: [cells[i] for i in kept] for name, cells in raw.columns.items()},
-        tuple(meant),
-        (*raw.notes, *notes),
-        doubt,
-    )
+    cells = {name: [cells[i] for i in kept] for name, cells in raw.columns.items()}
+    return Understood(columns, cells, tuple(meant), (*raw.notes, *notes), doubt)
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------
@@ -174,28 +162,7 @@ def _readings(
             rotation = turns
             break
     numbered(read, table, dof, options.quaternion or "wxyz")
-    # ROS' joints in the robot's order, where columns name0, ... name them
-    matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem) for name, found in read.items()}
-    named = {int(match[1]): name for name, match in matches.items() if match}
-    if named and f"q{min(named)}" in {found.stem for found in read.values()}:
-        places: dict[str, int] = {}  # 0 for a joint that the robot does not have
-        for i, column in named.items():
-            called = {str(cell) for cell in table[column]}
-            if len(called) > 1:
-                raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
-            (joint,) = called
-            places[f"q{i}"] = ur_joint(joint)
-            if joints:
-                places[f"q{i}"] = joints.index(joint) + 1 if joint in joints else 0
-            elif not places[f"q{i}"] or dof != len(known_names.UR_JOINTS):
-                accepted = "a robot from a URDF, which names its joints"
-                raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
-        why = "the joint that its column of names names"
-        for name, found in list(read.items()):
-            if places.get(found.stem):
-                read[name] = found._replace(stem=f"q{places[found.stem]}", why=why)
-            elif found.stem in places:
-                read[name] = found._replace(stem=f"another {found.stem}")
+    read.update(_in_robots_order(read, table, dof, joints))
     read.update(_from_one(read, dof))
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, {"x", "y", "z"}):
         read.update(_without_prefix(read, stems, joints, options.prefix))
@@ -246,6 +213,32 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
         inside = next((each for each in inner if each.why), found)
         found = inside._replace(kind=found.kind or inside.kind)
     return found._replace(unit=unit)
+
+
+def _in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[str]) -> Readings:
+    """Return ROS' joints in the robot's order, where columns name0, ... name them."""
+    matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem) for name, found in read.items()}
+    named = {int(match[1]): name for name, match in matches.items() if match}
+    if not named or f"q{min(named)}" not in {found.stem for found in read.values()}:
+        return {}
+    places: dict[str, int] = {}  # 0 for a joint that the robot does not have
+    for i, column in named.items():
+        called = {str(cell) for cell in table[column]}
+        if len(called) > 1:
+            raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
+        (joint,) = called
+        places[f"q{i}"] = ur_joint(joint)
+        if joints:
+            places[f"q{i}"] = joints.index(joint) + 1 if joint in joints else 0
+        elif not places[f"q{i}"] or dof != len(known_names.UR_JOINTS):
+            accepted = "a robot from a URDF, which names its joints"
+            raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
+    why = "the joint that its column of names names"
+    return {
+        name: found._replace(stem=f"q{places[found.stem]}" if places[found.stem] else f"another {found.stem}", why=why)
+        for name, found in read.items()
+        if found.stem in places
+    }
 
 
 def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
