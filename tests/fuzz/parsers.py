@@ -20,14 +20,13 @@ from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.units import parse_units
 from rpim_opt.convex.tolerances import sentence
-from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot
 from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
-from rpim_opt.store.raw import NOISE, understand_of
+from rpim_opt.store.raw import understand_of, usual_noise
 from rpim_opt.store.serialize import digest
 
 TWO = ro.robot.Robot("two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]))
@@ -119,20 +118,16 @@ def table(data: bytes, folder: Path) -> None:
     refusals = []
     for kind in MEASUREMENTS.values():
         try:
-            rows = read_data(columns, TWO, _noise(kind), kind)
+            rows = read_data(columns, TWO, usual_noise(kind), kind)
         except ro.InputError as error:
             refusals.append(error)
             continue
         require(bool(np.isfinite(rows.q).all()), "finite joint values")
         for block in rows.blocks:
             require(bool(np.isfinite(block.y).all()), "finite measurements")
-        require(same(rows.q, read_data(path, TWO, _noise(kind), kind).q), "the same from the file")
+        require(same(rows.q, read_data(path, TWO, usual_noise(kind), kind).q), "the same from the file")
     if len(refusals) == len(MEASUREMENTS):
         raise refusals[0]
-
-
-def _noise(kind: Measurement) -> dict[str, float]:
-    return {f"{name}_{NOISE[dimension][0]}": NOISE[dimension][1] for name, dimension in kind.noise.items()}
 
 
 def raw(data: bytes, folder: Path) -> None:
