@@ -104,7 +104,7 @@ def test_cells(monkeypatch, capsys, folder, old: str, number: str) -> None:
 
 
 def test_arrays_beyond_all_sizes() -> None:
-    with pytest.raises(ro.InputError, match="numbers up to"):
+    with pytest.raises(ro.InputError, match="numbers of at most"):
         ro.Dataset.of(np.full((1, 6), 1e300), np.zeros((1, 3)), 1e-4)
     with pytest.raises(ro.InputError, match="magnitudes of at most"):
         ro.robot.Robot("far", np.array([[0.0, 1e300, 0, 0, 0]]))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import difflib
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
 from types import MappingProxyType
 from typing import Any, NamedTuple, TypeVar
 
@@ -52,6 +54,15 @@ class InputError(RpimError):
     def within(self, file: object) -> InputError:
         """Return the error with the file added, unless it already names one."""
         return self if self.file else InputError(self.where, self.found, self.accepted, file)
+
+
+@contextmanager
+def in_file(source: object) -> Iterator[None]:
+    """Let an InputError name the file that is read meanwhile; a source that is no path has no name."""
+    try:
+        yield
+    except InputError as error:
+        raise error.within(source if isinstance(source, str | Path) else None) from None
 
 
 def _one_line(text: str) -> str:

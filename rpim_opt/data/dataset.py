@@ -309,7 +309,9 @@ class Dataset(Tabled):
         points, c = measurement.points, len(measurement.columns)
         fits = q.ndim == 3 and q.shape[:2] == (len(y), points) and y.shape[1:] == (c,)
         if not fits or not (np.abs(q) <= LARGEST).all() or not (np.abs(y) <= LARGEST).all():
-            accepted = f"numbers up to {LARGEST:g} m or rad, {points} x dof joint and {c} measured values a row"
+            accepted = (
+                f"finite numbers of at most {LARGEST:g} m or rad, {points} x dof joint and {c} measured values a row"
+            )
             raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
         k = len(measurement.components)
         rows = np.arange(N)

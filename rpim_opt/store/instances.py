@@ -10,7 +10,7 @@ from inspect import signature
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
 
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.files import inside, sha256_of
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import read_columns
@@ -151,7 +151,7 @@ def load(
     path = stated.path
     data, files, tools = _read_tables(stated)
     validation = data.get("validation")
-    try:
+    with in_file(path):
         rows = data["identification"]
         temperature = None if table.celsius is None else table.celsius + UNITS["degC"].zero
         fixtures = place_fixtures(stated.placed, rows)
@@ -165,8 +165,6 @@ def load(
         details = stated_details(table.record)
         TableOptions.stated(table.reading)
         requirement = stated_requirement(table.acceptance, problem.robot, path)
-    except InputError as error:
-        raise error.within(path) from None
     for file in table.published:
         if not inside(path.parent, file, "table published", path).is_file():
             raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
@@ -214,10 +212,8 @@ def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
     if isinstance(more, list):
         more = dict.fromkeys(parts, more)
     by_chain = {name: [*shared, *more.get(name, ())] for name in {**parts, **more}}
-    try:
+    with in_file(stated.path):
         problem = together(**{name: part.problem for name, part in parts.items()}, shared=by_chain)
-    except InputError as error:
-        raise error.within(stated.path) from None
     first, *others = parts.values()
     record = first.record
     for other in others:
@@ -323,10 +319,8 @@ def _read(stated: ProblemFile, each: Observation, path: Path, tcps: dict[str, li
     source: Any = path
     try:
         if stated.board is not None and kind.by_camera:
-            try:
+            with in_file(path):
                 source = on_board(read_columns(path), stated.board)
-            except InputError as error:
-                raise error.within(path) from None
         elif robodk:
             source = robodk_columns(path, stated.robot.joint_dimensions, tcps)
         return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
@@ -354,11 +348,9 @@ def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Da
             known.append(KnownDistance((first, second), each.distance, sigma))
         else:
             known.append(KnownAngle((first, second), each.deg == 0, sigma))
-    try:
+    with in_file(path):
         whole = with_known(data, known)
         _require_enough(whole)
-    except InputError as error:
-        raise error.within(path) from None
     return whole
 
 

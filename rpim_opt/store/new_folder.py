@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.files import make_folder, read_text, scratch_folder, undoing, write_text
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
@@ -153,10 +153,8 @@ def new_problem(
         "fixture": kind.start is not None,
         "reading": [(name, toml(text)) for name, text in replace(found.options, joints=arm.names).texts().items()],
     }
-    try:
+    with in_file(found.file):
         text, guessed = _problem_text(arm, kind, rows, noise, context)
-    except InputError as error:
-        raise error.within(found.file) from None
     # beside its place, and moved there when it is whole
     with undoing() as parents, ExitStack() as stack:
         make_folder(folder.parent, parents)

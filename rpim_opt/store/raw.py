@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, pick
+from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import Columns, read_columns
 from rpim_opt.basics.units import dimension_of, split
@@ -243,21 +243,17 @@ def _tables(
 ) -> list[Understood]:
     tables = []
     for path, raw in files:
-        try:
+        with in_file(path):
             found = understand(raw, arm.robot, kind, options, arm.names, targets)
             tables.append(replace(found, file=path.name) if path else found)
-        except InputError as error:
-            raise error.within(path) from None
     return tables
 
 
 def _whole(
     files: Files, arm: Described, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
 ) -> Understanding:
-    try:
+    with in_file(files[0][0] if len(files) == 1 else None):
         whole = together(tables, arm.robot, kind, options.key, options.within)
-    except InputError as error:
-        raise error.within(files[0][0] if len(files) == 1 else None) from None
     shown = []  # in what is shown the columns by which rows were joined are not left out
     for each in tables:
         joins = [m.column.lower() in whole.keys and m.meaning == "left out" for m in each.meant]

@@ -12,7 +12,7 @@ import numpy as np
 from pydantic import Field
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, pick
+from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.files import inside, write_files
 from rpim_opt.basics.schema import Length, Table, validate
 from rpim_opt.basics.tables import csv_text
@@ -103,11 +103,9 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     free = parameters.free
     x = plan.spread * rng.normal(size=len(free)) * free.scale
     dimensions = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
-    try:
+    with in_file(stated.path):
         for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
             x[free.names.index(name)] = value
-    except InputError as error:
-        raise error.within(stated.path) from None
     tables: dict[str, Columns] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):

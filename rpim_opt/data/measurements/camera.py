@@ -8,14 +8,13 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices, pick
+from rpim_opt.basics.exceptions import InputError, choices, in_file, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split, split_unit
 from rpim_opt.data.dataset import Dataset
@@ -156,7 +155,7 @@ def read_board(source: Any) -> dict[str, Array]:
     array([0.025, 0.   , 0.   ])
     """
     accepted = "point, x_mm, y_mm, perhaps z_mm"
-    try:
+    with in_file(source):
         table = read_columns(source)
         names = texts(table.get("point", ()), "point")
         if not names:
@@ -165,8 +164,6 @@ def read_board(source: Any) -> dict[str, Array]:
         places = quantities_of(table, {axis: ["length"] for axis in "xyz"}, ["point"], names)
         if ("x", "") not in places or ("y", "") not in places:
             raise InputError("the header", f"columns {', '.join(table)}", accepted)
-    except InputError as error:
-        raise error.within(source if isinstance(source, str | Path) else None) from None
     flat = {("z", ""): np.zeros(len(names)), **places}
     return dict(zip(names, np.column_stack([flat[axis, ""] for axis in "xyz"]), strict=True))
 

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, RowError, choices
+from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, joint_columns, spelled, split_unit, with_unit
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
@@ -71,10 +71,8 @@ def read_data(
     ([[0.0, 0.0], [1.571, 0.524]], [0.401, 0.0, 0.0])
     """
     declared = declared_noise(noise or {}, measurement)  # outside: a mistake there is not the table's
-    try:
+    with in_file(source):
         return _dataset(read_columns(source), robot, declared, measurement)
-    except InputError as error:
-        raise error.within(source if isinstance(source, str | Path) else None) from None
 
 
 def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Measurement) -> Dataset:
@@ -295,15 +293,13 @@ def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, lis
     (RoboDK's macro library reads it so). ``joints`` are "angle" or "length" each; ``tools`` are the reflectors that are
     known, marker to x, y, z [mm], to which new ones are added as A, B, ...
     """
-    try:
+    with in_file(path):
         table = list(read_columns(Path(path)).values())
         names = [*joint_columns(joints), "x_mm", "y_mm", "z_mm"]
         if len(table) < len(names) + 3:
             accepted = f"{len(joints)} joints, 3 measured and 3 of the tool"
             raise InputError("the header", f"{len(table)} columns", accepted)
         places = np.column_stack([numbers(table[i], f"{i + 1}") for i in range(len(names), len(names) + 3)])
-    except InputError as error:
-        raise error.within(path) from None
     markers = []
     for place in places:
         name = next((name for name, known in tools.items() if np.allclose(known, place, atol=1e-6)), None)

@@ -9,7 +9,7 @@ from pathlib import Path
 from pkgutil import iter_modules
 from typing import Any, NamedTuple
 
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.files import LARGEST_DATA, require_file
 from rpim_opt.basics.layout import RawTable, TableOptions, read_table
 from rpim_opt.basics.tables import EXCEL, TEXTS, decoded
@@ -56,13 +56,11 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     found = None
     rows: Rows = ()
     if fitting:
-        try:
+        with in_file(path):
             require_file(path, LARGEST_DATA)
             text, _ = decoded(path, options.encoding if options else "")
             found = next((each for each in fitting if each.shown_by(text)), None)
             rows = found.read(text) if found else ()
-        except InputError as error:
-            raise error.within(path) from None
         if not rows and (found or ending not in TEXTS):
             names = " or ".join(each.name for each in fitting)
             raise InputError("the file", "neither targets nor rows", f"{names} with some", path)
