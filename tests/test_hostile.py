@@ -121,7 +121,6 @@ def test_limits_that_mean_none_in_a_urdf(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "wrong",
     [
-        lambda problem: ro.Formulation("mine", largest=float("nan")),
         lambda problem: ro.calibrate(problem, ro.tikhonov, 1.0, max_iterations=-1),
         lambda problem: ro.calibrate(problem, ro.tikhonov, 1.0, max_iterations=True),
         lambda problem: ro.calibrate(problem, ro.tikhonov, True),

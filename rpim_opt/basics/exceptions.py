@@ -8,7 +8,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 Named = TypeVar("Named")
 LONGEST = 1000
@@ -88,15 +88,13 @@ class RowError(InputError):
 
 
 class Conflict(NamedTuple):
-    """Contradiction between constraints and measurements, and the loosening of bounds that resolves it.
+    """By how much bounds of parameters [SI] would have to give way, with the least sum; empty where that would not do.
 
-        Each of the two alone makes the program feasible, with the least sum; empty where it cannot. ``constraints`` are
-        those that cannot hold together, of which any one less would do; ``stated`` says by how much [SI] statements in
-    Loosening either ``parameters`` [SI] or ``configurations`` [standard deviations] by these amounts, of smallest
+    ``constraints`` are those that cannot hold together, of which any one less would do; ``stated`` says by how much
+    [SI] statements in words would have to give way.
     """
 
     parameters: dict[str, float]
-    configurations: dict[Any, float]
     constraints: tuple[str, ...] = ()
     stated: Mapping[str, float] = MappingProxyType({})
 
@@ -105,17 +103,10 @@ class Conflict(NamedTuple):
         parts = []
         if self.constraints:
             parts.append(f"these constraints contradict each other: {', '.join(self.constraints)}")
-        bounds, stated = (
-            ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in of.items())
-            for of in (self.parameters, self.stated)
-        )
-        rows = ", ".join(f"{name} by {v:.3g} standard deviations" for name, v in self.configurations.items())
-        if bounds and rows:
-            parts.append(f"bounds contradict measurements: loosen {bounds}, or else {rows}")
-        elif bounds or rows:
-            parts.append(f"loosen {bounds or rows}")
-        if stated:
-            parts.append(f"loosen {stated}")
+        for bounds in (self.parameters, self.stated):
+            if bounds:
+                by = ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
+                parts.append(f"loosening {by} would do")
         return "; ".join(parts)
 
 
@@ -138,12 +129,13 @@ class NoSolutionFound(RpimError):
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem
     >>> tight = problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 0.5})
-    >>> exact = ro.Formulation("all within a sigma", largest=1.0, constraints=(ro.within_tolerance,))
+    >>> longer = ro.constraints.parse("a3 = nominal + 2 mm")
+    >>> drawn = ro.Formulation("as drawn", constraints=(ro.within_tolerance, longer))
     >>> try:
-    ...     ro.calibrate(ro.CalibrationProblem(problem.robot, tight, problem.data), exact)
+    ...     ro.calibrate(ro.CalibrationProblem(problem.robot, tight, problem.data), drawn)
     ... except ro.NoSolutionFound as error:
-    ...     print(error.status, *error.conflict.parameters)  # whose tolerances contradict the measurements
-    infeasible a3 a4 d5 d6
+    ...     print(error.status, *error.conflict.parameters)  # whose tolerances contradict the statement
+    infeasible a3
     """
 
     def __init__(
@@ -162,19 +154,6 @@ class NoSolutionFound(RpimError):
         super().__init__(
             f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; {why}."
         )
-
-    def naming(self, names: Mapping[int, str]) -> NoSolutionFound:
-        """Return the error with labels in place of the numbers of configurations."""
-        if not self.conflict:
-            return self
-
-        def name(found: re.Match[str]) -> str:
-            return f"configuration {names.get(int(found[1]), found[1])}"
-
-        rows = {names.get(k, k): v for k, v in self.conflict.configurations.items()}
-        constraints = tuple(re.sub(r"^configuration (\d+)\b", name, each) for each in self.conflict.constraints)
-        named = self.conflict._replace(configurations=rows, constraints=constraints)
-        return NoSolutionFound(self.formulation, self.weight, self.status, named, self.advice)
 
 
 def choices(found: str, known: Iterable[str], many: int = 24) -> str:

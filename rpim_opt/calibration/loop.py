@@ -50,8 +50,6 @@ NEAR_FIRST = 0.01
 """Share of the solution that the next step at the first weight may be when the rule is asked: it would not tell."""
 NOTHING_PROMISED = 3
 """Iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest."""
-EXCESS_COST = 10.0
-"""Cost of exceeding ``largest`` by its own size, relative to the objective."""
 DAMPING_MOST = 1e30
 """Damping at which no step, however short, lowers the objective."""
 SAME_POSITIONS = 1e-4
@@ -138,7 +136,7 @@ class State:
         """Return the state with another weight and its objective."""
         if choice.weight == self.choice.weight:
             return replace(self, choice=choice)
-        return replace(self, choice=choice, merit=merit(self.program, self.z, choice.weight))
+        return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight))
 
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""
@@ -212,10 +210,10 @@ class Loop:
         # the first linearization is good for a rough minimum, unless that promises too little to judge by
         rough = 0.0 if state.history or state.refused or self.options.solver else FIRST_ACCURACY
         straight = self._solved(state.program, state, rough)
-        promised = state.merit - merit(state.program, straight, state.choice.weight)
+        promised = state.merit - state.program.objective(straight, state.choice.weight)
         if rough and promised <= 10 * rough * abs(state.merit):
             straight = self._solved(state.program, state)
-            promised = state.merit - merit(state.program, straight, state.choice.weight)
+            promised = state.merit - state.program.objective(straight, state.choice.weight)
         length = state.relative(float(np.linalg.norm(straight - state.z)))
         short = length <= self.options.tolerance
         accuracy, best = self._accuracy(state)
@@ -234,7 +232,7 @@ class Loop:
             return self.answered(replace(state, idle=0))
         z = self._curved(state, straight)
         candidate = state.program.on(self.linearized(z, state.z))
-        after = merit(candidate, z, state.choice.weight)
+        after = candidate.objective(z, state.choice.weight)
         rounding = ROUNDING * abs(state.merit) + state.floor
         fall = state.merit - after
         gain = 1.0
@@ -300,7 +298,7 @@ class Loop:
             turned = wrapped / self.scale
             moved = candidate.model.with_values(candidate.model.b + candidate.model.A @ (turned - z))
             candidate, z = candidate.on(moved), turned
-            after = merit(candidate, z, state.choice.weight)
+            after = candidate.objective(z, state.choice.weight)
         passed = Iteration(after, length, state.choice.weight, state.damping)
         there = replace(
             state,
@@ -324,15 +322,6 @@ class Loop:
             return 0.0, -np.inf
         size = max(size, 1.0)  # an interior point's accuracy is absolute below one squared sigma
         return INTERIOR * size, BEST * size
-
-
-def merit(program: Program, z: Array, weight: float) -> float:
-    """Return the nonlinear objective at the z (n,) of a linearization, and the penalty for violating ``largest``."""
-    objective = program.objective(z, weight)
-    excess = program.excess(z)
-    if excess == 0:
-        return objective
-    return objective + EXCESS_COST * (1 + abs(objective)) * excess
 
 
 # --- the loop ---------------------------------------------------------------------------------------------------------
@@ -409,10 +398,7 @@ def _certified(
         model = around(anew.linearize(loop.scale * state.z), *about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)
-    try:
-        found = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
-    except NoSolutionFound as error:
-        raise error.naming(_labels(loop.source)) from None
+    found = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
     return Ended(state, loop.scale * state.z, found)
 
 
@@ -429,16 +415,13 @@ def _rested(
     if not source.keeps_rows:
         solved, reweigh = in_blocks(formulation, lambda: sum(len(part.owners) for part in source.rows()))
     loop = Loop(source, formulation, reweigh, options, about)
-    try:
-        state = begun(loop, solved, weight_choice(weight, formulation.penalty is not None), start)
-        while not state.outcome and state.evaluations <= options.max_iterations:
-            iterations = len(state.history)
-            state = loop.confirmed(loop.advanced(loop.chosen(state)))
-            if options.progress and len(state.history) > iterations:
-                options.progress(state.history[-1])
-        return loop, loop.answered(state)
-    except NoSolutionFound as error:
-        raise error.naming(_labels(source)) from None
+    state = begun(loop, solved, weight_choice(weight, formulation.penalty is not None), start)
+    while not state.outcome and state.evaluations <= options.max_iterations:
+        iterations = len(state.history)
+        state = loop.confirmed(loop.advanced(loop.chosen(state)))
+        if options.progress and len(state.history) > iterations:
+            options.progress(state.history[-1])
+    return loop, loop.answered(state)
 
 
 def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Array | None) -> State:
@@ -463,7 +446,7 @@ def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Arr
     if start is not None:
         program.beginning(z)
     choice = replace(choice, robust=loop.reweigh is not None or program.separable)
-    objective = merit(program, z, choice.weight)
+    objective = program.objective(z, choice.weight)
     floor = VANISHING * abs(objective) if np.isfinite(objective) else 0.0
     return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), floor)
 
@@ -490,11 +473,3 @@ def require_finite(*arrays: Array) -> None:
 
 def _whitened(problem: CalibrationProblem, z: Array) -> Array:
     return problem.whitened_residual(problem.parameters.free.scale * z)
-
-
-def _labels(source: Source) -> dict[int, str]:
-    """Return a label for every configuration's number."""
-    names: dict[int, str] = {}
-    for part in source.rows():
-        names |= dict(zip(part.data.configuration, part.data.label, strict=True))
-    return names

@@ -49,13 +49,10 @@ class Formulation(Brief):
     penalty_over
         A function of the identified `Parameters` that returns matrices D_k: the penalty then gets the norms
         |D_k z| (K,), and has to be nondecreasing. `by_link`, `by_kind`, `differences`.
-    largest
-        Largest whitened norm that a configuration may keep; infinite by default.
     solvable
         False for one that was read from a file, which cannot hold a script's functions.
 
-    InputError for another ``loss_over`` or ``largest``, and what is no function; when it is posed, for a program that
-    is not convex.
+    InputError for another ``loss_over``, and what is no function; when it is posed, for a program that is not convex.
 
     Examples
     --------
@@ -77,7 +74,6 @@ class Formulation(Brief):
     constraints: tuple[Constraint, ...] = ()
     loss_over: str = "equation"
     penalty_over: Callable[[Parameters], Sequence[Array]] | None = None
-    largest: float = float("inf")
     solvable: bool = True
 
     def _short(self) -> str:
@@ -106,8 +102,6 @@ class Formulation(Brief):
         for constraint in self.constraints:
             if not callable(constraint):
                 raise InputError("constraints", f"{constraint!r}", "functions of z and the parameters")
-        if not isinstance(self.largest, float | int | np.number) or not self.largest > 0:
-            raise InputError("largest", f"{self.largest}", "a number of sigmas above zero, or infinity")
 
     @property
     def ready(self) -> bool:

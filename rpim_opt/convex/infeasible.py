@@ -10,9 +10,8 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import Conflict
 from rpim_opt.convex.constraints import Box, Parsed, spoken
-from rpim_opt.convex.expressions import cp, norms, substituted
+from rpim_opt.convex.expressions import cp, substituted
 from rpim_opt.convex.structure import Structure
-from rpim_opt.problem.linear import LinearModel
 
 LEAST = 1e-6
 """Slacks below this are the solver's accuracy."""
@@ -25,7 +24,7 @@ class Stated(NamedTuple):
     demands: tuple[Any, ...]
 
 
-def conflict(structure: Structure, model: LinearModel) -> Conflict | None:
+def conflict(structure: Structure) -> Conflict | None:
     """Return what contradicts what; None where the constraints can be met after all.
 
     ``constraints`` is irreducible: without any one of them the others can be met (deletion filter; Chinneck and
@@ -33,26 +32,25 @@ def conflict(structure: Structure, model: LinearModel) -> Conflict | None:
     slacks, of one kind at a time.
     """
     z = cp.Variable(structure.n)
-    units = _units(structure, model, z)
+    units = _units(structure, z)
     if _possible(units):
         return None
     kept = _irreducible(units)
     single = _irreducible([[stated] for unit in kept for stated in unit])
     names = tuple(stated.name for unit in single for stated in unit)
-    parameters, groups = structure.parameters, np.unique(model.group)
+    parameters = structure.parameters
     parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
     slacks = []
-    for kind, count in (("boxes", structure.n), ("configurations", len(groups)), ("statements", len(parsed))):
+    for kind, count in (("boxes", structure.n), ("statements", len(parsed))):
         slack = cp.Variable(max(count, 1), nonneg=True)
-        loosened = _units(structure, model, z, **{kind: slack})
+        loosened = _units(structure, z, **{kind: slack})
         _solved(cp.sum(slack), [demand for unit in loosened for stated in unit for demand in stated.demands])
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
-    by_box, by_row, by_statement = slacks
+    by_box, by_statement = slacks
     bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
-    rows = {int(groups[i]): float(by_row[i]) for i in np.flatnonzero(by_row > LEAST)}
     pairs = zip(parsed, by_statement, strict=True)
     statements = {each.name: float(each.scale(parameters) * by) for each, by in pairs if by > LEAST}
-    return Conflict(bounds, rows, names, statements)
+    return Conflict(bounds, names, statements)
 
 
 def _solved(objective: Any, demands: Sequence[Any]) -> cp.Problem | None:
@@ -83,17 +81,10 @@ def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
     return kept
 
 
-def _units(
-    structure: Structure,
-    model: LinearModel,
-    z: cp.Variable,
-    boxes: Any = 0,
-    configurations: Any = 0,
-    statements: Any = 0,
-) -> list[list[Stated]]:
-    """Return what every constraint function demands, bound by bound, and ``largest`` by configuration.
+def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[list[Stated]]:
+    """Return what every constraint function demands, bound by bound.
 
-    Loosened by slacks of boxes [scales], of configurations [sigma], and of statements in words [scales of each].
+    Loosened by slacks of boxes [scales], and of statements in words [scales of each].
     """
     parameters, stated = structure.parameters, structure.formulation
     units: list[list[Stated]] = []
@@ -117,12 +108,6 @@ def _units(
             several = len(demands) > 1
             found = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
         units.append(found)
-    if structure.limited:
-        size = norms(model.A @ z - model.b, model.group)
-        limit = stated.largest + configurations + np.zeros(size.size)
-        name = "configuration {} within {:g} sigmas"
-        numbers = np.unique(model.group)
-        units.append([Stated(name.format(g, stated.largest), (size[i] <= limit[i],)) for i, g in enumerate(numbers)])
     return units
 
 

@@ -168,7 +168,7 @@ class Program(Brief):
 
     @property
     def quadratic(self) -> bool:
-        """Whether loss and penalty are quadratics, without ``largest``."""
+        """Whether loss and penalty are quadratics."""
         return self.loss_form is not None and self.linear_penalty
 
     @property
@@ -178,7 +178,7 @@ class Program(Brief):
 
     @property
     def constrained(self) -> bool:
-        """Whether there are constraints, or ``largest`` is one."""
+        """Whether there are constraints."""
         return self.structure.constrained
 
     @property
@@ -224,11 +224,8 @@ class Program(Brief):
 
     @property
     def _squares(self) -> Squares | None:
-        """The quadratic part of the loss, reduced to n + 1 rows."""
-        form = self.structure.quadratic_of_r
-        if form is None:
-            return None
-        return Squares.of_factor((_squared(self.model, form) if self.loss_form is None else self.squared).triangle)
+        """A quadratic loss, reduced to n + 1 rows."""
+        return None if self.loss_form is None else Squares.of_factor(self.squared.triangle)
 
     @property
     def _warm(self) -> Warm:
@@ -277,28 +274,19 @@ class Program(Brief):
         return self.model.norms(self.model.A @ z - self.model.b)
 
     def violation(self, z: Array) -> float:
-        """Return by how much z (n,) misses the constraints, in units of the scales; of ``largest`` relative to it.
+        """Return by how much z (n,) misses the constraints, in units of the scales.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
-        >>> ball = ro.Formulation("ball", constraints=(ro.in_ball(2.0, "*"),), largest=100.0)
+        >>> ball = ro.Formulation("ball", constraints=(ro.in_ball(2.0, "*"),))
         >>> problem = ro.load("position").problem
         >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
         >>> z = program.solve().z
         >>> round(program.violation(3 * z), 6), program.meets(z), program.meets(2 * z)
         (4.0, True, False)
         """
-        return max(self._distance(z), self.excess(z))
-
-    def _distance(self, z: Array) -> float:
         found = self._projected(z)
         return np.inf if found is None else float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
-
-    def excess(self, z: Array) -> float:
-        """Return by how much at z (n,) the worst configuration exceeds ``largest``, relative to it."""
-        if not self.structure.limited:
-            return 0.0
-        return max(0.0, float(np.max(self.norms(z))) / self.formulation.largest - 1)
 
     def nearest(self, z: Array) -> Array:
         """Return the point of the constraints of z that is nearest to z (n,); z itself where none is found."""
@@ -318,7 +306,7 @@ class Program(Brief):
 
     def meets(self, z: Array) -> bool:
         """Whether z (n,) meets its constraints as well as is asked for."""
-        return self._distance(z) <= feasibility_tolerance(z) and self.excess(z) <= FEASIBLE
+        return self.violation(z) <= feasibility_tolerance(z)
 
     def gradient(self, z: Array, weight: float) -> Array | None:
         """Return the gradient (n,) of the objective; None where the loss, or a weighted penalty, is no quadratic.
@@ -378,8 +366,6 @@ class Program(Brief):
         groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
-        if shape.limited:
-            every.append(substituted(shape.limit_of_norms, instead))
         total = substituted(loss, instead) + self.model.offset
         if penalty is not None:
             price = substituted(penalty, instead)
@@ -598,7 +584,7 @@ class Program(Brief):
 
         contradiction = None
         if self.constrained:  # a solver may stop in other words, and the constraints contradict each other all the same
-            contradiction = conflict(self.structure, self.model)
+            contradiction = conflict(self.structure)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point
         text = advice(self.structure, status, contradiction)

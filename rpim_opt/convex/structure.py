@@ -126,7 +126,6 @@ def declared(formulation: Formulation) -> bool:
         formulation.ready
         and formulation.loss == SQUARES
         and formulation.loss_over == "equation"
-        and not np.isfinite(formulation.largest)
         and formulation.penalty_over is None
         and (formulation.penalty is None or declared_form(formulation.penalty, 1) is not None)
         and all(isinstance(constraint, Box) for constraint in formulation.constraints)
@@ -143,8 +142,7 @@ class Structure:
     def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
         self.formulation, self.parameters = formulation, parameters
         self.n, self.equations, self.groups = len(parameters), equations, groups
-        self.limited = bool(np.isfinite(formulation.largest))
-        self.constrained = bool(formulation.constraints) or self.limited
+        self.constrained = bool(formulation.constraints)
         self._lock = threading.RLock()
         self._called: Answers | None = None
         self._declared = declared(formulation)
@@ -191,24 +189,18 @@ class Structure:
         """The loss as an expression of r."""
         return self.of_r(self.answers.loss.expression)
 
-    @cached_property
-    def limit_of_norms(self) -> Any:
-        """The bound of the configurations' norms."""
-        return norms(self.answers.r, self.groups) <= self.formulation.largest
-
     def on_squares(self) -> Structure:
         """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
         made = copy.copy(self)
-        for name in ("quadratic_of_r", "loss", "loss_of_r", "limit_of_norms", "joint", "inner", "by_configuration"):
+        for name in ("loss_form", "loss", "loss_of_r", "joint", "inner", "by_configuration"):
             vars(made).pop(name, None)
         if self._called is not None:  # the functions of penalty and constraints are not called again
             r = cp.Variable(self.n + 1, name="r")
             loss = Term(cp.sum_squares(r), r)
             live = (loss.expression, *self._called.live[1:])
             made._called = replace(self._called, r=r, loss=loss, live=live)
-        made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation", largest=float("inf"))
-        made.equations, made.limited = self.n + 1, False
-        made.constrained = bool(self.formulation.constraints)
+        made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation")
+        made.equations = self.n + 1
         return made
 
     def like(self, other: Structure) -> bool:
@@ -228,14 +220,9 @@ class Structure:
 
     # --- structure ---------------------------------------------------------------------------------------------
 
-    @property
+    @cached_property
     def loss_form(self) -> Quadratic | None:
         """The quadratic of r that the loss is."""
-        return None if self.limited else self.quadratic_of_r
-
-    @cached_property
-    def quadratic_of_r(self) -> Quadratic | None:
-        """The quadratic of r that the loss is, whether or not ``largest`` bounds it."""
         size = len(np.unique(self.groups)) if self.over_norms else self.equations
         form = declared_form(self.formulation.loss, size)
         if form is None:
@@ -274,7 +261,7 @@ class Structure:
     @cached_property
     def box(self) -> tuple[Array, Array] | None:
         """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none."""
-        if self.limits is None or self.limited:
+        if self.limits is None:
             return None
         lower = np.max([low for low, _ in self.limits], axis=0, initial=-np.inf)
         upper = np.min([high for _, high in self.limits], axis=0, initial=np.inf)
@@ -292,19 +279,16 @@ class Structure:
 
     @cached_property
     def loss(self) -> Loss | None:
-        """The loss as the solver sees it, where it is no square, or limited by ``largest``."""
+        """The loss as the solver sees it, where it is no square."""
         if self.loss_form is not None:
             return None
         with self._lock:
-            if not self.limited:
-                return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms)
-            expression = self.loss_of_r if self.quadratic_of_r is None else cp.Constant(0.0)  # squares are reduced
-            return Loss(expression, self.answers.r, False, (self.limit_of_norms,))
+            return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms)
 
     @cached_property
     def by_configuration(self) -> tuple[np.ndarray, np.ndarray] | None:
         """(m,) sorts equations by configurations, (N,) how many each has; None where the loss gets no norms."""
-        if self.limited or not self.over_norms:
+        if not self.over_norms:
             return None
         return np.argsort(self.groups, kind="stable"), np.unique(self.groups, return_counts=True)[1]
 
@@ -415,7 +399,7 @@ def structure(formulation: Formulation, model: LinearModel) -> Structure:
         if form is not None:
             factor, constant = float(form.L[0] ** 2), form.constant
             formulation = replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
-    if formulation.loss in INVARIANT and formulation.loss_over == "equation" and not np.isfinite(formulation.largest):
+    if formulation.loss in INVARIANT and formulation.loss_over == "equation":
         m = n + 1
     groups = model.members[0]
     p = model.parameters
@@ -439,7 +423,7 @@ MOST_KEPT = 64
 
 def invariant(formulation: Formulation, equations: Callable[[], int]) -> bool:
     """Return whether the loss sees only the length of the whole residual; ``equations`` counts them where needed."""
-    if formulation.loss_over != "equation" or np.isfinite(formulation.largest):
+    if formulation.loss_over != "equation":
         return False
     if formulation.loss in INVARIANT:
         return True
@@ -473,8 +457,8 @@ class Lost(Structure):
     ) -> None:
         self.formulation, self.parameters = formulation, model.parameters
         self.n, self.equations, self.groups = model.A.shape[1], len(model.b), model.members[0]
-        self.limited, self.constrained = False, True
-        self.quadratic_of_r, self.penalty_form, self.box = loss_form, penalty_form, None
+        self.constrained = True
+        self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
         self._declared = True
         self._lock = threading.RLock()
         self.values = self.trusted = lost(formulation.name)
@@ -494,14 +478,12 @@ def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[F
     """Return the formulation by which blocks of rows are solved, and what makes its squares of their equations.
 
     A loss that sees only the length of the residual needs nothing; ``equations`` counts them. InputError for a loss
-    that is no sum over rows, and for a ``largest``.
+    that is no sum over rows.
     """
     if invariant(formulation, equations):
         return formulation, None
     where = f"formulation '{formulation.name}'"
     accepted = "a squared loss, or a sum over configurations or equations (robust)"
-    if np.isfinite(formulation.largest):
-        raise InputError(where, "a largest norm, with data in blocks", accepted)
     if not separable(formulation.loss, formulation.loss_over):
         raise InputError(where, "a loss that is no sum, with data in blocks", accepted)
     squares = Squares(formulation.loss, formulation.name, formulation.loss_over)

@@ -465,8 +465,6 @@ def _formulation(result: Calibration) -> str:
     over = "" if parts["penalty_over"] == "none" else f" over {term(parts['penalty_over'])}"
     text = f"loss {term(parts['loss'])} of each {parts['loss_over']}, penalty {term(parts['penalty'])}{over}"
     bounds = [term(c) for c in parts["constraints"]]
-    if parts["largest"] is not None:
-        bounds.append(f"standardized residual of every configuration at most {parts['largest']:g}")
     return f"{text}, constraints: {', '.join(bounds) or 'none'}"
 
 

@@ -394,7 +394,6 @@ def definition(formulation: Formulation) -> dict[str, Any]:
         "constraints": [_name(constraint) for constraint in formulation.constraints],
         "loss_over": formulation.loss_over,
         "penalty_over": _name(formulation.penalty_over),
-        "largest": _finite(formulation.largest),
     }
 
 
@@ -408,7 +407,6 @@ def formulation_of(name: str, stated: Mapping[str, Any]) -> Formulation:
         constraints=tuple(_function(term, name) for term in stated["constraints"]),
         loss_over=stated["loss_over"],
         penalty_over=_function(stated["penalty_over"], name),
-        largest=math.inf if stated["largest"] is None else stated["largest"],
         solvable=None not in (*functions, *stated["constraints"]),
     )
 

@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.identify import ending
-from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State, begun, merit
+from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State, begun
 from rpim_opt.calibration.weight_choice import weight_choice
 from tests.simulate import simulated
 
@@ -30,19 +30,7 @@ def state(problem: Any = PROBLEM, formulation: ro.Formulation = ro.tikhonov, wei
     z = np.zeros(len(problem.parameters.free))
     program = ro.convex.pose(formulation, problem.linearize(z))
     size = np.linalg.norm(program.model.A, axis=0)
-    return replace(State(z, program, weight_choice(weight, True), merit(program, z, weight), size), **how)
-
-
-def test_missing_the_largest_norm_costs() -> None:
-    limited = replace(ro.tikhonov, largest=3.0)
-    program = ro.convex.pose(limited, PROBLEM.linearize(np.zeros(N)))
-    z = np.zeros(N)
-    objective = program.objective(z, 1.0)
-    excess = program.norms(z).max() / 3.0 - 1
-    assert excess > 0
-    assert merit(program, z, 1.0) == pytest.approx(objective + 10 * (1 + objective) * excess, rel=1e-12)
-    met = program.solve(1.0).z
-    assert merit(program, met, 1.0) == pytest.approx(program.objective(met, 1.0), rel=1e-6)
+    return replace(State(z, program, weight_choice(weight, True), program.objective(z, weight), size), **how)
 
 
 # --- the weight in the loop --------------------------------------------------------------------------------
@@ -82,7 +70,7 @@ def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, dampi
     assert (length < 0.01) == (away < 0.01)
     choice = replace(weight_choice(answering(5.0), True), robust=True, weight=1.0, settled=True)
     before = state(formulation=ro.robust, z=z, program=there, choice=choice, damping=damping, idle=2)
-    before = replace(before, merit=merit(there, z, 1.0))
+    before = replace(before, merit=there.objective(z, 1.0))
     after = loop(formulation=ro.robust).advanced(before)
     assert after.choice.answers == ((5.0,) if asks else ())
     if asks:
@@ -197,7 +185,7 @@ def test_at_its_minimum_a_damped_state_asks_for_the_full_step_and_then_rests() -
     x = ro.calibrate(PROBLEM, ro.tikhonov, 1.0, tolerance=1e-12).x
     z = x / PROBLEM.parameters.free.scale
     program = ro.convex.pose(ro.tikhonov, PROBLEM.linearize(x))
-    there = state(z=z, program=program, merit=merit(program, z, 1.0), damping=1.0)
+    there = state(z=z, program=program, merit=program.objective(z, 1.0), damping=1.0)
     full = loop().advanced(there)
     assert (full.damping, full.outcome, full.evaluations) == (0.0, "", there.evaluations)
     end = full
@@ -213,10 +201,10 @@ def test_three_idle_passes_are_enough_and_two_are_not() -> None:
     before = state(formulation=ro.lasso, weight=20.0)
     program = before.program
     z = program.solve(20.0).z
-    best = merit(program, z, 20.0)
+    best = program.objective(z, 20.0)
     i = int(np.argmax(np.abs(z)))
     z[i] += np.sqrt(1e-9 * best) / before.size[i]
-    there = replace(before, z=z, merit=merit(program, z, 20.0))
+    there = replace(before, z=z, merit=program.objective(z, 20.0))
     assert 1e-10 * best < there.merit - best < 0.5e-8 * best
     at = loop(formulation=ro.lasso, tolerance=0.0)
     third = at.advanced(replace(there, idle=2))

@@ -291,8 +291,6 @@ case("Tikhonov, second-order cone", cp.sum_squares, cp.sum_squares, lambda z, p:
 case("Tikhonov, equalities", cp.sum_squares, cp.sum_squares, level_plane)
 case("Huber, exponential cone", lambda r: cp.sum(cp.huber(r, 1.5)), cp.sum_squares, exponential)
 case("Tikhonov, sum of exponentials", cp.sum_squares, cp.sum_squares, lambda z, p: cp.sum(cp.exp(z[:5])) <= 5.5)
-case("Tikhonov, largest that holds back", cp.sum_squares, cp.sum_squares, largest=25.0)
-case("lasso, largest that does not", cp.sum_squares, cp.norm1, largest=1e5)
 
 
 @made("Tikhonov, slack of a box")

@@ -47,8 +47,6 @@ def parts(formulation: ro.Formulation, model: ro.problem.LinearModel, z: Any) ->
     """Loss, penalty (zero where there is none) and constraints at z, a variable or numbers."""
     r = model.A @ z - model.b
     limits = [constraint for c in formulation.constraints for constraint in listed(c(z, model.parameters))]
-    if np.isfinite(formulation.largest):
-        limits.append(norms(r, model.group) <= formulation.largest)
     seen = r
     if formulation.loss_over == "configuration":
         seen = norms(r, model.group)

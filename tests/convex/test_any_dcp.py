@@ -121,7 +121,6 @@ def test_what_cvxpy_makes_with_a_solver_needs_that_solver() -> None:
 REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a penalty by name": ({"penalty": "norm1"}, "penalty: found 'norm1', accepted: a function"),
     "a loss by name": ({"loss": "huber"}, "loss: found 'huber', accepted: a function"),
-    "no largest": ({"largest": None}, "largest: found None, accepted: a number of sigmas above zero"),
     "a constraint by name": ({"constraints": ("box",)}, "constraints: found 'box', accepted: functions"),
     "a bound that is NaN": (
         {"constraints": lambda z, p: z <= np.nan},

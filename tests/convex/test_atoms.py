@@ -56,7 +56,6 @@ def test_a_formulation_in_cvxpy_s_functions_is_the_ready_one(stated: Formulation
 def test_what_is_known_without_asking() -> None:
     assert set(DECLARED) == {"least_squares", "tikhonov", "bounded"}
     assert not declared(Formulation("mine", penalty=lambda z: cp.sum_squares(z)))
-    assert not declared(Formulation("limited", largest=3.0))
     assert not declared(Formulation("norms", loss=SQUARES, loss_over="configuration"))
 
 

@@ -119,17 +119,6 @@ def test_an_estimates_objective_leaves_out_a_penalty_without_weight() -> None:
     assert (formula.status, formula.iterations, formula.seconds, formula.duals) == ("optimal", 0, 0.0, ())
 
 
-def test_a_largest_norm_is_missed_relative_to_itself() -> None:
-    norms = ro.convex.pose(ro.tikhonov, MODEL).norms(Z)
-    worst = float(norms.max())
-    assert norms == pytest.approx(np.linalg.norm((MODEL.A @ Z - MODEL.b).reshape(-1, 3), axis=1), rel=1e-12)
-    for share in (0.25, 0.8, 1.25):
-        program = ro.convex.pose(replace(ro.tikhonov, largest=share * worst), MODEL)
-        assert program.excess(Z) == pytest.approx(max(0.0, 1 / share - 1), rel=1e-12)
-        assert program.violation(Z) == pytest.approx(program.excess(Z), rel=1e-12)
-    assert ro.convex.pose(ro.tikhonov, MODEL).excess(Z) == 0.0
-
-
 def test_a_point_outside_a_domain_is_moved_inside() -> None:
     entropy = ro.Formulation("entropy", penalty=lambda z: cp.sum(cp.kl_div(z + 1, 1)))
     program = ro.convex.pose(entropy, MODEL)

@@ -82,7 +82,7 @@ AT_NOMINAL = ro.constraints.at_nominal("alpha[34]")
 SIGNS = (ro.constraints.signed(1, "a[23]"), ro.constraints.equal("a2", "a3"))
 FORMULATIONS = [
     ro.Formulation("own numbers", ro.huber(1.5), cp.sum_squares, (AT_NOMINAL, ro.in_ball(9.0, "a?"))),
-    ro.Formulation("differences", penalty=cp.sum, penalty_over=ro.constraints.differences("a?"), largest=1e3),
+    ro.Formulation("differences", penalty=cp.sum, penalty_over=ro.constraints.differences("a?")),
     ro.Formulation("signs", penalty=cp.sum_squares, constraints=SIGNS),
     ro.least_squares,
     ro.robust,

@@ -353,18 +353,16 @@ class OutsideDomain(Exception):
 
 
 class Loss:
-    """A loss f(v) that is no square, and limits of v (M,): residuals, or where ``positive`` configurations' norms.
+    """A loss f(v) that is no square, of residuals v (M,), or where ``positive`` of configurations' norms.
 
     Where it is ``separable``, f(v) = sum_i f_i(v_i); with a ``threshold`` t min_t rate t + sum_i f_i(v_i, t).
     """
 
-    def __init__(self, expression: Any, variable: Any, positive: bool, limits: tuple[Any, ...] = ()):
-        self.expression, self.variable, self.positive, self.limits = expression, variable, positive, limits
+    def __init__(self, expression: Any, variable: Any, positive: bool):
+        self.expression, self.variable, self.positive = expression, variable, positive
         self.entries: Any = None
         self.threshold: Any = None
         self._lock = threading.Lock()  # a variable has one value at a time
-        if limits:
-            return
         expression = _by_threshold(expression)
         own = [v for v in expression.variables() if v.id != variable.id]
         if not own:
@@ -382,8 +380,8 @@ class Loss:
 
     @cached_property
     def canonical(self) -> Canonical:
-        """Loss and limits in canonical form."""
-        return Canonical(self.expression, self.limits, self.variable)
+        """The loss in canonical form."""
+        return Canonical(self.expression, [], self.variable)
 
     @cached_property
     def _evaluated(self) -> Evaluation:
