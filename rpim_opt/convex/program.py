@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
@@ -52,9 +52,7 @@ def feasibility_tolerance(z: Array) -> float:
 class Estimate(Brief):
     """One solution: z (n,) at a weight, with the two values that the L-curve plots.
 
-    ``duals`` are multipliers of the formulation's constraints, one array each, (n,) for a `Box`: by how much the
-    objective would fall if the constraint were loosened by one unit of the scales. ``status`` is CVXPY's word;
-    zero ``iterations``: a formula, or an active set.
+    ``status`` is CVXPY's word; zero ``iterations``: a formula, or an active set.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -63,21 +61,27 @@ class Estimate(Brief):
     >>> estimate = program.solve(1e-3)
     >>> estimate.status, estimate.objective == estimate.loss + 1e-3 * estimate.penalty, len(estimate.duals)
     ('optimal', True, 1)
-    >>> program.solve(1e-3, solver="CLARABEL", settings={"max_iter": 100}).iterations > estimate.iterations == 0
-    True
     """
 
     z: Array
     weight: float
     loss: float
     penalty: float
-    duals: tuple[Array, ...] = ()
+    multipliers: Callable[[], tuple[Array, ...]] = tuple
     status: str = OPTIMAL
     iterations: int = 0
     seconds: float = 0.0
 
     def _short(self) -> str:
         return f"{self.status} at weight {self.weight:.4g}: loss {self.loss:.4g}, penalty {self.penalty:.4g}"
+
+    @cached_property
+    def duals(self) -> tuple[Array, ...]:
+        """Multipliers of the formulation's constraints, one array each, (n,) for a `Box`.
+
+        By how much the objective would fall if the constraint were loosened by one unit of the scales.
+        """
+        return self.multipliers()
 
     @property
     def objective(self) -> float:
@@ -99,18 +103,16 @@ class Program(Brief):
     (True, True)
     >>> [round(e.penalty, 1) for e in program.path([0.5, 5.0, 50.0])]
     [13.4, 12.5, 10.4]
-    >>> loss, penalty = program.value(estimate.z)
-    >>> np.allclose([loss + 5.0 * penalty, program.objective(estimate.z, 5.0)], estimate.objective, rtol=1e-12)
-    True
     >>> there = program.on(problem.linearize(estimate.z * problem.parameters.free.scale))
-    >>> round(loss), round(there.value(estimate.z)[0])  # promised, and what the nonlinear model keeps
+    >>> round(estimate.loss), round(there.value(estimate.z)[0])  # promised, and what the nonlinear model keeps
     (97, 100)
     """
 
     formulation: Formulation
     model: LinearModel
     structure: Structure
-    _kept: dict[str, Any] = field(default_factory=dict, repr=False)  # shared with all programs that `on` makes of this
+    _kept: dict[str, Any] = field(default_factory=dict)  # shared with all programs that `on` makes of this
+    _values: dict[Any, tuple[float, float]] = field(default_factory=dict, init=False)  # loops ask for a point again
 
     def __reduce__(self) -> Any:
         return pose, (self.formulation, self.model)  # what CVXPY made of the functions does not travel
@@ -177,14 +179,9 @@ class Program(Brief):
         return self.structure.loss is not None and self.structure.loss.separable
 
     @property
-    def constrained(self) -> bool:
-        """Whether there are constraints."""
-        return self.structure.constrained
-
-    @property
     def closed_form(self) -> bool:
         """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares)."""
-        return self.quadratic and not self.constrained
+        return self.quadratic and not self.structure.constrained
 
     @property
     def box(self) -> tuple[Array, Array] | None:
@@ -247,10 +244,6 @@ class Program(Brief):
             self._values[key] = loss + self.model.offset, penalty
         return self._values[key]
 
-    @cached_property
-    def _values(self) -> dict[Any, tuple[float, float]]:
-        return {}  # a loop evaluates one point again and again
-
     def objective(self, z: Array, weight: float) -> float:
         """Return loss(A z - b) + weight penalty(z); infinite outside their domain. Arguments as for `value`."""
         loss, penalty = self.value(z, weight)
@@ -281,9 +274,8 @@ class Program(Brief):
         >>> ball = ro.Formulation("ball", constraints=(ro.in_ball(2.0, "*"),))
         >>> problem = ro.load("position").problem
         >>> program = ro.convex.pose(ball, problem.linearize(np.zeros(len(problem.parameters.free))))
-        >>> z = program.solve().z
-        >>> round(program.violation(3 * z), 6), program.meets(z), program.meets(2 * z)
-        (4.0, True, False)
+        >>> round(program.violation(3 * program.solve().z), 6)
+        4.0
         """
         found = self._projected(z)
         return np.inf if found is None else float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
@@ -303,22 +295,6 @@ class Program(Brief):
             return nearest(self.structure.canonical, z)
         except Unsolved:
             return None
-
-    def meets(self, z: Array) -> bool:
-        """Whether z (n,) meets its constraints as well as is asked for."""
-        return self.violation(z) <= feasibility_tolerance(z)
-
-    def gradient(self, z: Array, weight: float) -> Array | None:
-        """Return the gradient (n,) of the objective; None where the loss, or a weighted penalty, is no quadratic.
-
-        Arguments as for `value`.
-        """
-        if self.loss_form is None or (weight > 0 and not self.linear_penalty):
-            return None
-        gradient = 2 * self.squared.A.T @ (self.squared.A @ z - self.squared.b)
-        if self.penalty_form is None or weight == 0:
-            return gradient
-        return gradient + weight * self.penalty_form.slope(z)
 
     def trust(self, z: Array) -> Trusted | None:
         """Return what a robust loss trusts at z (n,); None for a squared loss, which trusts everything.
@@ -487,10 +463,12 @@ class Program(Brief):
             raise InputError("weight", f"{weight!r}", "a finite number, zero or more")
         return 0.0 if self.formulation.penalty is None else float(weight)
 
-    def _at(self, z: Array, weight: float, duals: tuple[Array, ...] = (), iterations: int = 0) -> Estimate:
+    def _at(
+        self, z: Array, weight: float, multipliers: Callable[[], tuple[Array, ...]] = tuple, iterations: int = 0
+    ) -> Estimate:
         if not self.quadratic:  # a quadratic is finite everywhere
             z = self.inside(z, np.zeros_like(z), weight)
-        return Estimate(z, weight, *self.value(z, weight), duals, iterations=iterations)
+        return Estimate(z, weight, *self.value(z, weight), multipliers, iterations=iterations)
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss; where rounding stops that by a proximal step, or CVXPY's."""
@@ -510,10 +488,10 @@ class Program(Brief):
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
         z = found.x[self.structure.canonical.at]
-        if weight == 0 and damping is None and not self.constrained:  # what the data do not see stays nominal
+        if weight == 0 and damping is None and not self.structure.constrained:  # what the data do not see stays nominal
             _, s, V = self.model.svd
             z = z - V[s == 0].T @ (V[s == 0] @ z)
-        return self._at(z, weight, self._duals(found), found.iterations)
+        return self._at(z, weight, partial(self._duals, found), found.iterations)
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""
@@ -529,7 +507,7 @@ class Program(Brief):
         groups = self.structure.constraints
         return self._by_function([[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in groups])
 
-    def _by_function(self, groups: list[list[Array]]) -> tuple[Array, ...]:
+    def _by_function(self, groups: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
         """Return multipliers by constraint function: of a box (n,), as if loosened on the side that is active."""
         found = []
         for constraint, group in zip(self.formulation.constraints, groups, strict=True):
@@ -571,19 +549,22 @@ class Program(Brief):
         if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE) or z.value is None:
             raise self._failure(first or problem.status, weight)
         point = np.array(z.value)
-        if not self.meets(point):
-            missed = self.violation(point)
+        missed = self.violation(point)
+        if missed > feasibility_tolerance(point):
             raise self._failure(f"{problem.status}, but violates the constraints by {missed:.1e}", weight)
         values = [[np.ravel(np.asarray(c.dual_value, dtype=float)) for c in group] for group in groups]
         iterations = int(problem.solver_stats.num_iters or 0)
-        return replace(self._at(point, weight, self._by_function(values), iterations), status=problem.status)
+        multipliers = partial(self._by_function, values)
+        return replace(self._at(point, weight, multipliers, iterations), status=problem.status)
 
     def _failure(self, status: str, weight: float) -> NoSolutionFound:
         """Return why there is no solution."""
         from rpim_opt.convex.infeasible import advice, conflict  # of programs without a solution
 
         contradiction = None
-        if self.constrained:  # a solver may stop in other words, and the constraints contradict each other all the same
+        if (
+            self.structure.constrained
+        ):  # a solver may stop in other words, and the constraints contradict each other all the same
             contradiction = conflict(self.structure)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point

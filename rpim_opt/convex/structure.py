@@ -99,11 +99,13 @@ def answers(formulation: Formulation, parameters: Parameters, equations: int, gr
         of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
         live.append(listed(called(constraint, of, z, known), of))
     penalty_of_z = None if penalty is None else over_z(penalty.expression)
-    composed = {"penalty": penalty_of_z}
+    composed = {}
+    if penalized is not z and penalty is not None:
+        composed["penalty"] = penalty_of_z
     if seen is not r:  # norms are convex and nonnegative, as absolute values are
         composed["loss"] = substituted(loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))})
     for what, expression in composed.items():
-        if expression is not None and not expression.is_convex():
+        if not expression.is_convex():
             accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
             raise InputError(f"{where}, {what}", "a program that is not convex", accepted)
     constraints = [[frozen(each) for each in group] for group in live]

@@ -55,19 +55,6 @@ def test_the_multiplier_goes_to_the_box_on_whose_bound_the_solution_lies(model: 
     assert (of_high[estimate.z <= -0.3] == 0).all()
 
 
-def test_slopes_do_not_depend_on_other_threads(model: Any) -> None:
-    """Ready formulations are posed once, for all threads."""
-    program = ro.convex.pose(ro.tikhonov, model)
-    points = np.random.default_rng(1).normal(size=(50, model.A.shape[1]))
-    serial = [program.gradient(z, 1e6) for z in points]
-
-    def off(k: int) -> float:
-        return float(np.abs(program.gradient(points[k % 50], 1e6) - serial[k % 50]).max())
-
-    with ThreadPoolExecutor(4) as pool:
-        assert max(pool.map(off, range(4000))) < 1e-3
-
-
 OUTSIDE = {
     "1 / (z - 0.1)": lambda z: cp.sum(cp.inv_pos(z - 0.1)),
     "-ln z": lambda z: -cp.sum(cp.log(z)),

@@ -192,7 +192,9 @@ def weight_grid(program: Program, count: int = 200) -> Array:
         return grid_of(program.ridge, count)
     weights = grid_of(ridge(program.model, program.penalty_form), count)
     n = program.model.A.shape[1]
-    slope = None if program.linear_penalty or program.structure.inner else program.gradient(np.zeros(n), 0.0)
+    slope = None  # of the loss at nominal
+    if program.loss_form is not None and not program.linear_penalty and not program.structure.inner:
+        slope = -2 * program.squared.A.T @ program.squared.b
     probe = np.cos(np.arange(1, n + 1))
     none, once, twice = (program.value(k * probe)[1] for k in (0, 1, 2))
     if slope is None or none != 0 or abs(twice - 2 * once) > HOMOGENEOUS * once:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cache, cached_property
 from importlib import import_module
 from types import SimpleNamespace
 from typing import Any, NamedTuple
@@ -19,15 +19,20 @@ from rpim_opt.problem.linear import RANK_TOLERANCE
 SOUGHT, ACCEPTED = 1e-10, 1e-8
 """Clarabel's tolerances: what it goes on to while it makes progress, and what is good enough."""
 SOLVED = ("Solved", "AlmostSolved")
-ATTEMPTS: tuple[dict[str, Any], ...] = (
-    {},
-    {"static_regularization_constant": 1e-10},
-    {"equilibrate_enable": True},
-    {"static_regularization_constant": 1e-7},
+Attempt = tuple[tuple[str, Any], ...]
+"""Settings of Clarabel by name that are not the usual ones."""
+ATTEMPTS: tuple[Attempt, ...] = (
+    (),
+    (("static_regularization_constant", 1e-10),),
+    (("equilibrate_enable", True),),
+    (("static_regularization_constant", 1e-7),),
 )
-"""Settings that are tried in turn: where one factorization stalls, another does not."""
-EQUILIBRATED = {"equilibrate_enable": True, "tol_gap_abs": SOUGHT, "tol_gap_rel": SOUGHT, "tol_feas": SOUGHT}
-"""Settings for rows beside tangents of many others, whose costs are far larger."""
+"""What is tried in turn: where one factorization stalls, another does not."""
+EQUILIBRATED: Attempt = (
+    ("equilibrate_enable", True),
+    *((f"tol_{each}", SOUGHT) for each in ("gap_abs", "gap_rel", "feas")),
+)
+"""Settings for the rows of a loss, which come as they are: a quarter fewer iterations."""
 CURVED = 1e-14
 """Eigenvalues of P below this part of the largest are rounding."""
 DENSE = 4e5
@@ -117,6 +122,11 @@ class Canonical:
         made.cone_sizes = []
         return made
 
+    @property
+    def polyhedral(self) -> bool:
+        """Whether an active set may solve it: equations and inequalities alone, without variables of functions' own."""
+        return self.linear == len(self.b) and not self.own and len(self.b) * self.size <= DENSE
+
     @cached_property
     def dense(self) -> tuple[Array, Array]:
         """A and P as dense matrices."""
@@ -159,11 +169,11 @@ class Canonical:
         x = np.zeros(self.size)
         x[self.at] = fixed
         if len(rest):
-            P = sparse.triu(sparse.csc_array(self.P)[rest][:, rest])
+            P = sparse.csc_matrix(sparse.triu(sparse.csc_array(self.P)[rest][:, rest]))
             q = self.q[rest] + (sparse.csr_array(self.P) @ x)[rest]
-            A = sparse.csc_array(self.A)[:, rest]
+            A = sparse.csc_matrix(sparse.csc_array(self.A)[:, rest])
             try:
-                x[rest] = _clarabel(P, q, A, self.b - self.A @ x, self.linear_cones).x
+                x[rest] = Clarabel(self.linear_cones).solve(P, q, A, self.b - self.A @ x).x
             except Unsolved:
                 return float("inf")
         return self.value(x)
@@ -200,27 +210,45 @@ def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.nd
     return fixed, np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
 
 
-def _clarabel(P: Any, q: Array, A: Any, b: Array, cones: list[Any], attempts: Sequence[dict[str, Any]] = ()) -> Any:
-    """Return Clarabel's solution of minimize 1/2 x'P x + q'x subject to b - A x in cones; Unsolved where none is."""
-    from scipy import sparse
+@cache
+def _settings(attempt: Attempt) -> Any:
+    """Return Clarabel's settings with some that are another attempt's."""
+    settings = import_module("clarabel").DefaultSettings()  # a compiled module, without types
+    settings.verbose, settings.max_threads = False, 1
+    settings.presolve_enable = False
+    settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
+    settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCEPTED if attempt else SOUGHT
+    settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
+    for name, value in attempt:
+        setattr(settings, name, value)
+    return settings
 
-    clarabel = import_module("clarabel")  # a compiled module, without types
-    program = sparse.csc_matrix(P), q, sparse.csc_matrix(A), b, cones
-    found: Any = None
-    for attempt in attempts or ATTEMPTS:
-        settings = clarabel.DefaultSettings()
-        settings.verbose, settings.max_threads = False, 1
-        settings.presolve_enable = False
-        settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
-        settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
-        settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCEPTED if attempt else SOUGHT
-        settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
-        for name, value in attempt.items():
-            setattr(settings, name, value)
-        found = clarabel.DefaultSolver(*program, settings).solve()
-        if str(found.status) in SOLVED:
-            return found
-    raise Unsolved(str(found.status))
+
+class Clarabel:
+    """Clarabel for programs that differ in numbers alone: a solver is set up once, and gets the numbers of the next."""
+
+    def __init__(self, cones: list[Any], attempts: Sequence[Attempt] = ATTEMPTS):
+        self.cones, self.attempts = cones, attempts
+        self._solver: Any = None
+
+    def solve(self, P: Any, q: Array, A: Any, b: Array) -> Any:
+        """Return the solution of minimize 1/2 x'P x + q'x subject to b - A x in cones; Unsolved where none is found.
+
+        P (its upper triangle) and A are `csc_matrix` with entries at the same places every time.
+        """
+        solver, found = self._solver, None
+        for k, attempt in enumerate(self.attempts):
+            if k == 0 and solver is not None:
+                solver.update(P=P.data, q=q, A=A.data, b=b)
+            else:
+                solver = import_module("clarabel").DefaultSolver(P, q, A, b, self.cones, _settings(attempt))
+            if k == 0 and solver.is_data_update_allowed():  # not where it decomposes a matrix
+                self._solver = solver
+            found = solver.solve()
+            if str(found.status) in SOLVED:
+                return found
+        raise Unsolved(str(found.status))
 
 
 class Unsolved(RuntimeError):
@@ -292,14 +320,11 @@ class Small:
         self.penalty, self.rows, self.loss, self.sizes = penalty, rows, loss, sizes
         self.face = np.zeros(0, dtype=int)
         self.near = np.zeros(penalty.size)
-        self.attempts = ATTEMPTS
 
     def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
-        # equations and inequalities alone; with variables of their own Clarabel is quicker
-        by_active_set = p.linear == len(p.b) and not p.own and len(p.b) * p.size <= DENSE
-        if squares is None or self.loss is not None or not by_active_set:
+        if squares is None or self.loss is not None or not p.polyhedral:
             return self._by_cones(squares, weight, A, b)[0]
         found = self._on_faces(squares, weight, self.face, self.near)
         if found is not None:
@@ -346,14 +371,15 @@ class Small:
     # --- Clarabel ----------------------------------------------------------------------------------------------------
 
     @cached_property
-    def _data(self) -> _Data:
+    def data(self) -> _Data:
+        """Clarabel's data and solver."""
         return _Data(self.penalty, self.rows, self.loss, self.sizes)
 
     def _by_cones(
         self, squares: Squares | None, weight: float, A: Array | None, b: Array | None
     ) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
-        data, p, k, n = self._data, self.penalty, self.rows, len(self.penalty.at)
+        data, p, k, n = self.data, self.penalty, self.rows, len(self.penalty.at)
         if squares is None:
             squares = Squares(np.zeros((k, n)), np.zeros(k), np.zeros(n))
         # tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
@@ -370,13 +396,13 @@ class Small:
         bounds, dense = [residual, p.b - p.A @ x0], [squares.R.ravel()]
         if self.loss is not None and A is not None and b is not None:
             q.append(self.loss.q)
-            bounds += [self.loss.b, data.link @ (b - A @ z0)]
+            bounds += [self.loss.b, data.linked(b - A @ z0)]
             dense.append(A.ravel())
         cost = np.concatenate(q)
         scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
         P, matrix = data.filled(weight, np.concatenate(dense))
         P.data *= scale  # tolerances are absolute below one
-        found = _clarabel(P, cost * scale, matrix, np.concatenate(bounds), data.cones, self.attempts)
+        found = data.clarabel.solve(P, cost * scale, matrix, np.concatenate(bounds))
         x, z, s = np.array(found.x), np.array(found.z) / scale, np.array(found.s)
         x[: p.size] += x0
         self.near = x[: p.size]
@@ -390,58 +416,91 @@ class Small:
 class _Data:
     """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
 
-    Rows: R z - s = y, those of the penalty and of the loss, and what links the loss's entries to the equations A z ~ b.
+    Rows: R z - s = y, those of the penalty and of the loss, and what links the loss's entries to the equations A z ~ b:
+    A z - v = b, or (v_k, A_k z - b_k) in a second-order cone for every norm v_k.
     """
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
-        from scipy import sparse
-
         clarabel = import_module("clarabel")
-        n, m = len(p.at), 0 if loss is None else len(loss.at)
-        P = [sparse.triu(sparse.csc_array(p.P)), 2.0 * sparse.eye_array(k, format="csr")]
-        self.cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
-        entries = sparse.eye_array(m, format="csr")
-        self.link: Any = sparse.eye_array(m, format="csr")  # A z - v = b
-        if sizes is not None:  # (v_k, r_k) in a second-order cone
-            first = np.cumsum(sizes + 1) - sizes - 1
-            count = int(sizes.sum())
-            every = -sparse.eye_array(count + m, format="csc")
-            entries, self.link = -every[:, first], every[:, np.setdiff1d(np.arange(count + m), first)]
+        cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
+        n, top = len(p.at), k + len(p.b)
+        squares = np.arange(k)
+        # entries as (rows, columns, numbers): first R, then A, which other programs have other numbers of
+        dense = [_block(squares, p.at)]
+        entries = [(squares, p.size + squares, -np.ones(k)), _entries(p.A, k, 0)]
+        curvature = [_entries(p.P, 0, 0, upper=True), (p.size + squares, p.size + squares, np.full(k, 2.0))]
+        size, self._sign = p.size + k, 1.0
         if loss is not None:
-            P.append(sparse.triu(loss.P))
-            linked = [clarabel.ZeroConeT(m)]
-            if sizes is not None:
-                linked = [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
-            self.cones += [*loss.linear_cones, *linked]
+            m = len(loss.at)
+            entries.append(_entries(loss.A, top, size))
+            curvature.append(_entries(loss.P, size, size, upper=True))
+            top += len(loss.b)
+            self._first = np.arange(m)
+            self._equations = self._first
+            cones += loss.linear_cones
+            if sizes is None:
+                cones.append(clarabel.ZeroConeT(m))
+            else:
+                self._first = np.cumsum(sizes + 1) - sizes - 1
+                self._equations = np.setdiff1d(np.arange(int(sizes.sum()) + m), self._first)
+                self._sign = -1.0
+                cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
+            dense.append(_block(top + self._equations, p.at))
+            entries.append((top + self._first, size + loss.at, -np.ones(m)))
+            top += len(self._equations) + (0 if sizes is None else m)
+            size += loss.size
+        self._R = k * n
+        self.matrix, place = _assembled([*dense, *entries], (top, size))
+        self._numbers = place[: sum(len(rows) for rows, _, _ in dense)]
+        self.P, place = _assembled(curvature, (size, size))
+        self._curvature = self.P.data.copy()
+        self._weighted = np.zeros(len(place), dtype=bool)
+        self._weighted[place[: len(curvature[0][0])]] = True
+        # a loss's rows come as the user scaled them
+        self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
 
-        def matrix(R: Array, A: Array) -> Any:
-            rows: list[list[Any]] = [[at_z(R), -sparse.eye_array(k, format="csr")], [sparse.csr_array(p.A), None]]
-            if loss is not None:
-                of_entries = sparse.csr_array((np.ones(m), (np.arange(m), loss.at)), (m, loss.size))
-                rows = [[*row, None] for row in rows]
-                rows += [[None, None, loss.A], [self.link @ at_z(A), None, -entries @ of_entries]]
-            return sparse.csc_matrix(sparse.block_array(rows))
-
-        def at_z(M: Array) -> Any:
-            return sparse.csr_array((M.ravel(), np.tile(p.at, len(M)), n * np.arange(len(M) + 1)), (len(M), p.size))
-
-        # the numbers of R and A are where matrices differ that have others there
-        equations = self.link.shape[1]
-        self._matrix = matrix(np.ones((k, n)), np.ones((equations, n)))
-        counted = 2.0 + np.arange((k + equations) * n).reshape(-1, n)
-        other = matrix(counted[:k], counted[k:])
-        self._dense = np.flatnonzero(self._matrix.data != other.data)
-        self._sign = self._matrix.data[self._dense]
-        self._order = np.abs(other.data[self._dense]).astype(int) - 2
-        self._P = sparse.csc_matrix(sparse.block_diag(P))
-        self._curvature = self._P.data
-        self._weighted = np.arange(self._P.nnz) < P[0].nnz  # the penalty's come first
+    def linked(self, b: Array) -> Array:
+        """Return the bounds of what links entries to equations, from those of the equations (m,)."""
+        bound = np.zeros(len(self._equations) + (len(self._first) if self._sign < 0 else 0))
+        bound[self._equations] = self._sign * b
+        return bound
 
     def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
         """Return P at a weight, and the matrix with the numbers of R (k, n) and A (m, n), row by row."""
-        self._matrix.data[self._dense] = self._sign * numbers[self._order]
-        self._P.data = np.where(self._weighted, weight, 1.0) * self._curvature
-        return self._P, self._matrix
+        numbers[self._R :] *= self._sign
+        self.matrix.data[self._numbers] = numbers
+        self.P.data = np.where(self._weighted, weight, 1.0) * self._curvature
+        return self.P, self.matrix
+
+
+Entries = tuple[np.ndarray, np.ndarray, Array]
+"""Rows, columns and numbers of a sparse matrix."""
+
+
+def _block(rows: np.ndarray, columns: np.ndarray) -> Entries:
+    """Return the places of a dense block, row by row."""
+    return np.repeat(rows, len(columns)), np.tile(columns, len(rows)), np.ones(len(rows) * len(columns))
+
+
+def _entries(M: Any, row: int, column: int, upper: bool = False) -> Entries:
+    """Return those of a matrix, or of its upper triangle, from a row and column on."""
+    from scipy import sparse
+
+    M = sparse.coo_array(M)
+    keep = M.row <= M.col if upper else slice(None)
+    return M.row[keep] + row, M.col[keep] + column, M.data[keep]
+
+
+def _assembled(entries: list[Entries], shape: tuple[int, int]) -> tuple[Any, np.ndarray]:
+    """Return a `csc_matrix` of entries at different places, and where in its data each of them is."""
+    from scipy import sparse
+
+    rows, columns, numbers = (np.concatenate(each) for each in zip(*entries, strict=True))
+    order = np.lexsort((rows, columns))
+    place = np.empty_like(order)
+    place[order] = np.arange(len(order))
+    starts = np.concatenate([[0], np.cumsum(np.bincount(columns, minlength=shape[1]))])
+    return sparse.csc_matrix((numbers[order], rows[order], starts), shape), place
 
 
 def nearest(p: Canonical, z: Array) -> Array:
@@ -450,10 +509,13 @@ def nearest(p: Canonical, z: Array) -> Array:
 
     n, N = len(z), p.size
     link = sparse.coo_array((-np.ones(n + 1), (np.arange(n + 1), np.append(N, p.at))), (n + 1, N + 1))
-    A = sparse.vstack([sparse.hstack([sparse.coo_array(p.A), sparse.coo_array((len(p.b), 1))]), link])
+    A = sparse.csc_matrix(
+        sparse.vstack([sparse.hstack([sparse.coo_array(p.A), sparse.coo_array((len(p.b), 1))]), link])
+    )
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
-    found = _clarabel(sparse.csc_array((N + 1, N + 1)), np.append(np.zeros(N), 1.0), A, bound, [*p.linear_cones, cone])
+    flat = sparse.csc_matrix((N + 1, N + 1))
+    found = Clarabel([*p.linear_cones, cone]).solve(flat, np.append(np.zeros(N), 1.0), A, bound)
     return np.array(found.x)[p.at]
 
 

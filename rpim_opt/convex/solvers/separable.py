@@ -11,11 +11,10 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
-from scipy.optimize import bisect
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.expressions import cp
@@ -49,8 +48,9 @@ FEWER, LEAST_SECANTS = 0.1, 1e-8
 """Factor on the secants after a full step, and their least part."""
 BLOCK = 1024
 """Rows that are multiplied together, as a processor's cache holds them."""
-DECADES, EXACT = 6, 1e-15
-"""Decades beyond the largest entry in which a best threshold is looked for, and how exactly, relative."""
+DECADES, TANGENTS, EXACT = 6, 100, 1e-15
+"""Decades beyond the largest entry in which a best threshold is looked for, by how many tangents at most, and how
+exactly, relative."""
 SCALED = ("AddExpression", "multiply", "MulExpression", "DivExpression", "reshape", "Promote")
 """Expressions below which a maximum is looked for."""
 JUMP = 1e-3
@@ -360,6 +360,7 @@ class Loss:
 
     def __init__(self, expression: Any, variable: Any, positive: bool):
         self.expression, self.variable, self.positive = expression, variable, positive
+        self.quadratic = bool(expression.is_qpwa())  # piecewise, of what is piecewise affine
         self.entries: Any = None
         self.threshold: Any = None
         self._lock = threading.Lock()  # a variable has one value at a time
@@ -436,18 +437,34 @@ class Loss:
             return evaluation(self.entries, self.threshold)
 
     def best(self, v: Array) -> tuple[float, float]:
-        """Return the least value at v (M,) and the threshold there; infinity where there is none."""
-        at: Any = self.by_threshold(v)
+        """Return the least value at v (M,) and the threshold there; infinity where there is none.
 
-        def rise(t: float) -> float:
-            return self.rate + float(np.sum(at(t)[1]))
+        The value is convex and piecewise linear in the threshold: where tangents from both sides meet it has its
+        minimum, or the next tangent.
+        """
+        entries: Any = self.by_threshold(v)
+
+        def at(t: float) -> tuple[float, float, float]:
+            values, slopes = entries(t)
+            return t, self.rate * t + float(np.sum(values)), self.rate + float(np.sum(slopes))
 
         for far in (1.0 + np.abs(v).max()) * 10.0 ** np.arange(DECADES):
-            if rise(-far) <= 0 <= rise(far):
-                root: Any = bisect(rise, -far, far, xtol=EXACT * far, rtol=np.float64(EXACT))
-                t = float(root)
-                return self.rate * t + float(np.sum(at(t)[0])), t
-        return np.inf, np.nan
+            low, high = at(-far), at(far)
+            if low[2] <= 0 <= high[2]:
+                break
+        else:
+            return np.inf, np.nan
+        for k in range(TANGENTS):
+            if low[2] == 0 or high[2] == 0:
+                break
+            t = low[0] + (high[1] - low[1] - high[2] * (high[0] - low[0])) / (low[2] - high[2])
+            bound = low[1] + low[2] * (t - low[0])
+            middle = at(0.5 * (low[0] + high[0]) if k % 3 == 2 else t)
+            low, high = (middle, high) if middle[2] < 0 else (low, middle)
+            if middle[1] <= bound + EXACT * max(abs(bound), abs(middle[0])):
+                break
+        t, value, _ = min(low, high, key=lambda point: point[1])
+        return value, t
 
     def some(self, which: np.ndarray) -> tuple[Any, Any]:
         """Return the sum of some entries and the threshold, and the variable (k,) of their own that it is of."""
@@ -586,13 +603,15 @@ def evaluation(e: Any, v: Any) -> Evaluation:
     name = "norm" if norm else type(e).__name__
     affine, atom = AFFINE.get(name), ATOMS.get(name)
 
+    moving = [k for k, a in enumerate(e.args[0].args if norm else e.args) if _has(a, v)]
+
     def evaluated(x: Array) -> tuple[Any, Any]:
-        values, slopes = zip(*(part(x) for part in inner), strict=True)
+        values, slopes = zip(*[part(x) for part in inner], strict=True)
         if affine is not None:
             return affine(values, slopes)
         with np.errstate(all="ignore"):
             value, parts = atom(e, values) if atom else _by_cvxpy(e, values)
-        return value, sum(part * slope for part, slope in zip(parts, slopes, strict=True) if np.any(slope))
+        return value, sum([parts[k] * slopes[k] for k in moving])
 
     return evaluated
 
@@ -629,9 +648,14 @@ def _huber(e: Any, v: Sequence[Array]) -> tuple[Array, list[Array]]:
 
 
 def _maximum(_: Any, v: Sequence[Any]) -> tuple[Array, list[Array]]:
-    v = np.broadcast_arrays(*v)
-    first = np.argmax(v, axis=0)
-    return np.maximum.reduce(v), [(first == i).astype(float) for i in range(len(v))]
+    value: Any = reduce(np.maximum, v)
+    free: Any = True  # where none of those before is the largest
+    parts = []
+    for each in v:
+        largest = free & (each == value)
+        parts.append(largest * 1.0)
+        free = free & ~largest
+    return value, parts
 
 
 def _norm(_: Any, v: Sequence[Any]) -> tuple[Any, list[Any]]:
