@@ -177,23 +177,12 @@ def distance_quantile(covariance: Array, freedom: float, probability: float) -> 
 class Acceptance:
     """Result of the acceptance test of a calibration against a requirement.
 
-    Parameters
-    ----------
-    requirement, verdict
-        The limit and the region; ``"accepted"``: at every configuration of the region the bound is within the limit,
-        and held-out rows bear it out. ``"rejected"``: they miss oftener than chance allows, or the robot's
-        repeatability at its least is above the limit. ``"undecided"``: something is lacking.
-    reasons
-        What rejects it, or what is lacking, a sentence each.
-    workspace
-        The bounds at configurations of the region; None where there are none.
-    scatter
-        What would be left of the largest bound if all parameters were known [m].
-    held_out
-        What held-out rows say, as a document [mm] with its ``sentence``; None where there are none.
+    The verdict is ``"accepted"`` where at every configuration of the region the bound is within the limit, and held-out
+    rows bear it out; ``"rejected"`` where they miss oftener than chance allows, or the robot's repeatability at its
+    least is above the limit; ``"undecided"`` where something is lacking. ``reasons`` say why, a sentence each.
+    ``workspace`` has the bounds at configurations of the region, ``scatter`` is what would be left of the largest if
+    all parameters were known [m], ``held_out`` what held-out rows say, a document [mm] with its ``sentence``.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()
     >>> found = ro.calibration.accept(result, ro.data.Requirement(limit=1e-4))
@@ -267,23 +256,10 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     A bound is as good as its covariance. Rows that the calibration did not see check it: they have to lie in their
     intervals, and may not miss by more than the limit oftener than chance lets them.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    requirement
-        The limit and the region; what the result's record states by default.
-    data
-        Measurements that the calibration did not see; those of its record by default, used since (`refit_all`) or not.
+    The requirement and the measurements are by default those of the result's record, used since (`refit_all`) or not.
+    InputError where nothing is required, for a region that the robot has not or does not reach, and for measurements of
+    which another reading (another unit, exchanged joints) fits far better.
 
-    Raises
-    ------
-    InputError
-        Where nothing is required, for a region that the robot has not or does not reach, and for measurements of
-        which another reading (another unit, exchanged joints) fits far better.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()
     >>> box = ((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9))

@@ -28,18 +28,11 @@ UNLIKELY = 0.01
 class Spread:
     """Covariance of a least-squares fit with a quadratic penalty, noise and prior separately (see `Uncertainty`).
 
-    Parameters
-    ----------
-    linear, form, weight
-        The equations that the fit rests on, their closed form with the penalty, and its weight.
-    z
-        (n,) the solution in units of the scales.
-    factor
-        The weight that a robust loss gives to the equations, against squared residuals in sigmas.
-    level
-        The noise's variance in units of the equations', where it was estimated with the scatter; None: from residuals.
-    drift
-        (n, k) what estimated hyperparameters and heavy tails add: D with D D' a covariance of the deviations [SI].
+    ``linear``, ``form`` and ``weight`` are the equations that the fit rests on, their closed form with the penalty, and
+    its weight; ``z`` (n,) the solution in units of the scales, ``factor`` the weight that a robust loss gives to the
+    equations, against squared residuals in sigmas. ``level`` is the noise's variance in units of the equations', where
+    it was estimated with the scatter, ``drift`` (n, k) what estimated hyperparameters and heavy tails add: D with D D'
+    a covariance of the deviations [SI].
     """
 
     linear: LinearModel
@@ -52,14 +45,7 @@ class Spread:
 
     @property
     def degrees_of_freedom(self) -> float:
-        """Degrees of freedom of the fit: unpenalized directions, and sum s^2 / (s^2 + weight) over the others.
-
-        >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> results = [ro.calibrate(problem, ro.tikhonov, weight) for weight in (1e-3, 1e3)]
-        >>> [round(result.spread.degrees_of_freedom, 1) for result in results]
-        [19.8, 5.9]
-        """
+        """Degrees of freedom of the fit: unpenalized directions, and sum s^2 / (s^2 + weight) over the others."""
         return self.form.degrees_of_freedom(self.weight)
 
     @property

@@ -69,22 +69,9 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     """Return the calibration from identification and validation rows together, with the same settings.
 
     Errors on the held-out rows, which validate the procedure, stay in its record (``held_out``); the parameters come
-    from all rows. No row is left that checks these alone.
+    from all rows. No row is left that checks these alone. ``validation`` are the held-out rows, by default those of the
+    record. InputError where there are none, or measurements are not in memory.
 
-    Parameters
-    ----------
-    result
-        The calibration that was validated.
-    validation
-        The held-out rows; those of its record by default.
-
-    Raises
-    ------
-    InputError
-        Where no rows were held out, or measurements are not in memory.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> result = instance.calibrate()

@@ -91,35 +91,15 @@ class Autocorrelation(NamedTuple):
 class LackOfFit:
     """Components of a calibration's residuals, as RMS of vectors over the rows [m; rad or px without lengths].
 
-    Parameters
-    ----------
-    configurations, equations, spare
-        How many were looked at, and how many equations the deviations leave over; with fewer than 6 nothing else is
-        judged.
-    dimension
-        ``"length"``, ``"angle"`` or ``"pixel"``.
-    left
-        RMS of the errors of the rows.
-    instrument, position, joint
-        RMS of the noise's parts: the instrument's as stated (or estimated), the robot's repeatability in position (in
-        orientation without lengths), and what comes from its joints.
-    repeatable
-        RMS of what `missing` would explain.
-    missing, parameters
-        Model extensions that the data support beside those of the model, and the patterns that identify them.
-    gain, share
-        By how much -2 ln L falls with them, and the share of the mean square residual that they would explain.
-    present
-        Extensions of the model that the data support, and by how much -2 ln L falls with each.
-    alike
-        Autocorrelation of the residuals of the model with all that `missing` names; None for too few.
-    upward
-        Joints whose compliance is significantly negative, which gravity cannot do.
-    repeated, excess
-        RMS of repeated readings of a configuration about their mean, None without enough of them; RMS of the residuals
-        beyond that, where it is more than chance.
-    overstated
-        Whether the residuals are smaller than the stated measurement noise, by the chi-squared test (`NoiseTest`).
+    ``spare`` is how many of the ``equations`` the deviations leave over; below 6 nothing else is judged. ``left`` is
+    the RMS of the errors; ``instrument`` (as stated or estimated), ``position`` (the robot's repeatability in position,
+    without lengths in orientation) and ``joint`` are the noise's parts, ``repeatable`` is what the extensions
+    ``missing`` would explain: a ``share`` of the mean square residual, -2 ln L falling by ``gain``; ``parameters`` are
+    the patterns that identify them. ``present`` says by how much -2 ln L falls with each extension of the model.
+    ``alike`` is the autocorrelation of the residuals with all that is missing, None for too few; ``upward`` are joints
+    whose compliance is significantly negative, which gravity cannot do. ``repeated`` is the RMS of repeated readings
+    about their mean, None without enough, ``excess`` that of the residuals beyond, where it is more than chance.
+    ``overstated``: the residuals are smaller than the stated noise, by the chi-squared test (`NoiseTest`).
     """
 
     configurations: int

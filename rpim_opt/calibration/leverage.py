@@ -37,34 +37,13 @@ BALANCED = 1e-4
 class Influence(Tabled):
     """Influence of C configurations on n parameters.
 
-    Parameters
-    ----------
-    label
-        C labels, of a configuration's first row.
-    configuration
-        (C,) numbers.
-    parameters, dimensions
-        Names of the n identified parameters, and what they measure.
-    leverage
-        (C,) trace of a configuration's part of the influence matrix: how many degrees of freedom of the fit are its
-        own. They sum to those of the fit.
-    cook
-        (C,) Cook's distance (1977): how far all predictions move without the configuration, in units of the noise and
-        a degree of freedom. About 1 and above: the result hangs on it.
-    change
-        (C, n) by how much every parameter would change without the configuration [SI]; NaN where no other decides it.
-    deviation
-        (n,) standard deviations of the parameters from the noise [SI]; zero where the data do not see one.
-    weight
-        (C,) what a robust loss gave the configuration at the end, against a squared one; 1 for a squared loss.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
-    >>> found = ro.calibration.influence(result)
-    >>> found.change.shape, f"{found.leverage.sum():.1f}", f"{result.spread.degrees_of_freedom:.1f}"
-    ((40, 34), '26.7', '26.7')
+    ``label`` and ``configuration`` (C,) are of their first rows, ``parameters`` and ``dimensions`` of the parameters.
+    ``leverage`` (C,) is the trace of a configuration's part of the influence matrix; they sum to the degrees of freedom
+    of the fit. ``cook`` (C,) is Cook's distance (1977): how far all predictions move without the configuration, in
+    units of the noise and a degree of freedom; the result hangs on one of about 1. ``change`` (C, n) is by how much
+    parameters would change [SI], NaN where no other configuration decides one; ``deviation`` (n,) their standard
+    deviations from the noise [SI], zero where the data do not see one; ``weight`` (C,) what a robust loss gave the
+    configuration at the end, against a squared one.
     """
 
     label: tuple[str, ...]
@@ -123,27 +102,13 @@ def influence(result: Outcome) -> Influence:
     them. With a robust loss W are the weights with which the loss ended; they are held, so that what is left out
     changes no other configuration's weight. Parameters at a bound stay there.
 
-    Parameters
-    ----------
-    result
-        With a squared penalty or none.
+    InputError for a penalty that is no square, and a loss that weighs no equations (minimax rests on a few).
 
-    Raises
-    ------
-    InputError
-        For another penalty, and a loss that weighs no equations (minimax rests on a few).
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
-    >>> problem = ro.load("blunders").problem
-    >>> found = ro.calibration.influence(ro.calibrate(problem, ro.tikhonov, weight=1.0))
+    >>> found = ro.calibration.influence(ro.calibrate(ro.load("blunders").problem, ro.tikhonov, weight=1.0))
     >>> [found.label[k] for k in np.argsort(-found.cook)[:3]]  # blunders
     ['c43', 'c14', 'c1']
-    >>> robust = ro.calibration.influence(ro.calibrate(problem, ro.robust, weight=1.0))
-    >>> print(f"{robust.weight[list(robust.label).index('c39')]:.3f}")
-    0.020
     """
     if not result.linear_penalty:
         raise InputError("influence", f"formulation '{result.formulation.name}'", "a squared penalty or none")
@@ -249,12 +214,8 @@ WORTH = 0.9
 class Improvement:
     """Expected position errors of the flange [m] over the joint ranges, with base and tool fitted.
 
-    Parameters
-    ----------
-    before, after
-        RMS with the nominal parameters, and with the identified ones.
-    within
-        What 95 % of the errors along any axis do not exceed where least is known.
+    RMS before (nominal parameters) and after (identified ones); ``within`` is what 95 % of the errors along any axis do
+    not exceed where least is known.
     """
 
     before: float
@@ -279,13 +240,8 @@ def improvement(result: Outcome) -> Improvement | None:
     N is that of leaving out every configuration in turn (the jackknife) where that is more than the noise says: then
     the rows of a configuration err together, by the robot or by the camera, and more of them do not help.
 
-    Parameters
-    ----------
-    result
-        With a squared penalty or none, of one robot with joint limits, in one place or several (`together`).
+    For a squared penalty or none, and one robot with joint limits, in one place or several (`together`).
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> found = ro.calibration.improvement(ro.load("position").calibrate())
     >>> found.improves, found.before > 10 * found.after

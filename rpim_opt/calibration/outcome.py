@@ -58,13 +58,6 @@ class Prediction(NamedTuple):
     The factor is (N, 1) where rows have degrees of ``freedom`` (N,) of their own: readings of a session that is not
     known, where a few sessions told how far they lie apart. ``outside`` says which rows are beyond the joint ranges
     that were measured; there an interval may be too narrow.
-
-    >>> import rpim_opt as ro
-    >>> instance = ro.load("position")
-    >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.reml)
-    >>> where = ro.calibration.Uncertainty(result).predict(instance.validation.q)
-    >>> where.covariance.shape, bool((where.expanded == where.coverage_factor * where.standard).all())
-    ((40, 3, 3), True)
     """
 
     position: Array
@@ -140,8 +133,7 @@ class Outcome:
         >>> (1e3 * (result.robot.mdh - result.problem.robot.mdh)[:, 3]).round(2)  # deviations of d [mm]
         array([0.17, 0.45, 0.45, 0.45, 3.82, 0.7 ])
         """
-        name = "" if "" in self.problem.arms else self.problem.robot.name  # says which, where there are several
-        return self.robots[name]
+        return self.robots["" if "" in self.problem.arms else self.problem.robot.name]  # says which, of several
 
     @property
     def robots(self) -> Mapping[str, Robot]:
@@ -172,22 +164,12 @@ class Outcome:
         Base, robot and tool, gears and joints' elasticity included, joints in the middle of their backlash unless
         `columns` say otherwise; of `robot` alone: `forward_kinematics`.
 
-        Parameters
-        ----------
-        q
-            (N, dof) joint values of the controller [rad or m].
-        marker, robot
-            The reflector and the robot; the only ones by default.
-        torque
-            (N, dof) joint torques [Nm], where compliances of joints were identified from measured ones.
-        payload
-            Mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`.
-        columns
-            What terms of your own see, by name, (N,) each [SI]; "approach", (N, dof), is the direction in which each
-            joint came, -1 or 1, where backlash was identified.
+        q (N, dof) are joint values of the controller [rad or m]; ``marker`` and ``robot`` the only ones by default;
+        ``torque`` (N, dof) joint torques [Nm], where compliances were identified from measured ones; ``payload`` the
+        mass at the flange [kg], one or (N,), instead of that of the robot's `Gravity`; ``columns`` what terms of your
+        own see, by name, (N,) each [SI], "approach" (N, dof) the direction in which each joint came, -1 or 1, where
+        backlash was identified.
 
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
         >>> result.forward([[0, 0, 0, 0, 0, 0]])[0, :3, 3].round(3)  # [m]
@@ -213,8 +195,6 @@ class Outcome:
         model says, J C J'; ``"reached"`` of the position that the robot will reach, with its repeatability;
         ``"reading"`` of what the instrument will read there. A penalty without covariance (lasso) is refused.
 
-        Examples
-        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -257,20 +237,13 @@ class Outcome:
 
         Of the identification data by default; ``nominal``: of the nominal robot, as in `nominal_errors`.
         """
-        source, x = self.problem, self.x
-        if nominal:
-            source, x = self._nominal
-        if data is not None:
-            source = source.on(data)
+        source, x = self._at(data, nominal)
         return np.concatenate([error_vectors(part, x) for part in source.rows()])
 
     def measured_positions(self, data: Dataset | None = None) -> Array:
-        """Return the measured position of every row, (N, 3) [m]; the modelled one where none was measured."""
-        source = self.problem
-        if data is not None:
-            source = source.on(data)
+        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured."""
         found = []
-        for part in source.rows():
+        for part in self._at(data)[0].rows():
             points = np.empty((len(part.data), 3))
             for block in part.data.blocks:
                 torque = None if block.torque is None else block.torque[:, 0]
@@ -293,10 +266,8 @@ class Outcome:
         >>> [f"{1e3 * result.errors(instance.validation, d).mean():.3f}" for d in ("length", "angle")]  # mm, mrad
         ['0.044', '0.101']
         """
-        source = self.problem
-        if data is not None:
-            source = source.on(data)
-        return source.errors(self.x, dimension)
+        source, x = self._at(data)
+        return source.errors(x, dimension)
 
     def nominal_errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the error of every row for the nominal robot, (N,) [m]; arguments as for `errors`.
@@ -304,10 +275,13 @@ class Outcome:
         Frames (base, reflectors, anchors, ...) that the calibration identifies are fitted to the identification data
         first: before that they say nothing about the robot.
         """
-        source, x = self._nominal
-        if data is not None:
-            source = source.on(data)
+        source, x = self._at(data, nominal=True)
         return source.errors(x, dimension)
+
+    def _at(self, data: Dataset | None, nominal: bool = False) -> tuple[Source, Array]:
+        """Return the problem, on some data, and its solution; or that which identifies frames alone."""
+        source, x = self._nominal if nominal else (self.problem, self.x)
+        return source if data is None else source.on(data), x
 
     @cached_property
     def _nominal(self) -> tuple[Source, Array]:
@@ -326,18 +300,14 @@ class Outcome:
         identified = p.identified & ~np.isin(p.names, learned.added)
         bare = self.problem.scattered(None)
         bare = bare.with_parameters(replace(p, scale=scale, identified=identified))
-        if learned.curves is None:
-            return bare
-        return bare.with_transmission(())
+        return bare if learned.curves is None else bare.with_transmission(())
 
     # --- how the fit is, and what it rests on ------------------------------------------------------------------
 
     @property
     def penalty_weight(self) -> float:
         """The weight, zero where there is no penalty."""
-        if self.formulation.penalty is None:
-            return 0.0
-        return self.weight
+        return 0.0 if self.formulation.penalty is None else self.weight
 
     @property
     def squared_loss(self) -> bool:
@@ -376,10 +346,7 @@ class Outcome:
     def spread(self) -> Spread:
         """The basis of the uncertainty: the equations that the fit keeps, and its penalty.
 
-        Raises
-        ------
-        InputError
-            For a penalty that is no squared norm, or a loss that no squared one stands for.
+        InputError for a penalty that is no squared norm, or a loss that no squared one stands for.
         """
         if not self.linear_penalty:
             found = f"formulation '{self.formulation.name}'"
@@ -430,12 +397,10 @@ class Outcome:
         It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty, conditional on
         the active constraints. Variances that neither data nor penalty decide are infinite.
 
-        >>> import numpy as np
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> deviation = 1e3 * np.sqrt(np.diag(result.covariance))
-        >>> f"a2 to {deviation[result.problem.parameters.free.names.index('a2')]:.3f} mm"
-        'a2 to 0.007 mm'
+        >>> bool((result.spread.noise + result.spread.prior == result.covariance).all())
+        True
         """
         return self.spread.covariance
 
@@ -483,10 +448,8 @@ class Outcome:
     @property
     def doubted(self) -> list[str]:
         """Labels of all outliers: excluded before the fit, and flagged after it."""
-        before: list[str] = []
-        if self.learned is not None:
-            before = [row.label for row in self.learned.left_out]
-        return [*before, *(flag.label for flag in self.flagged)]
+        before = () if self.learned is None else self.learned.left_out
+        return [row.label for row in (*before, *self.flagged)]
 
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, with the same formulation, selector and solver.
@@ -513,17 +476,7 @@ class Outcome:
 
     @cached_property
     def prices(self) -> tuple[Price, ...]:
-        """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none.
-
-        >>> import cvxpy as cp
-        >>> import rpim_opt as ro
-        >>> length = ro.constraints.parse("a3 + a4 = 824.0 +- 0.5 mm")
-        >>> stated = ro.Formulation("as drawn", penalty=cp.sum_squares, constraints=(length,))
-        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
-        >>> price = result.prices[0]
-        >>> print(f"{price.multiplier:.1f} for every {price.unit}; {price.gain:.2f} of {price.misfit:.2f} for 0.05 mm")
-        10.5 for every mm; 0.53 of 10.25 for 0.05 mm
-        """
+        """What the statements of a drawing (`constraints.parse`) cost, in their order; empty where there are none."""
         if self.kept is not None:
             return self.kept.prices
         return diagnosis.prices(self.program, self.z, self.weight)

@@ -61,8 +61,6 @@ class Calibration(Outcome):
     identified 0.032 mm
     >>> print(result.selector, result.verdict)
     l_curve Delivered.
-    >>> result.parameter_rows()[1]["name"], round(result.parameter_rows()[1]["deviation"], 2)  # [mm]
-    ('a1', 0.01)
     """
 
     @cached_property
@@ -83,12 +81,7 @@ class Calibration(Outcome):
         return words.selector(self)
 
     def weight_sentence(self) -> str:
-        """Return a sentence on the weight and its origin.
-
-        >>> import rpim_opt as ro
-        >>> print(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0).weight_sentence())
-        Weight 1 (given), formulation 'Tikhonov'.
-        """
+        """Say the weight and where it came from."""
         return " ".join(words.weight_lines(self))
 
     def parameter_rows(self) -> list[dict[str, Any]]:
@@ -101,30 +94,14 @@ class Calibration(Outcome):
     def to_frame(self, what: str = "parameters") -> Any:
         """Return one of the result's tables as a data frame (pandas, or polars if pandas is not installed).
 
-        Parameters
-        ----------
-        what
-            ``"parameters"``, ``"errors"`` (every row's, before and after), ``"history"`` (the passes), ``"flags"``
-            (rows that the fit distrusts), ``"bounds"`` (parameters that their tolerance holds back) or ``"prices"``
-            (of statements of a drawing).
+        ``what`` is ``"parameters"``, ``"errors"`` (of every row, before and after), ``"history"`` (iterations),
+        ``"flags"`` (outlying rows), ``"bounds"`` (active ones) or ``"prices"`` (of statements of a drawing).
+        InputError for another name, or where no data frames are installed.
 
-        Raises
-        ------
-        InputError
-            For another name, or where no data frames are installed.
-
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
         >>> list(result.to_frame().columns)
         ['parameter', 'unit', 'nominal', 'identified', 'deviation', 'std']
-        >>> result.to_frame("errors").head(2).round(3)
-          label  nominal_mm  identified_mm
-        0    c0       1.090          0.049
-        1    c1       1.886          0.025
-        >>> len(result.to_frame("history")) == len(result.history)
-        True
         """
         if what not in words.FRAMES:
             raise InputError("to_frame", f"'{what}'", choices(what, words.FRAMES))

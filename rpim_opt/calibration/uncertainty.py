@@ -34,32 +34,14 @@ class Uncertainty(Tabled):
     It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty; other penalties
     (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.held_back``.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    confidence
-        Of the intervals, between 0 and 1.
+    ``confidence`` of the intervals is between 0 and 1. InputError for another one, or a penalty without covariance.
 
-    Raises
-    ------
-    InputError
-        For another confidence, or a penalty without covariance.
-
-    Examples
-    --------
-    >>> import numpy as np
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> uncertainty = ro.calibration.Uncertainty(result, confidence=0.95)
     >>> print(f"{result.freedom:.1f} degrees of freedom, k = {uncertainty.coverage_factor:.2f}")
     93.5 degrees of freedom, k = 1.99
-    >>> bool(np.allclose(result.spread.noise + result.spread.prior, result.covariance))
-    True
-    >>> uncertainty.intervals().shape
-    (34, 2)
-    >>> frame = uncertainty.to_frame()
-    >>> list(frame.columns)
+    >>> list(uncertainty.to_frame().columns)
     ['parameter', 'unit', 'value', 'u_noise', 'u_prior', 'u', 'U', 'held_back']
     """
 
@@ -87,13 +69,6 @@ class Uncertainty(Tabled):
         """Return `Calibration.predict` with the coverage factor of this confidence; same arguments.
 
         The factor is larger for readings of an unknown session, where few sessions told how far they lie apart.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> where = ro.calibration.Uncertainty(result, confidence=0.99).predict(np.radians([[10, 20, -30, 40, 50, 60]]))
-        >>> (where.expanded / where.standard).round(2)
-        array([[2.63, 2.63, 2.63]])
         """
         found = self.result.predict(q, marker, **arguments)
         factor: float | Array = self.coverage_factor
@@ -216,15 +191,6 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     The check of the law of propagation (JCGM 101), with bounds and any loss: the spread of the draws is to be compared
     with `Spread.noise`. Every draw solves the linearized program at the same weight.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    draws, seed
-        How many, and of which random numbers.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)

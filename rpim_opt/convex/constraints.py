@@ -91,8 +91,6 @@ class Box:
     >>> result = ro.calibrate(ro.load("paper_arm").problem, within, weight=1e-3)
     >>> round(float(abs(result.z).max()), 9)
     0.5
-    >>> half.bounds(result.problem.parameters.free)[1][:3], half.stated, ro.within_tolerance.stated
-    (array([0.5, 0.5, 0.5]), None, None)
     """
 
     name: str

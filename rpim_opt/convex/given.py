@@ -63,16 +63,6 @@ class Given(Identified):
     """The identified parameters as a constraint function gets them: with the unknowns z (n,), and what follows them.
 
     Other arguments as for `Parameters`; ``asked`` notes that positions were used, which are linear about some point.
-
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> home = np.zeros((1, 6))  # joint values [rad]
-    >>> def level(z, p):
-    ...     return p.positions(home)[0, 2] == 0.1975  # [m], of the reflector in the instrument's frame
-    >>> stated = ro.Formulation("level", penalty=ro.tikhonov.penalty, constraints=(level,))
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
-    >>> print(f"{result.forward(home)[0, 2, 3]:.4f} m")
-    0.1975 m
     """
 
     z: Any = None
@@ -92,11 +82,12 @@ class Given(Identified):
 
         >>> import numpy as np
         >>> import rpim_opt as ro
-        >>> problem = ro.load("paper_arm").problem
-        >>> parameters = problem.linearize(np.zeros(len(problem.parameters.free))).parameters
-        >>> there = ro.convex.given(ro.convex.Unknown(parameters.names), parameters).positions(np.zeros((2, 6)))
-        >>> there.shape, there.is_affine()
-        ((2, 3), True)
+        >>> home = np.zeros((1, 6))  # joint values [rad]
+        >>> level = lambda z, p: p.positions(home)[0, 2] == 0.1975  # [m]
+        >>> stated = ro.Formulation("level", penalty=ro.tikhonov.penalty, constraints=(level,))
+        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+        >>> print(f"{result.forward(home)[0, 2, 3]:.4f} m")
+        0.1975 m
         """
         return _expression(predicted(problem_of(self), q, marker, torque, self.at), self)
 
@@ -112,9 +103,8 @@ class Given(Identified):
         >>> still = lambda z, p: cp.norm(p.movements(np.zeros((1, 6)))[0]) <= 1e-3  # [m]
         >>> stated = ro.Formulation("at home", penalty=ro.tikhonov.penalty, constraints=(still,))
         >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
-        >>> there = ro.robot.forward_kinematics(result.robot, np.zeros(6))[0, :3, 3]
-        >>> before = ro.robot.forward_kinematics(result.problem.robot, np.zeros(6))[0, :3, 3]
-        >>> print(f"{1e3 * np.linalg.norm(there - before):.3f} mm")
+        >>> before, after = (ro.robot.forward_kinematics(r, np.zeros(6)) for r in (result.problem.robot, result.robot))
+        >>> print(f"{1e3 * np.linalg.norm((after - before)[0, :3, 3]):.3f} mm")
         1.000 mm
         """
         return _expression(moved(problem_of(self), q, marker, torque, self.at), self)

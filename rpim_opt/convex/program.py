@@ -23,7 +23,7 @@ from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import Warm, minimum
 from rpim_opt.convex.structure import Structure, structure
-from rpim_opt.convex.trust import Trusted
+from rpim_opt.convex.trust import Trusted, trusted
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
@@ -303,7 +303,7 @@ class Program(Brief):
         """
         if self.loss_form is not None:
             return None
-        return self.structure.trusted(self.norms(z), self.model.members[1])
+        return trusted(self.formulation, self.norms(z), self.model.members[1], self.structure.answers.loss)
 
     def trusted(self, z: Array) -> LinearModel:
         """Return the squared-loss model that a robust fit amounts to: the rows that it trusts at z (n,), downweighted.
@@ -370,24 +370,13 @@ class Program(Brief):
         Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints.
 
-        Parameters
-        ----------
-        weight
-            Of the penalty, zero or more.
-        damping
-            A term that keeps the solution near a point.
-        solver, settings, verbose
-            Any installed solver of CVXPY with its options: then `problem` is solved by it, whatever the structure.
-        accuracy
-            Part of a loss that is a sum over rows by which a first guess may lie above the minimum.
+        ``damping`` is a term that keeps the solution near a point. With a ``solver`` of CVXPY, its ``settings`` or
+        ``verbose``, `problem` is solved by it, whatever the structure. ``accuracy`` is the part of a loss that is a sum
+        over rows by which a first guess may lie above the minimum.
 
-        Raises
-        ------
-        InputError
-            For a weight that is negative or not finite, and a solver that is not installed.
-        NoSolutionFound
-            When the solver does not end with "optimal", or its point misses the constraints; ``conflict`` names
-            what contradicts what when the program is infeasible.
+        InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound
+        when the solver does not end with "optimal", or its point misses the constraints; its ``conflict`` names what
+        contradicts what.
         """
         begin = time.perf_counter()
         weight = self._weight(weight)

@@ -59,11 +59,6 @@ class Quadratic:
         residual = self.times(v) - self.c
         return float(residual @ residual) + self.constant
 
-    def slope(self, v: Array) -> Array:
-        """Return the gradient 2 L'(L v - c), (n,)."""
-        residual = self.times(v) - self.c
-        return 2 * (self.L * residual if self.diagonal else self.L.T @ residual)
-
 
 def identity(n: int) -> Quadratic:
     """Return |v|^2, which `cp.sum_squares` declares to be."""
@@ -78,8 +73,8 @@ def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
     """
     if {v.id for v in expression.variables()} != {variable.id}:
         return None
-    if not expression.is_quadratic() or cp.huber in expression.atoms():  # which CVXPY counts among quadratics
-        return None
+    if not expression.is_quadratic() or expression.is_affine() or cp.huber in expression.atoms():
+        return None  # affine expressions and huber are quadratic to CVXPY
     variable.save_value(None)  # atoms ask for the value of what they are made of, and may get a stale one
     data = cp.Problem(cp.Minimize(expression)).get_problem_data(cp.CLARABEL, solver_opts={})[0]
     if data.get("P") is None or data["dims"].zero != len(data["b"]) or data.get("lower_bounds") is not None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -29,12 +29,12 @@ from rpim_opt.convex.expressions import (
     substituted,
     term,
 )
-from rpim_opt.convex.formulation import Formulation, lost
+from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
 from rpim_opt.convex.solvers.conic import Canonical
 from rpim_opt.convex.solvers.separable import Loss
-from rpim_opt.convex.trust import Squares, Trusted, separable, trusted
+from rpim_opt.convex.trust import Squares, separable
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 
@@ -138,17 +138,28 @@ class Structure:
     """A formulation for data of one shape: its functions' expressions of r and z, their structure and their values.
 
     A formulation that is `declared` is called when an expression of it is first needed: what a formula or an active
-    set solves, it solves without CVXPY.
+    set solves, it solves without CVXPY. Of one whose functions a file could not hold the ``forms`` of loss and penalty
+    may be known, and all else raises InputError.
     """
 
-    def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
+    def __init__(
+        self,
+        formulation: Formulation,
+        parameters: Parameters,
+        equations: int,
+        groups: np.ndarray,
+        forms: Sequence[Quadratic | None] | None = None,
+    ):
         self.formulation, self.parameters = formulation, parameters
         self.n, self.equations, self.groups = len(parameters), equations, groups
-        self.constrained = bool(formulation.constraints)
+        self.constrained = bool(formulation.constraints) or not formulation.solvable
         self._lock = threading.RLock()
         self._called: Answers | None = None
-        self._declared = declared(formulation)
-        if self._declared:
+        self._declared = declared(formulation) or not formulation.solvable
+        if not formulation.solvable:
+            self.box = None
+            self.loss_form, self.penalty_form = forms or (None, None)
+        elif self._declared:
             self.box  # noqa: B018 - limits that do not fit the parameters are refused now
         else:  # a user's functions may return another thing later
             self.answers  # noqa: B018
@@ -372,10 +383,6 @@ class Structure:
         """Return what the loss gets of a residual: itself, or the norms of the configurations."""
         return np.sqrt(np.bincount(self.groups, r**2)) if self.over_norms else r
 
-    def trusted(self, lengths: Array, count: np.ndarray) -> Trusted:
-        """Return the rows that the loss trusts, of configurations with these norms and numbers of equations (N,)."""
-        return trusted(self.formulation, lengths, count, self.answers.loss)
-
     def met(self, z: Array) -> bool:
         """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""
         own = self.answers.z
@@ -387,11 +394,13 @@ class Structure:
                 return not any(np.any(limit.violation() > 0) for limit in self.flat)
 
 
-def structure(formulation: Formulation, model: LinearModel) -> Structure:
+def structure(
+    formulation: Formulation, model: LinearModel, forms: Sequence[Quadratic | None] | None = None
+) -> Structure:
     """Return the structure of a formulation for the shape of a model; that of a ready one may be there already."""
-    if not formulation.solvable:
-        return Lost(formulation, model)
     m, n = model.A.shape
+    if not formulation.solvable:
+        return Structure(formulation, model.parameters, m, model.members[0], forms)
     if model.stands_for is not None:
         if not invariant(formulation, lambda: model.equations):
             found = f"formulation '{formulation.name}'"
@@ -445,35 +454,6 @@ def _loss_form(formulation: Formulation, equations: int) -> Quadratic | None:
     except ValueError:  # it is made for another number of residuals
         return None
     return quadratic(loss.expression, loss.variable)
-
-
-class Lost(Structure):
-    """The structure of a formulation whose functions a file could not hold; their quadratic forms may be known."""
-
-    def __init__(
-        self,
-        formulation: Formulation,
-        model: LinearModel,
-        loss_form: Quadratic | None = None,
-        penalty_form: Quadratic | None = None,
-    ) -> None:
-        self.formulation, self.parameters = formulation, model.parameters
-        self.n, self.equations, self.groups = model.A.shape[1], len(model.b), model.members[0]
-        self.constrained = True
-        self.loss_form, self.penalty_form, self.box = loss_form, penalty_form, None
-        self._declared = True
-        self._lock = threading.RLock()
-        self.values = self.trusted = lost(formulation.name)
-
-    @property
-    def answers(self) -> Answers:
-        """Raises InputError."""
-        return lost(self.formulation.name)()
-
-    @property
-    def constraints(self) -> list[list[Any]]:
-        """None: the functions cannot be called again."""
-        return []
 
 
 def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, Squares | None]:

@@ -36,22 +36,10 @@ AROUND = 5
 class Selection(Tabled):
     """A chosen weight with its evidence.
 
-    Parameters
-    ----------
-    weight
-        The choice.
-    name
-        The rule's name.
-    weights, score
-        (K,) the weights that were tried and what the rule compared.
-    interior
-        Whether the choice lies inside the weights that were tried. If not, ``note`` says what that means.
-    note
-        One sentence for the report.
+    ``name`` is the rule's, ``weights`` and ``score`` (K,) are what it tried and compared; ``interior`` says whether the
+    choice lies inside of them, and if not, ``note``, a sentence for the report, what that means.
 
-    Examples
-    --------
-    A selector of one's own is a function of the program that returns one.
+    A selector of one's own is a function of the program that returns one:
 
     >>> import numpy as np
     >>> import rpim_opt as ro

@@ -237,7 +237,7 @@ class Clarabel:
 
         P (its upper triangle) and A are `csc_matrix` with entries at the same places every time.
         """
-        solver, found = self._solver, None
+        solver, found = self._solver, SimpleNamespace(status="")
         for k, attempt in enumerate(self.attempts):
             if k == 0 and solver is not None:
                 solver.update(P=P.data, q=q, A=A.data, b=b)

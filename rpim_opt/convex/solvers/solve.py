@@ -89,9 +89,11 @@ def minimum(
 
 def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
     few = loss.variable.size <= FEW
-    if not (few and _whole(loss, warm)) and warm.kink < 0:
+    if few and _whole(loss, warm):
+        return _all_rows(loss, rows, warm, weight, None, damping)
+    if warm.kink < 0:
         warm.kink = loss.kink(rows)
-    if few and (warm.kink or _whole(loss, warm)):
+    if few and warm.kink:
         return _all_rows(loss, rows, warm, weight, None, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
@@ -111,11 +113,14 @@ def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Dampi
 
 
 def _whole(loss: Loss, warm: Warm) -> bool:
-    """Whether few rows of a piecewise quadratic loss are solved at once, in place of ten Newton steps, or four near z.
+    """Whether few rows of a loss are solved at once: piecewise linear ones, and in place of Newton quadratic ones.
 
-    One program of all rows takes three times as long as a small one where the penalty has unknowns of its own, and
-    longer still beside one whose active set is known; the first one has none.
+    Newton takes ten steps, or four near the minimum. One program of all rows takes three times as long as one of them
+    where the penalty has unknowns of its own, and longer still beside one whose active set is known; a first one's is
+    not.
     """
+    if loss.expression.is_pwl():
+        return True
     penalty, near = warm.penalty, warm.z is not None
     unknowns = penalty.size > len(penalty.at)
     return loss.quadratic and ((unknowns and not (near and penalty.polyhedral)) or not (near or penalty.polyhedral))
