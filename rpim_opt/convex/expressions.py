@@ -236,7 +236,7 @@ def _evaluation(e: Any, variable: cp.Variable) -> Callable[[Array], Any]:
     if not e.variables():
         constant = e.value
         return lambda v: constant
-    if not e.args or type(e).__name__ == "SuppFuncAtom" or 0 in e.shape:
+    if not e.args or type(e).__name__ in ("SuppFuncAtom", "indicator") or 0 in e.shape:
         return lambda v: e.value
     parts = [_evaluation(arg, variable) for arg in e.args]
 
