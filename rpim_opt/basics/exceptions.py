@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -106,7 +105,7 @@ class Conflict(NamedTuple):
         for bounds in (self.parameters, self.stated):
             if bounds:
                 by = ", ".join(f"{name} by {1e3 * v:.3g} mm or mrad" for name, v in bounds.items())
-                parts.append(f"loosening {by} would do")
+                parts.append(f"loosen {by}")
         return "; ".join(parts)
 
 

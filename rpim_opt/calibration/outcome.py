@@ -241,7 +241,7 @@ class Outcome:
         return np.concatenate([error_vectors(part, x) for part in source.rows()])
 
     def measured_positions(self, data: Dataset | None = None) -> Array:
-        """Return the measured position of every row, (N, 3) [m]; the identified reflector's where none was measured."""
+        """Return the measured position of every row, (N, 3) [m]; the modelled one where none was measured."""
         found = []
         for part in self._at(data)[0].rows():
             points = np.empty((len(part.data), 3))
@@ -476,7 +476,7 @@ class Outcome:
 
     @cached_property
     def prices(self) -> tuple[Price, ...]:
-        """What the statements of a drawing (`constraints.parse`) cost, in their order; empty where there are none."""
+        """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none."""
         if self.kept is not None:
             return self.kept.prices
         return diagnosis.prices(self.program, self.z, self.weight)

@@ -81,7 +81,7 @@ class Calibration(Outcome):
         return words.selector(self)
 
     def weight_sentence(self) -> str:
-        """Say the weight and where it came from."""
+        """Return a sentence on the weight and its origin."""
         return " ".join(words.weight_lines(self))
 
     def parameter_rows(self) -> list[dict[str, Any]]:
