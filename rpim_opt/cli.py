@@ -33,8 +33,8 @@ HELP = """Robot calibration by convex optimization.
 
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
-Exit codes: 0 done; 1 a limit or gate failed, or a robot is not delivered; 2 unusable input; 3 no solution found; 4
-whether a limit is kept cannot be decided.
+Exit codes: 0 done; 1 a limit or gate failed, or a robot is not delivered; 2 invalid input; 3 no solution found; 4
+acceptance inconclusive.
 """
 
 
@@ -136,25 +136,26 @@ Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or the folder it lies in.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
 Sheet = Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")]
-Key = Annotated[str, Option(help="Column that joins several files, or row for the number of the row.")]
-TimeTolerance = Annotated[Number, Option(help="Join files by the nearest time, at most so many seconds apart.")]
+Key = Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")]
+TimeTolerance = Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")]
 Several = "several files are stacked, or joined as by new."
-Type = Annotated[Text, Option(help="Which of the result's measurement types, if there are several.")]
+Type = Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")]
 Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
-Largest = Annotated[Number, Option(help="Largest error that is allowed [mm]; exit code 1 above.")]
+Largest = Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")]
 Box = Annotated[
     Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base frame; default: the measured joint ranges.")
 ]
-Marker = Annotated[Text, Option(help="Which reflector, where there are several.")]
-UrdfBase = Annotated[Text, Option(help="Link where the chain starts, if not the root: any link, a camera in the head.")]
-UrdfTip = Annotated[Text, Option(help="Link where it ends, if there are several.")]
+Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
+UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
+UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
 Workers = Annotated[int, Option(help="Processes on this machine.")]
 Scheduler = Annotated[Text, Option(help="Address of a Dask scheduler to compute on.")]
-Resume = Annotated[Choice, Option(help="Continue an interrupted run, or discard it and start again.")]
+Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
-Folder = Annotated[File, Option(help="Folder for result.json.")]
+Folder = Annotated[File, Option(help="Folder in which to write result.json.")]
 Despite = Annotated[
-    bool, Option("--despite-verdict", help="Write the file although the robot is not delivered, with a note in it.")
+    bool,
+    Option("--despite-verdict", help="Write the file although the robot is not delivered, with a note in the file."),
 ]
 Json = Annotated[bool, Option("--json", help="One JSON document on stdout, errors as JSON on stderr.")]
 
@@ -186,7 +187,7 @@ class Answer(NamedTuple):
         """Print the text, or the document as JSON."""
         lines = [*filter(None, [str(self.text)]), *self.notes]
         if self.left_out:
-            lines.append(f"Columns that were left out: {', '.join(self.left_out)}.")
+            lines.append(f"Ignored columns: {', '.join(self.left_out)}.")
         lines += [f"Written: {file}" for file in self.written or ()]
         more = {"left_out": self.left_out, "tables": self.notes or None, "written": self.written}
         document = {**self.document, **{key: value for key, value in more.items() if value is not None}}
@@ -268,7 +269,7 @@ def new(
     key: Key = "",
     time_tolerance: TimeTolerance = None,
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
-    rotation: Annotated[str, Option(help="What rx, ry, rz are: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
+    rotation: Annotated[str, Option(help="Meaning of rx, ry, rz: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
     constants: Annotated[
         str, Option(help="Joints that did not move and have no column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")
@@ -280,7 +281,9 @@ def new(
         Text, Option(help="position, pose, cable, distance, plane, sphere, eye_in_hand, ...; guessed from columns.")
     ] = None,
     validation: Annotated[File, Option(help="A table for validation.")] = None,
-    hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead, 0.25.")] = None,
+    hold_out: Annotated[
+        Number, Option(help="Fraction of the configurations to hold out instead, such as 0.25.")
+    ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
@@ -288,7 +291,7 @@ def new(
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: Json = False,
 ) -> Answer:
-    """Make a problem folder from a table and a robot; every key has a comment, every guess its reason."""
+    """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
         from rpim_opt.basics.files import refused
         from rpim_opt.store.raw import understand_tables
@@ -351,7 +354,9 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     selector: Selector = None,
-    model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.", autocompletion=MODELS)] = None,
+    model: Annotated[
+        Text, Option(help="auto: select model extensions by evidence; geometry: none.", autocompletion=MODELS)
+    ] = None,
     formulation: Formulation = None,
     noise: Noise = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
@@ -359,7 +364,7 @@ def calibrate(
         bool | None,
         Option(
             "--use-validation/--no-use-validation",
-            help="Once validated, calibrate from all rows; by default those that --hold-out drew.",
+            help="After validation, calibrate from all rows; default: if --hold-out drew the validation set.",
         ),
     ] = None,
     limit: Tolerance = None,
@@ -369,7 +374,7 @@ def calibrate(
 ) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if the robot is not delivered or a limit is not kept; 4 where that cannot be decided.
+    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if the test is inconclusive.
     """
     with console.progress() as say:
         from rpim_opt.basics.threads import clock
@@ -394,7 +399,7 @@ def calibrate(
 
             say("calibrating from all rows")
             result = refit_all(result)
-        say("summing up")
+        say("computing the summary")
         found = summary(result, instance.published)
     text = describe(result, found)
     if drop_outliers:
@@ -436,13 +441,13 @@ def validate(
     limit: Largest = None,
     out: Table = None,
 ) -> Answer:
-    """Compare a result with new measurements; rows beyond what the prediction's uncertainty allows are named.
+    """Validate a result on new measurements; rows outside their prediction intervals are named.
 
-    In the table of --out, sigmas is a row's error over its predicted standard deviation, and allowed_sigmas what the
-    largest of all these rows exceeds with probability 0.01.
+    In the table of --out, sigmas is a row's error over its predicted standard deviation; the largest of all rows
+    exceeds allowed_sigmas with probability 0.01.
 
-    Exit code 1 if an error is above the limit, the errors are clearly larger than the nominal robot's (mean difference
-    of their squares above three standard errors), or a mistake in the measurements is likely.
+    Exit code 1 if an error is above the limit, the errors are significantly larger than those of the nominal robot
+    (mean difference of their squares above three standard errors), or an input mistake is likely.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
@@ -463,7 +468,8 @@ def accept(
     limit: Tolerance = None,
     box: Box = None,
     data: Annotated[
-        list[Path] | None, Option(help=f"New measurements that check it, instead of those it has; {Several}")
+        list[Path] | None,
+        Option(help=f"New held-out measurements for the test, instead of those of the result; {Several}"),
     ] = None,
     tables: Tables = TABLES,
 ) -> Answer:
@@ -485,8 +491,10 @@ def accept(
 def iso9283(
     table: Annotated[Path, Argument(help="Repeated approaches: pose, x_mm, y_mm, z_mm; command_x_mm, ...")],
     units: Units = "",
-    limit: Annotated[Number, Option(help="Largest AP_p that is allowed [mm]; exit code 1 above.")] = None,
-    repeatability: Annotated[Number, Option(help="Largest RP_l that is allowed [mm]; exit code 1 above.")] = None,
+    limit: Annotated[Number, Option(help="Largest permitted pose accuracy AP_p [mm]; exit code 1 if exceeded.")] = None,
+    repeatability: Annotated[
+        Number, Option(help="Largest permitted repeatability RP_l [mm]; exit code 1 if exceeded.")
+    ] = None,
     out: Table = None,
 ) -> Answer:
     """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
@@ -517,7 +525,7 @@ def update(
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     out: Folder = None,
 ) -> Answer:
-    """Recalibrate with the previous result as prior: say whether the robot changed, and which parameters did.
+    """Recalibrate with the previous result as prior, and report which parameters changed.
 
     Exit code 1 if nothing explains what the new measurements miss, or the robot is not delivered.
     """
@@ -541,9 +549,9 @@ def monitor(
         list[Path], Argument(help=f"Check readings; a column time, timestamp or date orders them; {Several}")
     ],
     tables: Tables = TABLES,
-    out: Annotated[File, Option(help="The chart over time: .html, or its points as .csv.")] = None,
+    out: Annotated[File, Option(help="Control chart over time as .html, or its points as .csv.")] = None,
 ) -> Answer:
-    """Look for drift in check readings over time, each and together against the interval of a new reading.
+    """Detect drift in check readings over time, by their prediction intervals and a CUSUM chart.
 
     Exit code 1 if the robot drifts.
     """
@@ -561,9 +569,11 @@ def monitor(
 def export(
     result: Result,
     urdf: Annotated[File, Option(help="URDF of the nominal robot; corrected origins go to --out.")] = None,
-    ur_kinematics: Annotated[File, Option(help="kinematics.yaml of ROS for a Universal Robot, likewise.")] = None,
+    ur_kinematics: Annotated[
+        File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")
+    ] = None,
     ur_calibration: Annotated[
-        File, Option(help="calibration.conf copied from a Universal Robot's controller; likewise.")
+        File, Option(help="calibration.conf copied from a Universal Robot's controller; corrected file to --out.")
     ] = None,
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
     mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
@@ -571,15 +581,17 @@ def export(
     corrections: Annotated[
         File, Option(help="CSV file for the joints' transmission errors: subtract from commands.")
     ] = None,
-    out: Annotated[File, Option(help="File to write; of several sources the folder for them.")] = None,
+    out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
-    base: Annotated[bool | None, Option(help="Make the URDF's root the instrument's frame; default: if near.")] = None,
-    tool: Annotated[Choice, Option(help="Make its tip the reflector; by default if it is near.")] = None,
+    base: Annotated[
+        bool | None, Option(help="Make the URDF root the instrument's frame; default: if they nearly coincide.")
+    ] = None,
+    tool: Annotated[Choice, Option(help="Make the URDF tip the reflector; default: if they nearly coincide.")] = None,
     marker: Marker = None,
     despite_verdict: Despite = False,
 ) -> Answer:
-    """Write the identified robot for other tools: all files that are asked for, or none.
+    """Export the identified robot to files of other tools; all requested files are written, or none.
 
     Exit code 1 if the robot is not delivered.
     """
@@ -601,12 +613,12 @@ def compensate(
     units: Units = "",
     position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
     tool: Annotated[
-        Text, Option(help="TCP in the flange frame, x,y,z [mm], roll,pitch,yaw [deg]; else the reflector.")
+        Text, Option(help="TCP in the flange frame, x,y,z [mm], roll,pitch,yaw [deg]; default: the reflector.")
     ] = None,
     marker: Marker = None,
-    base: Annotated[bool, Option("--base", help="Correct for the base, too.")] = False,
+    base: Annotated[bool, Option("--base", help="Correct for deviations of the base as well.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
-    largest: Annotated[float, Option(help="Largest correction of a joint [rad or m].")] = 0.2,
+    largest: Annotated[float, Option(help="Largest permitted correction of a joint [rad or m].")] = 0.2,
     limit: Annotated[Number, Option(help="Largest residual error [mm]; rows above it are marked, exit code 1.")] = None,
     out: Table = None,
     despite_verdict: Despite = False,
@@ -639,7 +651,7 @@ def simulate(
     seed: Annotated[int | None, Option(min=0, help="Seed in place of the file's.")] = None,
     out: Annotated[File, Option(help="Folder for the tables; the problem's own by default.")] = None,
 ) -> Answer:
-    """Make the tables of a simulated problem and the truth they come from."""
+    """Simulate the tables of a problem, and write its true parameters."""
     from rpim_opt.basics.files import refused
     from rpim_opt.store.simulation import write_simulation
 
@@ -654,13 +666,17 @@ def design(
     count: Annotated[int, Option(help="How many configurations to choose.")] = 30,
     criterion: Annotated[str, Option(help="V (predicted positions), D or A.")] = "V",
     candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within limits.")] = 1000,
-    table: Annotated[File, Option(help="A table of candidates instead: q1_deg, ...")] = None,
-    point: Annotated[Text, Option(help="For a robot that touches points: x,y,z [mm] of one in its base frame.")] = None,
+    table: Annotated[File, Option(help="Table of candidates to use instead: q1_deg, ...")] = None,
+    point: Annotated[
+        Text, Option(help="For touch measurements: the point x,y,z [mm] in the robot's base frame.")
+    ] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
-    augment: Annotated[bool, Option("--augment", help="Add to the measured ones, within their joint ranges.")] = False,
+    augment: Annotated[
+        bool, Option("--augment", help="Augment the measured configurations, within their joint ranges.")
+    ] = False,
     out: Table = None,
 ) -> Answer:
-    """Choose the configurations to measure next, from candidates, by optimal design."""
+    """Choose the next configurations to measure by optimal design."""
     with console.progress() as say:
         from rpim_opt.basics.tables import csv_text, read_columns
         from rpim_opt.calibration.diagnosis import measured_ranges
@@ -679,7 +695,7 @@ def design(
             limits = posed.robot.limits
             if augment:
                 limits = measured_ranges(posed)[posed.data.blocks[0].robot].T
-                where = "\nThe candidates lie in the measured joint ranges (others: --table)."
+                where = "\nCandidates are within the measured joint ranges (use --table for others)."
             q = random_candidates(replace(posed.robot, limits=limits), candidates, seed)
         found = choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
     columns = joint_cells(posed.robot, q[found.chosen], found.chosen)
@@ -699,12 +715,12 @@ def study(
     workers: Workers = 1,
     scheduler: Scheduler = None,
     resume: Resume = None,
-    redraw: Annotated[bool, Option("--redraw", help="Only write the report again, from the last replicates.")] = False,
+    redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from the last replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
     as_json: Json = False,
 ) -> Answer:
-    """Run a study: replicates in parallel, with the time that is left; the results say what made them.
+    """Run a study: replicates in parallel, resumable, with provenance in the results.
 
     With --gate exit code 1 if a metric got worse.
     """
@@ -730,12 +746,14 @@ def compare(
     formulations: Annotated[str, Option(help="tikhonov,robust,...; folder: each its own.")] = "tikhonov",
     selector: Annotated[str, Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
-    splits: Annotated[str, Option(help="What is held out: folder, a part (0.25), a number of folds (5).")] = "folder",
-    counts: Annotated[str, Option(help="Numbers of configurations to identify from: 10,25; all without.")] = "",
-    noise: Annotated[str, Option(help="Factors on the noise of the data to fit: 1,3.")] = "1",
+    splits: Annotated[
+        str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds (5).")
+    ] = "folder",
+    counts: Annotated[str, Option(help="Numbers of configurations to identify from: 10,25; default: all.")] = "",
+    noise: Annotated[str, Option(help="Factors on the noise of the identification data: 1,3.")] = "1",
     seeds: Annotated[int, Option(min=1, help="Number of random draws.")] = 1,
     metrics: Annotated[str, Option(help="Metrics, the first one summarized: rms_mm,max_mm,...")] = "",
-    against: Annotated[Text, Option(help="Method that others are compared with: 'tikhonov, reml'.")] = None,
+    against: Annotated[Text, Option(help="Reference method, such as 'tikhonov, reml'.")] = None,
     workers: Workers = 1,
     scheduler: Scheduler = None,
     resume: Resume = None,

@@ -115,7 +115,7 @@ METRICS |= {f"{situation} over best peer": Metric("lower", 0.05) for situation i
 
 
 def prepare(quick: bool) -> None:
-    """Install the peers, each into its own environment; one that is there already is left alone."""
+    """Install the peers, each into its own environment; an existing folder already is left alone."""
     for peer, (requirement, below) in PACKAGES.items():
         install(peer, [requirement], below)
 

@@ -327,7 +327,7 @@ def test_a_row_that_the_prediction_does_not_allow_is_named(monkeypatch, capsys, 
     said = capsys.readouterr().out
     assert "intervals: 8 (" in said
     assert "Largest error: row 8, 0." in said
-    assert "left out: temperature." in said
+    assert "Ignored columns: temperature." in said
 
 
 @pytest.mark.slow
@@ -449,7 +449,7 @@ def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, m
     with out.open() as stream:
         assert [row["status"] for row in csv.DictReader(stream)] == ["ok"] * 9
     assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "0.01", "--out", str(out)) == 1
-    assert "9 of 9 commands miss their target: do not run these rows." in capsys.readouterr().out
+    assert "9 of 9 commands miss their target; do not execute these rows." in capsys.readouterr().out
     with out.open() as stream:
         assert {row["status"] for row in csv.DictReader(stream)} == {"above the limit"}
     assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "100") == 0
@@ -511,7 +511,7 @@ BAD = {
     "another kind": (["validate", *RESULT, "later.csv", "--measurement", "pose"], ["'pose'", "position"]),
     "nothing to export": (["export", *RESULT], ["nothing to write", "--urdf", "--robodk"]),
     "nowhere to export": (["export", *RESULT, "--urdf", "arm.urdf"], ["--out", "arm.urdf"]),
-    "over the original": (["export", *RESULT, "--urdf", "arm.urdf", "--out", "arm.urdf"], ["the original stays"]),
+    "over the original": (["export", *RESULT, "--urdf", "arm.urdf", "--out", "arm.urdf"], ["is not overwritten"]),
     "tip that moves": (
         ["export", *RESULT, "--urdf", "bare.urdf", "--out", "made", "--tool"],
         ["moves link 'link_6'", "a fixed joint"],
@@ -652,5 +652,5 @@ def test_help_states_the_exit_codes(monkeypatch, capsys) -> None:
     assert run(monkeypatch, "--help") == 0
     text = " ".join(capsys.readouterr().out.split())
     assert "0 done; 1 a limit or gate failed" in text
-    assert "2 unusable input; 3 no solution found" in text
+    assert "2 invalid input; 3 no solution found" in text
     assert "--install-completion" in text

@@ -455,7 +455,7 @@ def require_start(start: Array, count: int) -> Array:
 def require_finite(*arrays: Array) -> None:
     """Refuse non-finite residuals or derivatives."""
     if not all(np.isfinite(values).all() for values in arrays):
-        raise InputError("data", "non-finite residuals or derivatives", "measurements and a model that are")
+        raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
 
 
 def _whitened(problem: CalibrationProblem, z: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Constraints of a formulation, and the groups that its penalty may see."""
+"""Constraints of formulations, and groups of parameters for penalties."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ Limits = Callable[[Parameters], tuple[Array, Array]]
 
 @dataclass(frozen=True)
 class Ready:
-    """A function that the package makes: equal in content is equal in meaning, in a cache or in a file.
+    """A function made by the package, which is compared and stored by its maker and arguments.
 
     ``function`` gets what it is called with, and the ``arguments`` of its ``maker``.
     """
@@ -70,7 +70,7 @@ class Ready:
 
 
 def spoken(deviation: float, dimension: str) -> str:
-    """Return a deviation [SI] as a person says it: in mm, mrad, or the parameter's own unit."""
+    """Return a deviation [SI] as text in mm, mrad, or the parameter's own unit."""
     unit, si = display(dimension)
     if dimension == "angle":
         unit, si = "mrad", 1e-3
@@ -98,7 +98,7 @@ class Box:
 
     @property
     def stated(self) -> list[Any] | None:
-        """What a file holds of it; None for limits that a script made."""
+        """Its representation in a file; None for limits computed by a script."""
         return getattr(self.limits, "stated", None)
 
     def bounds(self, parameters: Parameters) -> tuple[Array, Array]:
@@ -186,7 +186,7 @@ def _signed(parameters: Parameters, sign: int, *patterns: str) -> tuple[Array, A
 
 
 def equal(*names: str) -> Constraint:
-    """Keep parameters equal in value, nominal included: two links machined to one length, axes that stay parallel.
+    """Constrain parameters to equal values (nominal plus deviation): equal link lengths, parallel axes.
 
     InputError for names that are not identified, fewer than two, or of different dimensions.
 
@@ -279,7 +279,7 @@ def by_kind(parameters: Parameters) -> list[Array]:
 
 
 def differences(*patterns: str) -> Callable[[Parameters], list[Array]]:
-    """Penalize how much neighbours differ (total variation with ``cp.sum``), and the others themselves.
+    """Penalize differences of neighbouring links (total variation with ``cp.sum``), and other parameters themselves.
 
     For parameters of consecutive joints that share a cause: ``differences("ratio?")``, one scale of all encoders. The
     function that it returns gives rows D_k (1, n), for ``penalty_over`` of a `Formulation`.
@@ -316,7 +316,7 @@ class Place(NamedTuple):
 
 @dataclass(frozen=True)
 class Parsed:
-    """A constraint that `parse` read from a text, at places that it names."""
+    """A constraint parsed from a text by `parse`, with its named places."""
 
     text: str
     demanded: Sentence
@@ -324,7 +324,7 @@ class Parsed:
 
     @property
     def name(self) -> str:
-        """What errors and reports call it."""
+        """Its name in errors and reports."""
         return f"'{self.text}'"
 
     @property
@@ -374,12 +374,12 @@ class Parsed:
         return [value <= limit, -value <= limit]
 
     def price(self, multipliers: Array, parameters: Parameters) -> float:
-        """Return by how much the objective falls for every unit [1 / SI] by which all limits are loosened."""
+        """Return the shadow price: the decrease of the objective per unit of loosening of all limits [1 / SI]."""
         size = self._sums(given(None, parameters))[2]
         return float(np.abs(multipliers) @ (1 / np.tile(size, len(multipliers) // len(size))))
 
     def slack(self, z: Array, parameters: Parameters) -> float:
-        """Return how far z (n,) is from the limit [SI]; of an equality by how much it is missed, negative."""
+        """Return the slack of z (n,) [SI]; for an equality the negative violation."""
         E, f, _ = self._sums(given(None, parameters))
         value = E @ z + f
         if self.demanded.kind == "most":
@@ -387,20 +387,20 @@ class Parsed:
         return self.demanded.limit - float(np.max(np.linalg.norm(value, axis=1)))
 
     def scale(self, parameters: Parameters) -> float:
-        """Return by how much [SI] deviations of the prior scale change what is demanded."""
+        """Return the change [SI] of the constrained quantity for deviations of the prior scale."""
         return float(np.max(self._sums(given(None, parameters))[2]))
 
     def names(self, parameters: Parameters) -> list[str]:
-        """Return the identified parameters that it speaks of."""
+        """Return the identified parameters in the constraint."""
         used = np.any(self._sums(given(None, parameters))[0], axis=(0, 1)).tolist()
         return [name for name, own in zip(parameters.names, used, strict=True) if own]
 
     def require_near(self, parameters: Parameters) -> None:
-        """Refuse a statement that the nominal robot misses by far more than the prior scales."""
+        """Refuse a constraint that the nominal robot violates by far more than the prior scales."""
         missed = -self.slack(np.zeros(len(parameters)), parameters)
         if missed > FAR * self.scale(parameters):
             unit, si = self.unit
-            accepted = "one near it; 'nominal' where the nominal value is meant"
+            accepted = "a value near nominal; 'nominal' refers to the nominal value"
             raise self._wrong(f"a constraint that the nominal parameters violate by {missed / si:.4g} {unit}", accepted)
 
     def _wrong(self, found: str, accepted: str) -> InputError:
@@ -455,7 +455,7 @@ class Parsed:
             if len(dimensions) > 1:
                 raise self._wrong(f"a sum of {' and '.join(dimensions)}", "parameters of one dimension")
             if unit and UNITS[unit].dimension != dimensions[0]:
-                raise self._wrong(f"unit {unit} for what is no {UNITS[unit].dimension}", f"a unit of {dimensions[0]}")
+                raise self._wrong(f"unit {unit} for what is not {UNITS[unit].dimension}", f"a unit of {dimensions[0]}")
             row, constant = np.zeros(len(p)), found.constant
             for name, i, factor in zip(names, index, found.factors, strict=True):
                 if name in p.names:
@@ -470,7 +470,7 @@ class Parsed:
 
 
 def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
-    """Return a constraint in words: values of parameters with units, or how far the robot may move.
+    """Parse a constraint from text: values of parameters with units, or a limit on the robot's movement.
 
     ::
 

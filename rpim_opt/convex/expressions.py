@@ -1,4 +1,4 @@
-"""CVXPY's expressions: its functions by name, checks of what users' functions return, copies, values and slopes."""
+"""CVXPY expressions: functions by name, checks of users' return values, copies, values and gradients."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ OPTIMAL = "optimal"
 
 @dataclass(frozen=True)
 class Atom:
-    """A function of CVXPY by its name, ``cp.sum_squares``: stated before CVXPY is imported."""
+    """A function of CVXPY by its name, ``cp.sum_squares``, usable before CVXPY is imported."""
 
     name: str
 
@@ -55,7 +55,7 @@ ATOMS = (SQUARES, SUM, LARGEST, NORM1, NORM2)
 
 
 def named(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
-    """Return the `Atom` that a function of CVXPY is; any other function as it is."""
+    """Return a function of CVXPY as an `Atom`; any other function unchanged."""
     module = sys.modules.get("cvxpy")
     if module is None:  # then no function of it is in use
         return function
@@ -69,7 +69,7 @@ def named(function: Callable[..., Any] | None) -> Callable[..., Any] | None:
 
 
 def scalar(value: Any, where: str) -> Any:
-    """Return what a loss or penalty returned as a convex scalar expression; InputError for anything else."""
+    """Check that a loss or penalty returned a convex scalar expression, and return it."""
     accepted = "a convex scalar expression of CVXPY"
     if value is None:
         raise InputError(where, "None", f"{accepted}; is a 'return' missing?")
@@ -88,7 +88,7 @@ def scalar(value: Any, where: str) -> Any:
 
 
 def listed(value: Any, where: str) -> list[Any]:
-    """Return what a constraint function returned as a list of CVXPY constraints."""
+    """Check the return value of a constraint function, and return it as a list of CVXPY constraints."""
     made = list(value) if isinstance(value, list | tuple) else [value]
     for constraint in made:
         if isinstance(constraint, bool | np.bool_):
@@ -107,7 +107,7 @@ def _require_numbers(stated: Any, where: str) -> None:
 
 
 def reason(stated: Any) -> str:
-    """Say which part of an expression or constraint breaks CVXPY's rules: the innermost one."""
+    """Return the innermost part of an expression or constraint that violates CVXPY's rules, as text."""
     if isinstance(stated, cp.Constraint):
         broken = [argument for argument in stated.args if not argument.is_dcp()]
         if not broken:
@@ -145,7 +145,7 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
 
 
 def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
-    """Return whether two expressions or constraints are the same but for paired variables, by ``id`` both ways."""
+    """Return whether two expressions or constraints are equal up to a one-to-one renaming of variables, by ``id``."""
     kind = type(one)
     if issubclass(kind, cp.Expression | cp.Constraint):
         if kind is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
@@ -178,7 +178,7 @@ def _numbers(constant: Any) -> list[Array]:
 
 
 class Frozen:
-    """Copies of expressions with the present values of parameters, which later changes do not reach."""
+    """Copies of expressions with the current parameter values, unaffected by later changes."""
 
     def __init__(self, shared: Sequence[cp.Variable], where: str):
         self.own: list[cp.Variable] = []
@@ -190,7 +190,9 @@ class Frozen:
         """Return the copy of an expression or constraint."""
         for parameter in stated.parameters():
             if parameter.value is None:
-                raise InputError(self._where, f"parameter '{parameter.name()}' without a value", "one that has a value")
+                raise InputError(
+                    self._where, f"parameter '{parameter.name()}' without a value", "a parameter with a value"
+                )
             self._instead.setdefault(id(parameter), cp.Constant(parameter.value))
         for variable in stated.variables():
             if id(variable) in self._shared | self._instead.keys():
@@ -215,7 +217,7 @@ def _domain(expression: Any) -> list[Any]:
 
 
 def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
-    """Return what a user's function returns."""
+    """Call a user's function, and turn its errors into an InputError."""
     try:
         return function(*arguments)
     except cp.SolverError as error:  # atoms that call a solver when they are made
@@ -281,7 +283,7 @@ class Term:
 
 
 def term(function: Callable[[Any], Any], size: int, where: str) -> Term:
-    """Return a function of a vector of so many numbers as a term, with the parameters' values of now."""
+    """Return a function of a vector of given length as a term, with the current parameter values."""
     variable = cp.Variable(size)
     expression = Frozen([variable], where)(scalar(function(variable), where))
     return Term(expression, variable)

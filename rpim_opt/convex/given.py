@@ -1,4 +1,4 @@
-"""What a formulation's functions are given: z and the parameters by name, and predicted positions that follow z."""
+"""Arguments of a formulation's functions: deviations by name, and predicted positions affine in z."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from rpim_opt.robot.parameters import Parameters
 
 
 def places(names: Sequence[str], pattern: str, where: str, kind: str = "parameters") -> list[int]:
-    """Return which names match a pattern (``*``, ``?``, ``[...]``), one at least."""
+    """Return the indices of the names that match a pattern (``*``, ``?``, ``[...]``); at least one must."""
     found = [i for i, name in enumerate(names) if fits(name, pattern)]
     if not found:
         raise InputError(where, f"'{pattern}'", f"{kind}: {choices(pattern, names)}")
@@ -26,7 +26,7 @@ def places(names: Sequence[str], pattern: str, where: str, kind: str = "paramete
 
 
 def index_of(names: Sequence[str], key: Any, where: str) -> Any:
-    """Return the place of a name, the places that a pattern matches, or any other index as it is."""
+    """Return the index of a name, the indices that a pattern matches, or any other index unchanged."""
     if not isinstance(key, str):
         return key
     if key in names:
@@ -60,7 +60,7 @@ class Deviations:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Given(Identified):
-    """The identified parameters as a constraint function gets them: with the unknowns z (n,), and what follows them.
+    """The identified parameters as the argument of a constraint function, with z (n,) and quantities affine in it.
 
     Other arguments as for `Parameters`; ``asked`` notes that positions were used, which are linear about some point.
     """
@@ -92,7 +92,7 @@ class Given(Identified):
         return _expression(predicted(problem_of(self), q, marker, torque, self.at), self)
 
     def movements(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
-        """Return by how much the robot's own parameters move the reflector (N, 3) [m]; arguments as for `positions`.
+        """Return the displacement of the reflector (N, 3) [m] by the robot's parameters; arguments as for `positions`.
 
         Linear in z. Deviations of frames (base, reflector) do not count: they say where things stand, not how the
         robot is.
@@ -116,9 +116,9 @@ def whole(p: Given) -> Parameters:
 
 
 def problem_of(p: Given) -> CalibrationProblem:
-    """Return the problem of some parameters, that positions are predicted from; InputError where there is none."""
+    """Return the problem that predicts positions for some parameters; InputError if there is none."""
     if p.problem is None:
-        found = "parameters of no problem"
+        found = "parameters without a problem"
         raise InputError("positions", found, "those that a problem's linear model has (`CalibrationProblem`)")
     p.asked.append("positions")
     return p.problem
@@ -139,7 +139,7 @@ def _expression(found: Predicted, p: Given) -> cp.Expression:
 
 
 def given(z: Any, parameters: Parameters) -> Given:
-    """Return what constraint functions get: parameters, those of a linear model with its problem, that know z (n,).
+    """Return the argument of constraint functions: the parameters with z (n,), and the problem of a linear model.
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("paper_arm").problem.parameters.free

@@ -1,4 +1,4 @@
-"""Quadratic forms: recognized in CVXPY's canonical form; with a squared loss, minimized at any weight by one SVD."""
+"""Quadratic forms recognized in CVXPY's canonical form, and ridge regression at any weight by one SVD."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class Quadratic:
 
     @property
     def size(self) -> float:
-        """Mean of |L e|^2 over the squares that it sums, for e of unit noise."""
+        """Mean of |L e|^2 per squared term, for e of unit noise."""
         rows = self.L**2
         if not self.diagonal:
             rows = np.sum(rows, axis=1)
@@ -66,7 +66,7 @@ def identity(n: int) -> Quadratic:
 
 
 def quadratic(expression: Any, variable: cp.Variable) -> Quadratic | None:
-    """Return the quadratic that an expression of one variable is; None where it is something else.
+    """Return an expression of one variable as a quadratic; None if it is not quadratic.
 
     In CVXPY's canonical form 1/2 x'P x + q'x with A x + s = b it is one where all of s is zero (no inequality, no
     cone) and the equations give the variables that CVXPY added.
@@ -166,17 +166,17 @@ class Ridge:
 
     @property
     def fixed(self) -> int:
-        """Number of directions that the penalty leaves free and the data see."""
+        """Number of identifiable directions that the penalty leaves free."""
         return self.free.shape[1]
 
     @cached_property
     def seen(self) -> np.ndarray:
-        """Which of the p penalized directions the data see."""
+        """Which of the p penalized directions are identifiable."""
         return self.s > 0
 
     @property
     def filters(self) -> tuple[Array, Array, float]:
-        """beta^2 and s^2 of the identifiable directions, and what no weight explains."""
+        """beta^2 and s^2 of the identifiable directions, and the residual sum of squares that no weight can reduce."""
         seen = self.seen
         return self.beta[seen] ** 2, self.s[seen] ** 2, self.perp
 
@@ -205,7 +205,7 @@ class Ridge:
         return (self.B * by) @ self.B.T
 
     def undecided(self, weight: float) -> Array:
-        """Return the directions (n, u) that neither data nor penalty decide."""
+        """Return the directions (n, u) that neither data nor penalty determine."""
         if weight > 0:
             return self.null
         return np.hstack([self.null, self.B[:, ~self.seen]])

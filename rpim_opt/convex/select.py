@@ -1,4 +1,4 @@
-"""Choosing the weight from the identification data alone, with the evidence for the choice: ``ro.select``."""
+"""Selection of the weight from the identification data alone, with evidence: ``ro.select``."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ __all__ = [
 
 
 def compare(program: Program) -> dict[str, Selection]:
-    """Return what every selector chooses that serves a program, by name.
+    """Return the choice of every selector that applies to a program, by name.
 
     Those that hold configurations out are left out where that would take long: without a closed form, or with more
     than 200 configurations.
@@ -74,7 +74,7 @@ LEARNED = "learned"
 
 
 def weight_of(stated: Any) -> Any:
-    """Return a weight, a selector, or what a name stands for; None for "learned".
+    """Return a weight, or a selector by its name; None for "learned".
 
     InputError for a name that no selector has.
     """

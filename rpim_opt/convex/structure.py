@@ -1,4 +1,4 @@
-"""What a formulation's functions return for data of one shape, and the structure by which they are solved."""
+"""Expressions of a formulation for data of one shape, and their structure, which selects the solver."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ def answers(formulation: Formulation, parameters: Parameters, equations: int, gr
 
 
 def declared_form(function: Any, size: int) -> Quadratic | None:
-    """Return the quadratic of so many numbers that one of the package's own functions declares to be."""
+    """Return the quadratic form that one of the package's own functions declares, for a given size."""
     if function == SQUARES:
         return identity(size)
     if isinstance(function, Ready):
@@ -123,7 +123,7 @@ def declared_form(function: Any, size: int) -> Quadratic | None:
 
 
 def declared(formulation: Formulation) -> bool:
-    """Whether the functions declare what they are: quadratic forms of all equations and of z, in boxes."""
+    """Whether the functions declare their structure: quadratic forms of the equations and of z, with boxes."""
     return (
         formulation.ready
         and formulation.loss == SQUARES
@@ -217,7 +217,7 @@ class Structure:
         return made
 
     def like(self, other: Structure) -> bool:
-        """Whether the functions returned the same another time, for data of the same shape."""
+        """Whether another structure has the same expressions, for data of the same shape."""
         same = (self.n, self.equations) == (other.n, other.equations) and np.array_equal(self.groups, other.groups)
         if self._declared or not same:
             return False
@@ -380,7 +380,7 @@ class Structure:
         return self.answers.penalty(z) if form is None else form.value(z)
 
     def seen(self, r: Array) -> Array:
-        """Return what the loss gets of a residual: itself, or the norms of the configurations."""
+        """Return the argument of the loss for a residual: the residual, or the norms of the configurations."""
         return np.sqrt(np.bincount(self.groups, r**2)) if self.over_norms else r
 
     def met(self, z: Array) -> bool:
@@ -467,6 +467,6 @@ def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[F
     where = f"formulation '{formulation.name}'"
     accepted = "a squared loss, or a sum over configurations or equations (robust)"
     if not separable(formulation.loss, formulation.loss_over):
-        raise InputError(where, "a loss that is no sum, with data in blocks", accepted)
+        raise InputError(where, "a loss that is not a sum, with data in blocks", accepted)
     squares = Squares(formulation.loss, formulation.name, formulation.loss_over)
     return replace(formulation, loss=SQUARES, loss_over="equation"), squares

@@ -1,4 +1,4 @@
-"""Statements about parameters, ``d2 + d3 = 850.00 +- 0.05 mm``: parsed token by token, and never evaluated."""
+"""Parser of constraints and known values in text, ``d2 + d3 = 850.00 +- 0.05 mm``; nothing is evaluated as code."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Combination:
 
 
 def sentence(text: str) -> Sentence:
-    """Return the constraint that a text states.
+    """Parse a constraint.
 
     InputError for other words and signs, numbers without a unit, units of different dimensions, and demands that are
     not convex.
@@ -97,7 +97,7 @@ def sentence(text: str) -> Sentence:
 
 
 def combination(text: str) -> Combination:
-    """Return the prior statement of a text: a sum of parameters, its value or deviation, its standard deviation.
+    """Parse a known value: a sum of parameters, its value or deviation, and its standard deviation.
 
     InputError for numbers without a unit, and for a standard deviation that is not above zero.
 
@@ -168,7 +168,7 @@ class _Reader:
         if UNITS[self.unit or "mm"].dimension != "length":
             raise self._wrong(f"a movement in {self.unit}", "a length: 'move at most 5 mm'")
         if not limit > 0:
-            raise self._wrong(f"a movement of {limit:g}", "one above zero; at_nominal keeps parameters")
+            raise self._wrong(f"a movement of {limit:g}", "a positive limit; at_nominal fixes parameters")
         places = tuple(place.strip() for place in (where.strip() or "workspace").split(","))
         return Sentence("move", limit=limit, unit=self.unit, places=places)
 
@@ -179,7 +179,7 @@ class _Reader:
         if patterns:
             raise self._wrong(f"'{patterns[0]}'", "names of single parameters")
         if known.constant or known.nominal:
-            raise self._wrong("a number or nominal before =", "a sum of parameters, its value behind =")
+            raise self._wrong("a number or nominal before =", "a sum of parameters, with its value after =")
         equals = self._next("=")
         stated = self._sum() if equals else Sum(nominal=1)
         spread = self._next("+-")
@@ -198,7 +198,7 @@ class _Reader:
         sd = self._constant(wide)
         if not sd >= SMALLEST:
             found = f"a standard deviation of {sd / unit.si:g} {self.unit}"
-            raise self._wrong(found, "one above zero; [constraints] fixes parameters")
+            raise self._wrong(found, "a positive standard deviation; [constraints] fixes parameters")
         if stated.nominal:
             return Combination(known.names, known.factors, None, stated.constant, sd, unit.dimension)
         return Combination(known.names, known.factors, stated.constant, 0.0, sd, unit.dimension)
@@ -232,7 +232,7 @@ class _Reader:
                 raise self._wrong("a constraint that is not convex", "an absolute value or norm <= a number")
             limit = self._constant(large[0])
             if not limit > 0:
-                raise self._wrong(f"a limit of {limit:g}", "one above zero; '=' where nothing may differ")
+                raise self._wrong(f"a limit of {limit:g}", "a positive limit; '=' for equality")
             kind = "within" if opening == "|" and len(sums) == 1 else "norm"
         else:
             if len(set(relations)) > 1 or len(relations) > (1 if "=" in relations else 2):
@@ -273,7 +273,7 @@ class _Reader:
         while sign := self._next("+", "-"):
             found = found.plus(self._item(sign))
         if found.nominal not in (0, -1 if found.names else 1):
-            raise self._wrong("nominal where it means nothing", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
+            raise self._wrong("nominal without a meaning here", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
         return found
 
     def _item(self, sign: str) -> Sum:

@@ -1,4 +1,4 @@
-"""Robust losses as squares: of the configurations that they trust, and of all rows, some at a time (blocks)."""
+"""Robust losses as weighted squares: of the configurations that they keep, and of all rows in blocks."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ def outlying(norms: Array, count: np.ndarray) -> Array:
 
 @dataclass(frozen=True)
 class Trusted:
-    """The equations that a robust loss trusts, times the root of ``factor``; a `Reweigh` for blocks."""
+    """The equations that a robust loss keeps, times the square root of ``factor``; a `Reweigh` for blocks."""
 
     noise: float
     configurations: int
     factor: float
 
     def keeps(self, model: LinearModel, z: Array) -> np.ndarray:
-        """Return which equations (m,) are trusted at z (n,)."""
+        """Return which equations (m,) are kept at z (n,)."""
         which, count = model.members
         norms = model.norms(model.A @ z - model.b)
         return (norms <= limits(self.noise, self.configurations, count))[which]
@@ -83,7 +83,7 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
 
 
 def trusted(formulation: Formulation, norms: Array, count: np.ndarray, loss: Term | None = None) -> Trusted:
-    """Return what a robust formulation trusts of configurations with whitened norms (N,) and ``count`` equations.
+    """Return what a robust loss keeps, from whitened norms (N,) of configurations with ``count`` equations.
 
     Its factor is the median of loss'(v) / (2 v) over what it keeps, v the norms, or of a loss over equations norm /
     sqrt(count), each equation's share, so that storage does not matter. ``loss`` is that of one posed program.
@@ -177,7 +177,7 @@ class Squares:
 
 
 def separable(loss: Callable[[Any], Any], over: str = "configuration") -> bool:
-    """Return whether a loss of several norms is the sum of what it is of each; of residuals, for either sign too."""
+    """Return whether a loss of several norms or residuals is a sum over them; of residuals also an even function."""
     v = np.geomspace(1e-3, 1e3, 7)
     try:
         several, one = term(loss, len(v), "loss"), term(loss, 1, "loss")

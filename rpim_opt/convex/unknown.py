@@ -1,4 +1,4 @@
-"""The unknowns of a formulation as a variable of CVXPY whose entries have names; importing it imports CVXPY."""
+"""The unknowns of a formulation as a CVXPY variable with named entries; importing it imports CVXPY."""
 
 from __future__ import annotations
 

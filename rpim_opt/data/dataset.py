@@ -24,7 +24,7 @@ ROW_FIELDS = ("q", "y", "torque", "payload", "approach", "point", "session")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Block(Brief):
-    """Rows of a dataset that one function evaluates: one measurement model, the same reflectors and fixture.
+    """Rows of a dataset with one measurement model and the same reflectors and fixture.
 
     ``q`` (N, p, dof) are the controller's joint values [rad or m] at the p points of a row, ``y`` (N, c) the measured
     values [SI] in the order of the measurement's columns, ``covariance`` (N, k, k) that of the residual's components
@@ -138,13 +138,13 @@ class Dataset(Tabled):
 
     @property
     def robot(self) -> tuple[str, ...]:
-        """Whose rows they are, N names; ``""`` for the only robot."""
+        """Name of every row's robot (N,); ``""`` for a single robot."""
         names = {row: block.robot for block in self.blocks for row in block.row}
         return tuple(names[row] for row in range(len(self)))
 
     @property
     def sessions(self) -> tuple[str, ...]:
-        """The sessions in which they were measured, sorted; unnamed ones are not among them."""
+        """The names of the sessions, sorted, without unnamed ones."""
         return tuple(sorted({str(name) for block in self.blocks for name in block.session_names} - {""}))
 
     @property
@@ -184,7 +184,7 @@ class Dataset(Tabled):
 
     @classmethod
     def concatenated(cls, parts: Sequence[Dataset], names: Sequence[str], robots: Sequence[str] = ()) -> Dataset:
-        """Return the rows of several datasets, each with configurations of its own; names precede double labels."""
+        """Return the rows of several datasets, with separate configurations; names are prefixed to duplicate labels."""
         rows = np.cumsum([0, *(len(part) for part in parts)])
         first = np.cumsum([0, *(int(part.configuration.max()) + 1 for part in parts)])
         blocks = tuple(
@@ -212,7 +212,7 @@ class Dataset(Tabled):
         return Dataset(blocks, tuple(self.label[i] for i in index), self.configuration[index])
 
     def grouped_by_points(self) -> Dataset:
-        """Return measurements in which rows that one unknown point ties together have one number of configuration.
+        """Return the measurements with one configuration number for all rows that share an unknown point.
 
         Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
         configuration: a fold of a cross-validation has all of them or none.
@@ -238,7 +238,7 @@ class Dataset(Tabled):
         return self.take([i for i, label in enumerate(self.label) if label not in labels])
 
     def configurations(self, count: int, seed: int) -> Dataset:
-        """Return the rows of so many configurations drawn at random; the same seed gives the same rows."""
+        """Return the rows of a random sample of configurations; the same seed gives the same rows."""
         known = np.unique(self.configuration)
         if not 0 < count <= len(known):
             raise InputError("count", f"{count}", f"1 to {len(known)} configurations")
@@ -355,7 +355,7 @@ class Dataset(Tabled):
 
 
 def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | None:
-    """Return the names (N,) of the rows' sessions, None where there are none; refuse two that differ in signs alone."""
+    """Return the names (N,) of the rows' sessions, or None; refuse names that differ in punctuation alone."""
     if not len(names):
         return None
     found = np.array([str(name) for name in names], dtype=object)
@@ -380,7 +380,7 @@ def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:
 
 
 def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:
-    """Return the rows in groups of whole configurations, at least one each, and ``most`` rows unless one has more."""
+    """Return the rows in groups of whole configurations, of at most ``most`` rows unless one configuration has more."""
     order = np.argsort(data.configuration, kind="stable")
     ends = np.concatenate([[0], np.flatnonzero(np.diff(data.configuration[order])) + 1, [len(order)]])
     cuts = [0]

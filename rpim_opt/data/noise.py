@@ -1,4 +1,4 @@
-"""How uncertain measured values are: what a row states of itself, else what is declared for all, or a data sheet."""
+"""Covariances of measured values: stated by row, declared for all rows, or from a data sheet."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class LaserTracker:
 
 
 def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any]:
-    """Return what holds where a table states no uncertainty: standard deviations [SI], perhaps a ``tracker``."""
+    """Return the declared noise for rows without a stated one: standard deviations [SI], or a ``tracker``."""
     declared: dict[str, Any] = {}
     plain = dict(noise)
     stated = plain.pop("tracker", None)

@@ -1,4 +1,4 @@
-"""Where measurements come from, what is demanded of the robot, and rows that were judged before they were used."""
+"""Record of a calibration: origin of the data, requirement on the robot, and validation before a final fit."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CONFIDENCE = 0.95
 
 @dataclass(frozen=True)
 class Requirement:
-    """A limit on how far the robot may miss, and the region where it has to be kept.
+    """A tolerance on the position error, and the region where it applies.
 
     The ``limit`` is that of the distance between the position that is reached and the one that the model says [m], kept
     with probability ``confidence`` at every configuration of the region: the nominal reflector in a ``box``, sides
@@ -59,7 +59,7 @@ class Requirement:
 
     @property
     def where(self) -> str:
-        """The region in words."""
+        """The region as text."""
         box = ""
         if self.box is not None:
             sides = [f"{axis} {1e3 * a:g} to {1e3 * b:g}" for axis, (a, b) in zip("xyz", self.box, strict=True)]
@@ -72,7 +72,7 @@ class Requirement:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Errors on rows that a calibration did not see, kept when these rows are used in their turn.
+    """Errors on held-out rows, kept when a final fit uses these rows.
 
     They validate the procedure; the parameters that are delivered come from all rows.
 
@@ -96,16 +96,16 @@ class HeldOut:
     coverage: float | None = None
 
     def sentence(self, rows: int) -> str:
-        """Say what validated, and what the parameters come from: so many rows."""
+        """Return a sentence on the validation, and the rows that the parameters are identified from."""
         missed = f"{1e3 * np.nanmean(self.error):.4f} mm"
         return (
-            f"Validated on {len(self.label)} held-out rows: parameters from the {self.used} others missed "
-            f"them by {missed}. The parameters given here are from all {rows}."
+            f"Validated on {len(self.label)} held-out rows: with parameters from the {self.used} others their "
+            f"mean error is {missed}. The delivered parameters are from all {rows}."
         )
 
 
 class Earlier(NamedTuple):
-    """The calibration that another one carries on, and how.
+    """The earlier calibration that served as the prior.
 
     Its title, when it was made, the digest of its file and its number of rows; the least and the largest value of every
     joint that it measured [rad or m], by robot; the factor on its standard deviations; parameters that were let go, and

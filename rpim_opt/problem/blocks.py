@@ -92,8 +92,8 @@ class PartitionedProblem(RobotModel):
 
     @property
     def data(self) -> NoReturn:
-        """Raises InputError: the measurements do not stand together anywhere."""
-        raise InputError("problem.data", "data in blocks", "problem.rows(), one problem a part")
+        """Raises InputError: the measurements are never in memory together."""
+        raise InputError("problem.data", "data in blocks", "problem.rows(), one problem per block")
 
     @property
     def keeps_rows(self) -> bool:
@@ -101,7 +101,7 @@ class PartitionedProblem(RobotModel):
         return False
 
     def sample(self) -> CalibrationProblem:
-        """Return the first block: rows enough to place frames by."""
+        """Return the first block, which suffices to locate frames."""
         return self._first
 
     @cached_property
@@ -113,7 +113,7 @@ class PartitionedProblem(RobotModel):
         return self.sample().on(data)
 
     def without(self, labels: Collection[str]) -> PartitionedProblem:
-        """Return the same problem without the rows of these labels, wherever they stand."""
+        """Return the same problem without the rows of these labels, in any block."""
         return replace(self, dropped=self.dropped | frozenset(labels))
 
     def rows(self) -> Iterator[CalibrationProblem]:
@@ -162,7 +162,7 @@ class PartitionedProblem(RobotModel):
         return np.concatenate(norms), np.concatenate(equations)
 
     def configuration_errors(self, x: Array) -> tuple[Array, np.ndarray]:
-        """Return the same of every configuration, (C,) and (C,); its rows stand in one block."""
+        """Return the same for every configuration, (C,) and (C,); its rows are in one block."""
         norms, equations = zip(*self._everywhere(methodcaller("configuration_errors", x)), strict=True)
         return np.concatenate(norms), np.concatenate(equations)
 
@@ -216,7 +216,7 @@ def _read(parameters: Parameters, dropped: frozenset[str], part: tuple[int, Part
     strange = [name for name in data.sessions if session_prefix(name) not in known]
     if known and strange:
         accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
-        raise InputError("session", f"'{strange[0]}' in part {number}", accepted)
+        raise InputError("session", f"'{strange[0]}' in block {number}", accepted)
     return data
 
 

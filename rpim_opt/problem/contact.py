@@ -1,4 +1,4 @@
-"""Unmeasured points and planes that were touched, eliminated from the equations."""
+"""Elimination of unmeasured touched points and planes from the equations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Moved(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Thing:
-    """A point or a plane that fits the positions p_i (K, 3) of its touches best.
+    """The point or plane of best fit to the positions p_i (K, 3) of its touches.
 
     A touch of a point shows where it is, p_i; of a plane how far it is along the normal n, s_i = n'(p_i - centre), its
     first coordinate here, while two others are zero. Without the thing K touches say of the robot alone what is left of
@@ -49,7 +49,7 @@ class Thing:
 
     @classmethod
     def of(cls, positions: Array, planar: bool) -> Thing:
-        """Return what is nearest to touches at (K, 3) [m]."""
+        """Return the best-fitting point or plane of touches at (K, 3) [m]."""
         centre = positions.mean(axis=0)
         one = np.ones((len(positions), 1))
         if not planar:
@@ -65,12 +65,12 @@ class Thing:
 
     @property
     def planar(self) -> bool:
-        """Whether it is a plane."""
+        """Whether this is a plane."""
         return len(self.shown) == 1
 
     @property
     def level(self) -> Thing:
-        """The thing with its touches on it, and parallel planes parallel: what the nominal robot is off is no noise."""
+        """The point or plane with its touches on it, and parallel planes made parallel: nominal errors are no noise."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
     @cached_property
@@ -132,7 +132,7 @@ Things = Sequence[Thing]
 
 
 class Tie(NamedTuple):
-    """What a drawing knows of two touched things: its equations (e,), of which kind, its value, and which two."""
+    """A known relation of two touched points or planes: its equations (e,), kind, value, and the two."""
 
     equations: np.ndarray
     kind: str
@@ -142,7 +142,7 @@ class Tie(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Touches:
-    """Which equations touch which point or plane, and how these are eliminated.
+    """Assignment of equations to touched points and planes, and their elimination.
 
     Touches at p_i have the equations c - p_i ~ 0 with an unknown point c, or n'(p_i - c) ~ 0 with a plane.
     Their best values follow from the touches (`Thing`), and what the equations say of the robot alone are contrasts,

@@ -1,4 +1,4 @@
-"""What configurations can tell, and which to measure: observability, and optimal design by convex relaxation."""
+"""Observability of the parameters, and optimal design of experiments by convex relaxation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Design(Brief):
         count = f"{len(self.chosen)} of {len(self.weights)} configurations"
         what = f"{count}, {self.criterion}-optimal ({names[self.criterion]})"
         if self.gap > 1:
-            return f"{what}: too few for a useful bound on how near the best set is; choose more."
+            return f"{what}: too few for a useful optimality bound; choose more."
         return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
 
 
@@ -103,7 +103,7 @@ def choose(
     progress: Callable[[str], None] = lambda text: None,
     measured: Dataset | None = None,
 ) -> Design:
-    """Choose the configurations that tell most about the identified parameters.
+    """Choose the configurations that are most informative about the identified parameters.
 
     With rows A_i of the whitened, scaled Jacobian at nominal and the prior of the scales, the information of a set is
     M = 1 + sum A_i' A_i. Relaxed to weights 0 <= w_i <= 1 with sum w_i = count, each criterion is convex::
@@ -151,7 +151,7 @@ def choose(
         # L L' = 1 + sum of A_i' A_i over those rows, M = L (1 + sum B_i' B_i) L' for B = A L'^-1: ln det but for a
         # constant, and tr M^-1 C = tr (1 + ...)^-1 (L^-1 C L'^-1)
         if measured.blocks[0].measurement.touching:
-            raise InputError("measured", "touches of points", "measurements of a row at a time")
+            raise InputError("measured", "touches of points", "a measurement type with independent rows")
         known = problem.on(measured).linearize(np.zeros(len(problem.parameters.free))).A
         L = np.linalg.cholesky(np.eye(n) + known.T @ known)
         A = np.asarray(np.linalg.solve(L, A.reshape(-1, n).T).T.reshape(A.shape), dtype=float)
@@ -293,7 +293,7 @@ class Observability(Brief):
 
     @property
     def weak(self) -> int:
-        """Number of identifiable combinations that the data tell less precisely than the prior."""
+        """Number of identifiable combinations that the data determine less precisely than the prior."""
         return int(np.count_nonzero(self.singular_values[: self.rank] < 1))
 
     def _short(self) -> str:
@@ -333,7 +333,7 @@ class Observability(Brief):
 
 
 def observe(problem: Source) -> Observability:
-    """Return how well the data of a problem, in memory or in blocks, show its identified parameters.
+    """Return the observability of a problem's identified parameters, with data in memory or in blocks.
 
     It is linearized at nominal, where redundancies are exact. Measured values do not matter, configurations, scales
     and covariance do.

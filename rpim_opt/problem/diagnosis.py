@@ -1,4 +1,4 @@
-"""Diagnosis of a problem's data before anything is calibrated: ranges, suspicious rows, observability."""
+"""Input check before calibration: ranges, suspicious rows, observability."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ MOST_EQUATIONS = 3000
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Inspection(Tabled):
-    """What `inspect` found.
+    """Result of `inspect`.
 
     Parameters
     ----------
@@ -165,7 +165,7 @@ class Inspection(Tabled):
             lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
         if self.standing_out:
             named = listed([f"{label} ({self._mm[label]:.2f} mm)" for label in self.standing_out], 10)
-            lines.append(f"Nominal error stands out: {named}.")
+            lines.append(f"Exceptionally large nominal error: {named}.")
         notes = self._notes()
         parts = [
             table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
@@ -221,7 +221,7 @@ class Inspection(Tabled):
 
 
 def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> Inspection:
-    """Look at a problem's data: ranges, coverage, repeated rows, likely mistakes, what can be identified.
+    """Check a problem's data: ranges, coverage, repeated rows, likely input mistakes, identifiability.
 
     Mistakes are units, signs, zeros, orders and couplings of joints, rows that are shifted, exchanged or have no value,
     left-handed frames, another robot, an instrument that moved: another reading of the data that leaves less than a
@@ -342,7 +342,7 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which rows have zero or the same number for every measured coordinate: what an instrument writes for none."""
+    """Report rows with zeros or one number for all measured coordinates, which instruments write for missing values."""
     data = problem.data
     for block in data.blocks:
         if len(block.measurement.columns) < 3:
@@ -352,7 +352,7 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
         for value in np.unique(y[same, 0]):
             labels = [data.label[i] for i in block.row[same & (y[:, 0] == value)]]
             what = f"{_rows(labels, 'has', 'have')} {value:g} for every measured coordinate"
-            yield f"{what}: no measurement? Leave out what is none ([exclude])."
+            yield f"{what}: missing measurements? Exclude such rows ([exclude])."
         arm = problem.arms[block.robot]
         sliding = [i for i, dimension in enumerate(arm.joint_dimensions) if dimension == "length"]
         reach = float(np.abs(arm.mdh[:, [1, 3]]).sum() + np.ptp(block.q[..., sliding], axis=(0, 1)).sum())
@@ -373,7 +373,7 @@ def _rows(labels: list[str], of_one: str, of_several: str) -> str:
 
 
 def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
-    """Say which rows of the validation set are copies of identification rows."""
+    """Report rows of the validation set that are copies of identification rows."""
 
     def rows(of: Dataset) -> list[tuple[bytes, str]]:
         return [
@@ -391,12 +391,12 @@ def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
     if copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
-            f"{listed(copies)}. Its error is too optimistic: separate the sets (rpim-opt new --hold-out)."
+            f"{listed(copies)}. The validation error is too optimistic: separate the sets (rpim-opt new --hold-out)."
         )
 
 
 def copied_rows(data: Dataset) -> Iterator[str]:
-    """Say that rows are copies of others, joint and measured values alike: they do not count as measurements."""
+    """Report rows that duplicate others in joint and measured values, and so are not measurements."""
     for block in data.blocks:
         if not block.measurement.columns or len(block.row) < FEWEST:
             continue
@@ -406,13 +406,13 @@ def copied_rows(data: Dataset) -> Iterator[str]:
         if copies >= COPIES * len(rows):
             named = listed([data.label[block.row[i]] for i in np.sort(first[count > 1])], 3)
             yield (
-                f"{copies} of {len(rows)} rows repeat others to the last digit (first {named}): copies are no "
-                "measurements, and make uncertainties too small; leave them out."
+                f"{copies} of {len(rows)} rows repeat others to the last digit (first {named}): copies are not "
+                "measurements and make uncertainties too small; remove them."
             )
 
 
 def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which coordinates, not all, are exact functions of the nominal robot: they were computed, not measured.
+    """Report coordinates that are exact functions of the nominal robot: computed, not measured.
 
     A coordinate of a point in any frame, of any reflector, is linear in position and rotation of the nominal flange.
     """
@@ -429,7 +429,7 @@ def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:
-    """Say that excluded rows follow each other, where the others' labels are in the order of their numbers."""
+    """Report excluded rows that are consecutive, if the labels are in numerical order."""
     numbers = {label: [int(part) for part in re.findall(r"\d+", label)] for label in (*labels, *left_out)}
     ordered = sorted(numbers, key=lambda label: numbers[label])
     if [label for label in ordered if label not in left_out] != list(labels):
@@ -442,8 +442,9 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
         share = (len(at) - len(run)) / max(len(ordered) - len(run), 1)
         if len(at) * (1 - (1 - share) ** 2) ** (len(run) - 1) < CHANCE_RUNS:
             yield (
-                f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers, and follow each other: did "
-                "the instrument or the robot's foot move there? Calibrate the parts apart, or register the second anew."
+                f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers, and follow each other: "
+                "did the instrument or the robot's base move there? Calibrate the two parts separately, or "
+                "register the second one again."
             )
 
 
@@ -451,7 +452,7 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
 
 
 def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which rows fit the joint values, or the reflector, of another row."""
+    """Report rows that fit the joint values, or the reflector, of another row."""
     points = points_of(problem)
     if points is None:
         return
@@ -480,7 +481,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
-    """Say whether joint or measured values are rounded so that this explains the RMS error [m] of a fit."""
+    """Report rounding of joint or measured values that explains the RMS error [m] of a fit."""
     found: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
     for block in problem.data.blocks:
         if len(block.y) < FEWEST:  # lengths of a drawing are round
@@ -493,7 +494,7 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
         exact = (unit for unit in units if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < 1e-6)
         unit = next(exact, np.zeros(values.shape))
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
-        remedy = "export more decimals, or state that as their noise"
+        remedy = "export more decimals, or state the rounding as their noise"
         found.append((f"measured values are rounded to {unit.max(initial=0.0):g} mm", made, remedy))
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
@@ -516,7 +517,7 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
 
 
 def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
-    """Say that the RMS error [m] of a fit is nearly that of positions of which nothing is known."""
+    """Report an RMS error [m] of a fit that is nearly the spread of the positions."""
     points = points_of(problem)
     if points is None:
         return
@@ -524,13 +525,13 @@ def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
     if error > UNRELATED * spread:
         yield (
             f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, their "
-            f"spread is {three_digits(1e3 * spread)} mm): do the rows of the two belong together? Join them by a "
-            "column that both have, or by time."
+            f"spread is {three_digits(1e3 * spread)} mm): do the rows of the two tables match? Join them by a "
+            "common column, or by time."
         )
 
 
 def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which columns of joint and measured values are frozen, alike, flat or without their signs.
+    """Report columns of joint and measured values that are frozen, identical, flat or without signs.
 
     Asked of data that nothing else explains: a robot may be measured so.
     """
@@ -574,7 +575,7 @@ def decimals_of(values: Array) -> int | None:
 
 
 def moved_far(problem: CalibrationProblem) -> Iterator[str]:
-    """Say from which row on points fit another base: an instrument that was moved by more than a robot's errors."""
+    """Report the row from which on points fit another base or reflector: an instrument that was moved."""
     points = points_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
@@ -590,19 +591,19 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
         # the second part's points by the other base
         there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
         far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
-        other, what = "base", "the instrument or the robot's foot moved"
+        other, what = "base", "the instrument or the robot's base moved"
         reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
         if reflectors > far:
             other, what, far = "reflector", "the reflector was exchanged", reflectors
         yield (
             f"from row {problem.data.label[points.row[place]]} on the points fit another {other}, "
-            f"{three_digits(1e3 * far)} mm away: {what}; calibrate "
-            "the two parts apart, or register the second one anew."
+            f"{three_digits(1e3 * far)} mm away: {what}; calibrate the two parts separately, or register the "
+            "second one again."
         )
 
 
 def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which rows are of another reflector that no column names: rows fall into groups in the flange frame."""
+    """Report rows of another, unnamed reflector, from groups of points in the flange frame."""
     points = points_of(problem)
     if points is None or len(points.row) < 4 * FEWEST or len(points.tools) > 1 or points.turns is not None:
         return
@@ -637,7 +638,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def part_way(problem: CalibrationProblem) -> Iterator[str]:
-    """Say from which row on, roughly, the table is to be read in another way; the rows before fit as they stand."""
+    """Report the approximate row from which on another interpretation of the table fits."""
     points = points_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
@@ -692,7 +693,7 @@ def _added(model: LinearModel, x: Array, columns: Sequence[Array]) -> tuple[int,
 
 
 def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say whether the residuals at x (n,) are those of a gear ratio, a coupling of joints, or of the instrument.
+    """Report residuals at x (n,) due to a gear ratio, a coupling of joints, or the scale or zero of the instrument.
 
     One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, or that
     of the scale or offset of distances, of positions by the base's place along them and along their directions.
@@ -745,7 +746,7 @@ def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Say from which row on the residuals at x (n,) show a base, fixture, reflector or joint's zero that moved.
+    """Report the row from which on residuals at x (n,) show a moved base, fixture, reflector or joint zero.
 
     Its columns for the rows from there on are added to the linearization (`_added`).
     """
@@ -777,12 +778,12 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         after = equations.length & (equations.row >= place)
         change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * coefficients)
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
-        causes = {"base": "did the instrument or the robot's foot move", "reflector": "was the reflector exchanged"}
-        causes |= dict.fromkeys(fixtures, "did it, or the robot's foot, move")
+        causes = {"base": "did the instrument or the robot's base move", "reflector": "was the reflector exchanged"}
+        causes |= dict.fromkeys(fixtures, "did it, or the robot's base, move")
         yield (
             f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
             f"them, and fit a {what} that moved (that leaves {100 * rest:.0f} % of the residuals): "
-            f"{causes.get(what, 'did the joint slip, or was it mastered anew')}? Calibrate the two parts apart."
+            f"{causes.get(what, 'did the joint slip, or was it remastered')}? Calibrate the two parts separately."
         )
 
 
@@ -790,7 +791,7 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 
 
 def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
-    """Yield what the touches of a problem show, and what they do not; nothing where there are none."""
+    """Yield sentences on what touches identify and what they do not; none without touches."""
     touches = problem.touches
     if touches is None:
         return
@@ -804,6 +805,6 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
     )
     if all(tie.kind != "known_distance" for tie in touches.ties):
         yield (
-            "The size of the robot rests on its nominal lengths: a known distance between two touched places "
+            "The size of the robot rests on its nominal lengths: a known distance between two touched points "
             "([[known_distance]]) would determine it."
         )

@@ -86,7 +86,7 @@ class LinearModel(Brief):
 
     @property
     def rank(self) -> int:
-        """Number of directions in the parameters that the data see."""
+        """Number of identifiable directions of the parameters."""
         return int(np.count_nonzero(self.svd[1]))
 
     def with_values(self, b: Array) -> LinearModel:

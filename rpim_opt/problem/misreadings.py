@@ -1,4 +1,4 @@
-"""Likely misreadings of a table (units, orders, couplings, conventions, another robot), by how well they fit."""
+"""Likely misinterpretations of a table (units, orders, couplings, conventions, another robot), ranked by fit."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def placed(robot: Robot, points: Points, zeros: bool = False) -> Fit:
 
 
 def misfit(robot: Robot, points: Points) -> float:
-    """Return the error over the extent of the points, the RMS of the best three quarters; robot nominal."""
+    """Return the RMS error of the best three quarters of the points over their extent, for the nominal robot."""
     return float(misfits(robot, [points], zeros=False)[0])
 
 
@@ -123,7 +123,7 @@ DEGREES_PER_MM = np.radians(1) / 1e-3
 
 
 class Reading(NamedTuple):
-    """Another reading: what was mistaken, what to write, the points as they are then, and readings that fit as well.
+    """Another interpretation: the mistake, the remedy, the resulting points, and equally good interpretations.
 
     ``robot`` is another nominal robot, on which joint zeros are not fitted.
     """
@@ -136,7 +136,7 @@ class Reading(NamedTuple):
 
 
 class Better(NamedTuple):
-    """The best other reading: what and the remedies in words, and the errors [m] of both."""
+    """The best other interpretation: mistake and remedies as text, and the errors [m] with and without it."""
 
     what: str
     remedy: str
@@ -150,10 +150,10 @@ class Better(NamedTuple):
 
     @property
     def sentence(self) -> str:
-        """Say it with the figures."""
+        """Return it as a sentence with both errors."""
         alike = ""
         if ", or " in self.what:
-            alike = " These explain the data equally well: apply the one that the set-up confirms."
+            alike = " These explain the data equally well: apply the one that matches the set-up."
         figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
         times = three_digits(self.factor)
         return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"
@@ -220,7 +220,7 @@ def signs(joint_map: Array) -> Array:
 
 
 def coupling(joint_map: Array) -> str:
-    """Return what makes a joint map (m, dof)."""
+    """Return the description and remedy of a joint map (m, dof)."""
     stated = signs(joint_map)[:, None] * joint_map + 0.0
     rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in stated)
     return f"write coupling = [{rows}] in robot.toml"
@@ -353,7 +353,7 @@ def _other_robots(robot: Robot) -> Iterator[Reading]:
 
 
 def lost_row(problem: CalibrationProblem) -> Better | None:
-    """Return from which row on the measured values stand beside a neighbour's joint values, or None; rows in order."""
+    """Return the row from which on measured values are shifted by one row against the joint values, or None."""
     points = points_of(problem, len(problem.data))
     if points is None or points.seen or len(points.row) < LEAST_ROWS:
         return None
@@ -390,7 +390,7 @@ def lost_row(problem: CalibrationProblem) -> Better | None:
 
 
 def better_reading(problem: CalibrationProblem) -> Better | None:
-    """Return the reading that fits far better than what is written, or None.
+    """Return the interpretation that fits far better than the table as written, or None.
 
     Single mistakes are tried first, then a second and a third one behind the best of them; where the drawing cannot be
     right, all orders of up to six joints, and the ready robots. Base and reflectors are fitted anew for every reading.

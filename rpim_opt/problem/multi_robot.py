@@ -34,7 +34,7 @@ FAR = 3.0
 def together(
     *problems: CalibrationProblem, shared: Sequence[str] | Mapping[str, Sequence[str]], **named: CalibrationProblem
 ) -> CalibrationProblem:
-    """Return several problems as one: two arms and one tracker, one robot in two campaigns, one tool on two robots.
+    """Combine problems: two arms and one tracker, one robot in two campaigns, one tool on two robots.
 
     A problem like any other: `calibrate` takes it with any formulation and selector, or learns its sizes, one for each
     kind of parameter of all robots, and one scatter. Parameters are called ``name.parameter``, ``left.a2``, but those
@@ -146,7 +146,7 @@ def _concatenated(tables: Sequence[Parameters]) -> Parameters:
 
 
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
-    """Return the problem that identifies the sessions of its data, too, as those that are identified already.
+    """Return the problem with the sessions of its data identified, in the same way as the present ones.
 
     Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
     session is identified, or all are. Rows that name no session are of one more.
@@ -187,7 +187,7 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
 
 
 def require_affordable(problem: Source) -> None:
-    """Refuse sessions by the hundred: six parameters each, and the cost grows with the cube of the parameters."""
+    """Refuse hundreds of sessions: six parameters each, at a cost that grows with the cube of their number."""
     names = problem.parameters.free.names
     sessions = {frame_of(name) for name in names if of_session(name)}
     if len(names) > MOST_PARAMETERS and sessions:
@@ -195,5 +195,6 @@ def require_affordable(problem: Source) -> None:
         raise InputError(
             "session",
             f"{len(sessions)} of them and {len(names):,} parameters, which would take about {minutes:.0f} minutes",
-            f"{MOST_PARAMETERS:,} parameters: one name for sessions of one set-up, or `identify` without session_*",
+            f"{MOST_PARAMETERS:,} parameters: one name for sessions of the same set-up, or `identify` without "
+            "session_*",
         )

@@ -1,4 +1,4 @@
-"""The robot's repeatability beside the instrument's noise, and the equations of a configuration that share it."""
+"""Repeatability of the robot in addition to measurement noise, shared by all equations of a configuration."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from rpim_opt.data.dataset import Dataset
 
 @dataclass(frozen=True, eq=False)
 class Scatter:
-    """The repeatability of a robot: by how much it misses where its model sends it.
+    """Repeatability of a robot: the scatter of positions, orientations and joints about its model.
 
     The covariance of all that was measured in one configuration is::
 

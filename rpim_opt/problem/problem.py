@@ -58,7 +58,7 @@ SHIFTED = ("base_x", "base_y", "base_z")
 
 @dataclass(frozen=True, eq=False, repr=False)
 class RobotModel(Tabled):
-    """The nominal robots, the parameters of their model and their repeatability: what all measurements share."""
+    """The nominal robots, their parameters and repeatability, common to measurements in memory and in blocks."""
 
     robots: Robot | Mapping[str, Robot]
     parameters: Parameters
@@ -117,7 +117,7 @@ class RobotModel(Tabled):
         return replace(self, scatter=scatter)
 
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> Self:
-        """Return the same problem on an arm that moves by the terms of a model, too, beside those that it has.
+        """Return the same problem with the terms of a model added to the arm.
 
         ``identify`` are patterns of the terms' parameters that are identified besides what is; all of them by default.
         What reads blocks has to read the columns that terms see. InputError for a name that the problem has, a pattern
@@ -151,7 +151,7 @@ class RobotModel(Tabled):
         return bare.with_model(Model([transmission(curve) for curve in curves]))
 
     def frozen(self) -> Self:
-        """Return a copy that asks every measurement once, now, and keeps the answer.
+        """Return a copy that evaluates every measurement model once, now, and keeps the result.
 
         A measurement of a script may read a variable, an attribute, a file: `residual` and its like ask it anew at
         every call. Within a calibration one answer has to serve from the first iteration to the last.
@@ -357,7 +357,7 @@ class CalibrationProblem(RobotModel):
         return self._evaluated(block, what, x)[0][:, 0]
 
     def modelled(self, x: Array) -> list[Array]:
-        """Return what the instrument would read at the deviations x (n,) [SI], block by block, (N, c) [SI]."""
+        """Return the modelled values at the deviations x (n,) [SI], block by block, (N, c) [SI]."""
         return [self._values(block, "modelled", x) for block in self.data.blocks]
 
     def residual(self, x: Array) -> Array:
@@ -495,7 +495,7 @@ class CalibrationProblem(RobotModel):
 
     @cached_property
     def touched(self) -> Things:
-        """Where the nominal robot puts the points and planes that were touched, in its base frame."""
+        """Touched points and planes in the base frame, located by the nominal robot."""
         if self.touches is None:
             return ()
         return [thing.level for thing in self.touches.located(self._nominal_residual)]
@@ -505,7 +505,7 @@ class CalibrationProblem(RobotModel):
         return self._uncentred(np.zeros(len(self.parameters.free)))
 
     def contrasts(self, values: Array) -> Array:
-        """Return what values of the rows' equations (m, c) say without the points that were touched, (k, c).
+        """Return values (m, c) of the equations with the touched points eliminated, (k, c).
 
         They are what `linearize` whitens, in its order; the values themselves where no row touches a point.
         """
@@ -656,7 +656,7 @@ def _times(L: Array, values: Array, scale: float | Array = 1.0) -> Array:
 
 
 def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
-    """Return Hayati's parameters that a robot needs: ``beta{i}`` where the axes of joints i and i+1 are near parallel.
+    """Return the Hayati parameters that a robot needs: ``beta{i}`` if the axes of joints i and i+1 are near parallel.
 
     Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
     tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far

@@ -1,4 +1,4 @@
-"""CasADi functions of a measured row, and the loads on the joints that they depend on."""
+"""CasADi functions of a measured row, and the joint loads that they depend on."""
 
 from __future__ import annotations
 
@@ -231,7 +231,7 @@ class Loads(NamedTuple):
 
 
 def needed(robot: Robot, parameters: Parameters) -> Dependencies:
-    """Return what a robot's parameters that are identified, or not zero, need to know of a row."""
+    """Return the inputs of a row that a robot's identified or nonzero parameters depend on."""
     used = parameters.identified | (parameters.nominal != 0)
     names = {parameters.names[i] for i in np.flatnonzero(used)}
     of_arms = [name for name in names if of_term(name)]
@@ -243,12 +243,12 @@ def needed(robot: Robot, parameters: Parameters) -> Dependencies:
 
 
 def measured_torques(data: Dataset, robot: str = "") -> bool:
-    """Return whether data of a robot state torques: then those of gravity stand for none of them."""
+    """Return whether a robot's data have torques, which then replace those of gravity in all rows."""
     return any(block.torque is not None for block in data.blocks if block.robot == robot)
 
 
 def loads_of(robot: Robot, needs: Dependencies, data: Dataset, block: Block) -> Loads:
-    """Return what the rows of a block of some data state, and what they need of gravity."""
+    """Return the joint loads stated in the rows of a block, and those to compute from gravity."""
     weighs = needs.torques and not measured_torques(data, block.robot)
     return Loads(
         torques=block.torque is not None,
@@ -261,7 +261,7 @@ def loads_of(robot: Robot, needs: Dependencies, data: Dataset, block: Block) -> 
 
 
 def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool) -> Loads:
-    """Return what commands state that are to be compensated: torques, or a payload where those of gravity count."""
+    """Return the loads of commands to be compensated: torques, or a payload if torques are from gravity."""
     needs = needed(robot, parameters)
     if needs.columns:
         accepted = "a calibration without it: its value at the corrected commands is unknown"
@@ -276,7 +276,7 @@ def loads_in(robot: Robot, block: Block) -> list[Array]:
     found = [block.q @ robot.joint_map.T]
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
         if robot.dof < len(robot.mdh):
-            raise InputError("joint torques", "those of a robot with mimic joints", "a table without them")
+            raise InputError("joint torques", "those of a robot with mimic joints", "a table without torques")
         found.append(block.torque @ np.linalg.inv(robot.joint_map))
     if block.payload is not None:
         found.append(block.payload)

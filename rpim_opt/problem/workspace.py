@@ -1,4 +1,4 @@
-"""Positions of the reflector at configurations, and configurations at which it is somewhere or in sight."""
+"""Positions of the reflector at configurations, and configurations that reach a position or see a target."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def predicted(
 def moved(
     problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, at: Array | None = None
 ) -> Predicted:
-    """Return by how much the robot's own parameters move a reflector, frames where they are; arguments as before."""
+    """Return the displacement of a reflector by the robot's parameters with frames fixed; arguments as before."""
     own = ~problem.parameters.free.of_frames
     found = predicted(problem, q, marker, torque, None if at is None else at * own)
     nominal = _there(problem, q, marker, torque).modelled(np.zeros(len(own)))[0]
@@ -90,7 +90,7 @@ def _in_box(problem: CalibrationProblem, box: tuple[tuple[float, float], ...], m
 
 
 def within(problem: CalibrationProblem, box: Array | None = None, marker: str | None = None) -> Array:
-    """Return configurations (N, dof) that stand for all joint ranges, or those with the nominal reflector in a box.
+    """Return configurations (N, dof) that represent all joint ranges, or those with the nominal reflector in a box.
 
     Its corners are (3, 2) [m] in the base frame.
     """
@@ -100,7 +100,7 @@ def within(problem: CalibrationProblem, box: Array | None = None, marker: str | 
 
 
 def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | None) -> Array:
-    """Return some of `within`, and those of all that move farthest: bounds at some would be kept there alone."""
+    """Return some of `within` and those of largest displacement, so that bounds hold in the whole region."""
     q = within(problem, box)
     if farthest is None or len(q) <= 2 * SOME:
         return q[: 2 * SOME]
@@ -169,12 +169,12 @@ def postures_at(
     q, beyond = target.reached(len(points), np.random.default_rng(seed), share)
     if beyond is not None:
         point = ", ".join(f"{1e3 * v:g}" for v in points[beyond])
-        raise InputError("the point", f"({point}) mm, out of reach", "one that the tool can be at")
+        raise InputError("the point", f"({point}) mm, out of reach", "a point within reach of the tool")
     return q
 
 
 class Target(NamedTuple):
-    """What is to vanish at joint values: e (M, k) [m] of ``away`` at (M, dof) joint values of rows (M,).
+    """Equations of inverse kinematics: e (M, k) [m] of ``away`` at joint values (M, dof) of rows (M,).
 
     Newton's steps of least norm, in units u of the joints' ranges and ``within`` (dof, 2), lead there::
 
@@ -322,4 +322,6 @@ def postures_in_sight(
         if len(found) >= count:
             return found[:count]
     found_text = f"{len(found)} of {count} views in which the board is in sight"
-    raise InputError("postures_in_sight", found_text, "frames, a share and an image with which it is more often")
+    raise InputError(
+        "postures_in_sight", found_text, "frames, a share and an image with which it is visible more often"
+    )

@@ -1,4 +1,4 @@
-"""What a person looks at."""
+"""Presentation: figures, pages, and terminal output."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""The command line's terminal: what its options mean, what it prints, and how it ends."""
+"""Terminal input and output of the command line: parsing of options, printing, errors and exit codes."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def _print(text: str | dict[str, Any], stream: TextIO) -> None:
 
 @contextmanager
 def arriving() -> Iterator[None]:
-    """End quietly when the output's reader is gone, and with a sentence for other errors of the system."""
+    """Exit quietly if the output pipe is closed, and with a sentence for other errors of the operating system."""
     try:
         yield
     except BrokenPipeError:
@@ -89,7 +89,7 @@ def progress() -> Iterator[Callable[[str], None]]:
 
 
 def written_to(path: Path | None, text: str) -> list[Path]:
-    """Write a text where a path is given, and return the paths written."""
+    """Write a text if a path is given, and return the paths written."""
     from rpim_opt.basics.files import refused, write_text
 
     if path is None:
@@ -137,7 +137,7 @@ def carried(text: str | None) -> tuple[float | None, list[float] | None]:
 
 
 def required(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
-    """Return the requirement of ``--limit`` [mm] and ``--box``, which replace what the problem or result states."""
+    """Return the requirement of ``--limit`` [mm] and ``--box``, which override those of the problem or result."""
     from rpim_opt.data.record import Requirement
 
     require_positive("--limit", limit)
@@ -157,7 +157,7 @@ def required(limit: float | None, box: str | None, stated: Requirement | None) -
 
 
 def table_options(units: str, columns: str = "", **stated: Any) -> TableOptions:
-    """Return what the options of a command state of its raw tables."""
+    """Return the table options of a command."""
     from rpim_opt.basics.layout import TableOptions
     from rpim_opt.basics.units import parse_units
 

@@ -1,4 +1,4 @@
-"""HTML pages that work offline: blocks, tables and figures, and the page of checks over time."""
+"""Self-contained HTML pages: blocks, tables and figures, and the page of checks over time."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ STYLE = {
 
 
 def figure(draw: Callable[..., Any], title: str, caption: str = "", height: float = HEIGHT) -> Figure:
-    """Return a figure of what ``draw`` draws on matplotlib axes ``ax``; the title stands for it where none is shown.
+    """Return a figure drawn by ``draw`` on matplotlib axes ``ax``; the title is its alternative text.
 
     The page's policy allows no style attributes: they become attributes of their own. The page's colours stand in the
     place of the light ones, and marks have their ``hints`` as tooltips. A unit of the SVG is a pixel.
@@ -105,7 +105,7 @@ def figure(draw: Callable[..., Any], title: str, caption: str = "", height: floa
 
 
 def coded(text: str) -> Markup:
-    """Return a text with what stands between backticks as code."""
+    """Return a text with backticks converted to code elements."""
     parts = [Markup("<code>{}</code>" if i % 2 else "{}").format(part) for i, part in enumerate(text.split("`"))]
     return Markup("").join(parts)
 
@@ -123,7 +123,7 @@ def _environment() -> Environment:
 def render(
     title: str, kind: str, heading: str, top: Iterable[Block], sections: Iterable[tuple[str, Iterable[Block]]],
 ) -> str:  # fmt: skip
-    """Return a page as HTML: all texts are escaped, its own style alone counts, no script runs, nothing is loaded.
+    """Return a page as HTML, with escaped texts and inline style, without scripts or external resources.
 
     Pictures may stand in the page as data.
     """
@@ -155,9 +155,11 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     verdict, *details = str(found).splitlines()
     heading = title or "Checks"
     charts = [
-        figure(partial(plot.checks, found), "Residual of every check and its limit", "Each check on its own."),
+        figure(partial(plot.checks, found), "Residual of every check and its limit", "Individual checks."),
         figure(
-            partial(plot.cumulative_sum, found), "Cumulative sum of the checks and its limit", "All together (CUSUM)."
+            partial(plot.cumulative_sum, found),
+            "Cumulative sum of the checks and its limit",
+            "Cumulative sum of the checks (CUSUM).",
         ),
     ]
     sections: list[tuple[str, list[Block]]] = [
@@ -173,7 +175,7 @@ def _checks(found: Monitoring) -> Table:
     """Return every check; values beyond their limits are marked."""
     sigmas = [f"{value:.1f}" for value in found.sigmas]
     for i in found.beyond:
-        sigmas[i] = f"beyond {sigmas[i]}"
+        sigmas[i] = f"above {sigmas[i]}"
     sums = [f"{value:.1f}" for value in found.sums]
     if found.alarm is not None:
         sums[found.alarm] = f"alarm {sums[found.alarm]}"

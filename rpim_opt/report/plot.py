@@ -129,7 +129,7 @@ def _lengths(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list
 
 
 def parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
-    """Draw the deviations of the robot's own parameters of a dimension with their intervals and tolerances.
+    """Draw the deviations of the robot's parameters of a dimension with their intervals and tolerances.
 
     The dimension is ``length`` [mm], ``angle`` [deg], ``ratio`` [ppm] or ``compliance`` [mrad/Nm]. Intervals exist
     where the formulation has a covariance.
@@ -244,7 +244,9 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
             style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
             (dot,) = ax.plot([x], [y], color=f"C{k}", label=label, **style)
             dot.hints = [label]
-    ax.set(xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior scales]")
+    ax.set(
+        xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior standard deviations]"
+    )
     _logarithmic(ax, "x")
     _logarithmic(ax, "y")
     return _with_legend(ax)
@@ -313,7 +315,7 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
     >>> ax = ro.plot.picard(result)
     >>> [text.get_text() for text in ax.get_legend().get_texts()]
-    ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'root of the weight']
+    ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'square root of the weight']
     """
     ax = _axes(ax)
     if isinstance(of, Calibration):
@@ -330,10 +332,10 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     every = np.concatenate([s[k], data, [1.0]])
     if weight > 0:
         level = float(np.sqrt(weight))
-        ax.axhline(level, color=COLORS["mark"], ls="--", label="root of the weight")
+        ax.axhline(level, color=COLORS["mark"], ls="--", label="square root of the weight")
         every = np.append(every, level)
     low, high = max(float(every.min()), FAINT), max(float(every.max()), float(solution.max(initial=0.0)))
-    ax.set(xlabel="singular direction", ylabel="size, whitened and scaled [1]", ylim=(0.7 * low, 1.4 * high))
+    ax.set(xlabel="singular direction", ylabel="magnitude, whitened and scaled [1]", ylim=(0.7 * low, 1.4 * high))
     _logarithmic(ax, "y")
     return _with_legend(ax)
 

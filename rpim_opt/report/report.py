@@ -1,4 +1,4 @@
-"""The calibration report: what each section of its page contains, in the order in which it is signed."""
+"""The calibration report: the content of its sections, in their order."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
 
 @dataclass(frozen=True)
 class Content:
-    """A result, and what several sections judge of it."""
+    """A result, with evaluations that several sections share."""
 
     result: Calibration
     accepted: Acceptance | None
@@ -116,14 +116,16 @@ def _headline(content: Content) -> Iterator[Block]:
     if found is not None:
         text = f"limit {1e3 * found.requirement.limit:g} mm"
         if found.bound is not None and np.isfinite(found.bound):
-            text = f"expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
+            text = (
+                f"maximum expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
+            )
         text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
         yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
     elif summary.inconclusive(result, content.map):
         text = summary.inconclusive(result, content.map).partition(": ")[2]
         yield "verdict", {"kind": "undecided", "word": VERDICTS["undecided"], "text": text}
     elif result.verdict.delivered:
-        text = "the fit gives no reason against using this robot; no limit to accept it by is stated."
+        text = "the fit gives no reason against using this robot; no acceptance limit is stated."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
     yield "notes", [*result.verdict.reasons, *result.verdict.beside(result.causes)]
@@ -208,7 +210,7 @@ def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
 
 def _error_figure(result: Calibration, name: str, data: Dataset) -> Figure:
     title = "Error of every row before and after calibration"
-    return figure(partial(plot.errors, result, data), title, f"Every {name} row.")
+    return figure(partial(plot.errors, result, data), title, f"All {name} rows.")
 
 
 def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
@@ -290,7 +292,7 @@ def _parameters(content: Content) -> Iterator[Block]:
     for dimension in ("length", "angle"):
         if dimension in own:
             draw = partial(plot.parameters, result, dimension)
-            title, caption = f"Deviations of the {dimension} parameters", f"The robot's own {dimension} parameters."
+            title, caption = f"Deviations of the {dimension} parameters", f"The robot's {dimension} parameters."
             drawn.append(figure(draw, title, caption, 80.0 + 17 * np.count_nonzero(own == dimension)))
     yield "beside", [("table", Table("Identified parameters", head, rows)), ("figures", drawn)]
     yield from _transmission(result)
@@ -301,7 +303,13 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     if not curves:
         return
     yield "heading", "Transmission errors of the joints"
-    yield "text", ["A joint turns further than its value by this error. Beyond the measured range it is not known."]
+    yield (
+        "text",
+        [
+            "The actual joint angle is the encoder value plus this error. Outside the measured range the error is"
+            " unknown."
+        ],
+    )
     yield "table", Table("Within the measured range", *curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
@@ -354,14 +362,14 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
     text = f"{found.configurations} configurations. {summary.identifiability(result)}"
     redundant = [f"{combination(each)}" for each in found.redundant]
     if result.record.earlier:
-        text += " The others are known from the calibrations that are this one's prior."
+        text += " The other parameters are known from the earlier calibrations that serve as prior."
         redundant = []
     elif found.rank < len(found.names):
         if found.unidentifiable:
-            text += f" No measurement depends on {', '.join(found.unidentifiable)}."
+            text += f" Unidentifiable (no measurement depends on them): {', '.join(found.unidentifiable)}."
         text += (
-            " At the nominal parameters no measurement changes along the following combinations [mm, mrad]: the "
-            "penalty decides there, and predictions do not depend on it."
+            " Redundant combinations [mm, mrad], which change no measurement at the nominal parameters; the "
+            "penalty determines them, and predictions do not depend on them."
         )
     yield "text", [text]
     yield "bullets", redundant
@@ -378,16 +386,16 @@ def _flagged(result: Calibration) -> Block:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{kept}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
     if not rows:
-        return "text", ["No row is flagged (one good data set in a hundred has one), and none is excluded."]
+        return "text", ["No row is flagged or excluded (one in a hundred good data sets has a flagged row)."]
     head = ["row", "standardized residual", "error [mm]", "status"]
-    return "table", Table("The worst first", head, rows, prose=True)
+    return "table", Table("Largest first", head, rows, prose=True)
 
 
 def _convergence(result: Calibration) -> Iterator[Block]:
     try:
         c = result.certificate
         text = (
-            f"Certificate, computed anew at the solution: next step of the convex program {c.step:.1e}, constraint "
+            f"Certificate at the solution: next step of the convex program {c.step:.1e}, constraint "
             f"violation {c.violation:.1e} (in prior scales)."
         )
     except RpimError as error:
@@ -410,7 +418,7 @@ def _provenance(content: Content) -> Iterator[Block]:
         "facts",
         [
             ("Source", record.source or "not stated"),
-            ("Measurements", "simulated" if record.simulated else "as the source says; not marked as simulated"),
+            ("Measurements", "simulated" if record.simulated else "as stated in the source; not marked as simulated"),
             ("Robot", "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items())),
             ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
             ("Made", record.made),
@@ -430,13 +438,13 @@ def _provenance(content: Content) -> Iterator[Block]:
     if record.earlier:
         earlier = [[each.title, each.made, str(each.rows), _changes(each), each.digest] for each in record.earlier]
         head = ["calibration", "made", "rows", "changed since", "digest"]
-        yield "table", Table("Earlier calibrations that are the prior", head, earlier, prose=True)
+        yield "table", Table("Earlier calibrations used as prior", head, earlier, prose=True)
     yield "text", ["All figures on this page were computed from the calibration's measurements and parameters."]
     yield "facts", [(who, f"{'_' * 30} date {'_' * 12}") for who in ("Calibrated by", "Approved by")]
 
 
 def _changes(each: Earlier) -> str:
-    changes = ", ".join(each.let_go) or "nothing that the measurements identify"
+    changes = ", ".join(each.let_go) or "no identifiable combination"
     if each.inflate != 1:
         changes += f"; standard deviations times {each.inflate:g}"
     return changes
@@ -459,7 +467,7 @@ def _formulation(result: Calibration) -> str:
             long = [isinstance(each, list | tuple) and len(each) > FEW_NUMBERS for each in part]
             texts = [f"{len(each)} rows" if cut else str(each) for each, cut in zip(part, long, strict=True)]
             return f"{texts[0]}({', '.join(texts[1:])})"
-        return part or "a function of a script, not in the file"
+        return part or "a function of a script, not stored in the file"
 
     parts = definition(result.formulation)
     over = "" if parts["penalty_over"] == "none" else f" over {term(parts['penalty_over'])}"
@@ -486,7 +494,9 @@ def _noise(block: Rows) -> str:
 WHY = {"learned": "maximum of the marginal likelihood"}
 """Reasons of choices that have no note; others were given."""
 L_CURVE_HEIGHT = 430.0
-PICARD = "Picard's condition at the solution: the penalty damps directions below the line; data near 1 are noise."
+PICARD = (
+    "Picard condition at the solution: the penalty damps directions below the line; data coefficients near 1 are noise."
+)
 
 
 def _regularization(content: Content) -> Iterator[Block]:
@@ -501,14 +511,17 @@ def _regularization(content: Content) -> Iterator[Block]:
 
 
 def _weight(result: Calibration) -> Iterator[Block]:
-    """Yield the L-curve, and the choice of every rule with the mean error that it leads to."""
+    """Yield the L-curve, and the choice of every rule with the resulting mean error."""
     given = Selection(result.weight, "given", np.array([]), np.array([]), True)
     chosen = {**compare(result.program), result.selector: result.selection or given}
     chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))
     marked = {rule: choice for rule, choice in chosen.items() if choice.weight > 0}
     draw = partial(plot.l_curve, result, marked)
     title = "L-curve: residual norm against norm of the deviations"
-    caption = "Every point is the solution at one weight: small weights above left, large ones below right."
+    caption = (
+        "Each point is the solution at one weight, from small weights at the upper left to large ones at "
+        "the lower right."
+    )
     yield "figures", [figure(draw, title, caption, L_CURVE_HEIGHT)]
     name, data = next(iter(summary.sets(result).items()))
     problem = result.problem.on(data)
@@ -522,7 +535,7 @@ def _weight(result: Calibration) -> Iterator[Block]:
                 mean = mm(1e3 * float(np.nanmean(errors)))
         own = f"{rule} (chosen)" if rule == result.selector else rule
         rows.append([own, f"{choice.weight:.3g}", mean, choice.note or WHY.get(rule, "given")])
-    title = "Weights that the selection rules choose from the identification data alone"
+    title = "Weights chosen by the selection rules from the identification data alone"
     yield "table", Table(title, ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True)
 
 

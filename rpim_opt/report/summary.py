@@ -1,4 +1,4 @@
-"""A calibration in figures and sentences, once for the terminal, for JSON and for the report."""
+"""Summary of a calibration in numbers and sentences, shared by the terminal, JSON and the report."""
 
 from __future__ import annotations
 
@@ -32,14 +32,14 @@ ANYWHERE = Requirement(limit=1.0)
 
 
 def mm(value: float) -> str:
-    """Return a length in mm with the digits that matter."""
+    """Return a length in mm with its significant digits."""
     if value < 10:
         return f"{value:.3f}"
     return f"{value:.2f}" if value < 100 else f"{value:.0f}"
 
 
 def sets(result: Calibration) -> dict[str, Dataset]:
-    """Return the data by name: validation first, as far as there are such data."""
+    """Return the data sets by name, validation first if present."""
     data = {"identification": result.problem.data}
     if result.record.validation is None:
         return data
@@ -80,7 +80,7 @@ def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
 
 
 def signed_errors(result: Calibration, data: Dataset) -> tuple[str, dict[str, Array]]:
-    """Return what errors along axes are, and these (N, 3) [mm] before and after calibration."""
+    """Return the definition of errors along axes, and these (N, 3) [mm] before and after calibration."""
     what = "Measured minus modelled along the axes of the instrument"
     if any(block.measurement.touching for block in data.blocks):  # there is no instrument
         what = "Mean of the point minus touch along the axes of the robot's base"
@@ -143,14 +143,14 @@ def workspace_sentence(found: Workspace) -> str:
 
 
 def inconclusive(result: Calibration, found: Workspace | None) -> str:
-    """Say that the position reached is less certain than the nominal robot's error; empty where it is not."""
+    """Return a warning if U exceeds the error of the nominal robot; otherwise an empty text."""
     nominal = rms(headline_errors(result)[1])
     if found is None or not _of_positions(result) or not found.typical > nominal:
         return ""
     return (
-        f"Inconclusive: the median U over the region, {mm(1e3 * found.typical)} mm, is above the nominal robot's error "
-        f"of {mm(1e3 * nominal)} mm RMS on the {headline_errors(result)[0]} rows. Measure "
-        "more configurations (rpim-opt design --augment), the wrist turned further, or state what is known of the "
+        f"Inconclusive: the median U over the region, {mm(1e3 * found.typical)} mm, is above the error of the "
+        f"nominal robot, {mm(1e3 * nominal)} mm RMS on the {headline_errors(result)[0]} rows. Measure more "
+        "configurations (rpim-opt design --augment), with larger wrist rotations, or state what is known of the "
         'reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
 
@@ -168,7 +168,7 @@ def acceptance(result: Calibration) -> Acceptance | None:
 
 
 def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
-    """Return the name of the rows that the headline is about, and their errors (N,) [m], nominal and identified."""
+    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified."""
     held = result.record.held_out
     if held is not None:
         return "held out", held.nominal, held.error
@@ -182,7 +182,7 @@ def _of_positions(result: Calibration) -> bool:
 
 
 def headline(result: Calibration) -> str:
-    """Return by how much the errors fall, on data that were not used for identification where there are some."""
+    """Return a sentence on the error reduction, on data not used for identification if there are any."""
     name, nominal, identified = headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     n = after["count"]
@@ -191,7 +191,7 @@ def headline(result: Calibration) -> str:
     where = {
         "validation": f"On {n} validation measurements, not used for identification,",
         "held out": f"On {n} measurements that were held out",
-        "identification": f"On the {n} identification measurements themselves (there are no validation data)",
+        "identification": f"On the {n} identification measurements (no validation data)",
     }[name]
     what = "position error" if _of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
@@ -205,28 +205,28 @@ def headline(result: Calibration) -> str:
     held = result.record.held_out
     if held is not None:
         sentence += (
-            f" That validates the procedure, with parameters from {held.used} rows; those delivered here come from "
-            f"all {len(result.problem.labels)}."
+            f" This validates the procedure with parameters from {held.used} rows; the delivered parameters are "
+            f"from all {len(result.problem.labels)}."
         )
     if result.record.earlier:
         last = result.record.earlier[-1]
-        changed = joined(last.let_go) if last.let_go else "nothing that these measurements identify"
-        sentence += f" The prior is a calibration of {last.rows} rows; changed since: {changed}."
+        changed = joined(last.let_go) if last.let_go else "no identifiable combination"
+        sentence += f" The prior is a calibration of {last.rows} rows; changed since then: {changed}."
     return sentence
 
 
 def identifiability(result: Calibration) -> str:
-    """Return how many combinations of the parameters the data identify, coefficients of curves apart."""
+    """Return a sentence on the number of identifiable parameter combinations, without coefficients of curves."""
     model = result.program.model
     parameters = ~result.problem.parameters.free.of_curves
     s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
     text = f"{np.sum(s > RANK_TOLERANCE * s[0])} of {parameters.sum()} parameter combinations are identifiable"
-    apart = "" if parameters.all() else ", apart from the transmission errors of the joints"
+    apart = "" if parameters.all() else ", without the transmission errors of the joints"
     return f"{text} from {model.equations} equations{apart}."
 
 
 def warnings(result: Calibration) -> list[str]:
-    """Return what a reader must know besides the figures, the worst first."""
+    """Return the warnings, the most serious first."""
     lines = [line for line in words.remarks(result) if line != result.message]
     excluded = result.record.excluded
     if excluded:
@@ -237,9 +237,9 @@ def warnings(result: Calibration) -> list[str]:
         known = {q.tobytes() for q in result.problem.data.q}
         repeated = sum(q.tobytes() in known for q in validation.q)
         if repeated:
-            lines.append(f"{repeated} validation rows repeat identification configurations: they validate nothing.")
+            lines.append(f"{repeated} validation rows repeat identification configurations and validate nothing.")
     elif result.record.held_out is None:
-        lines.append("Without validation data the accuracy elsewhere in the workspace is not verified.")
+        lines.append("Without validation data, the accuracy at other configurations is not verified.")
     lines += words.contact_remarks(result.problem.sample())
     lines += words.camera_remarks(result)
     if result.record.simulated:
@@ -248,7 +248,7 @@ def warnings(result: Calibration) -> list[str]:
 
 
 def nominal_note(result: Calibration) -> str:
-    """Return what the nominal errors are of."""
+    """Return a note that defines the nominal errors."""
     fitted = result.problem.parameters.placed & result.problem.parameters.identified
     if fitted.any():
         return "Nominal: the nominal robot, with its base, tool and other frames fitted to the identification data."

@@ -1,4 +1,4 @@
-"""Any serial chain as modified DH with Hayati's beta, and identified parameters back on the chain's own frames."""
+"""Conversion of serial chains to modified DH with Hayati's beta, and of identified parameters back to their frames."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SAME_PLACE = (0.01, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """A robot as a file describes it: what the file calls the tip is at base @ MDH chain(q) @ tool.
+    """A robot from a file; the tip of the file is at base @ MDH chain(q) @ tool.
 
     Examples
     --------
@@ -71,7 +71,7 @@ def same_place(one: Array, other: Array) -> bool:
 
 
 def placed(place: Array) -> str:
-    """Say a frame (6,)."""
+    """Return a frame (6,) as text."""
     values = [*(1e3 * place[:3]), *np.degrees(place[3:])]
     return " ".join(f"{name} {value:z.3f}" for name, value in zip(FRAME, values, strict=True)) + " mm, deg"
 
@@ -79,7 +79,7 @@ def placed(place: Array) -> str:
 def describe(
     chain: Chain, near: Array | None = None, parallel: float = NEAR_PARALLEL
 ) -> tuple[Array, Array, Array, Array]:
-    """Return the MDH table (n, 5), base (4, 4), tool (4, 4), and what ties the chain's frames to the table's.
+    """Return the MDH table (n, 5), base (4, 4), tool (4, 4), and the transforms from the chain's frames to the table's.
 
     Joint i+1 is reached from joint i by Rot(z, theta_i) Trans(z, d_i) Rot(y, beta_i) Rot(x, alpha_i+1)
     Trans(x, a_i+1): six numbers for a line have one degree of freedom to spare. Where the axes cross at more than
@@ -116,7 +116,7 @@ def describe(
 
 
 def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Array], Array]:
-    """Return the origins and tail that give other MDH parameters, base and tool on the frames of `describe`.
+    """Return the origins and tail of the chain for other MDH parameters, base and tool, by the frames of `describe`.
 
     With the MDH frame i before Rot(y, beta_i) times G_i as the frame of joint i::
 
@@ -133,7 +133,7 @@ def corrected(G: Array, table: Array, base: Array, tool: Array) -> tuple[list[Ar
 def require_same_arm(
     robot: Robot, table: Array, joint_types: tuple[str, ...], file: Path, joint_map: Array | None = None
 ) -> None:
-    """Refuse a robot that is not one identified from a file's MDH table (n, 5): other joints or numbers."""
+    """Refuse a robot whose joints or nominal parameters differ from a file's MDH table (n, 5)."""
     joint_map = np.eye(len(joint_types)) if joint_map is None else joint_map
     if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, joint_map):
         found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == joint_types else "")
@@ -234,7 +234,7 @@ def reach(table: Array, *frames: Array) -> float:
 
 
 def origin_numbers(T: Array, old: Array, size: float) -> tuple[str | None, str | None]:
-    """Return an origin's new xyz and rpy as texts that read back exactly; None for what is as it was."""
+    """Return an origin's new xyz and rpy as texts that read back exactly; None for unchanged ones."""
     six = frame_numbers(T) + 0.0  # no negative zeros
     texts = [" ".join(repr(float(v)) for v in part) for part in (six[:3], six[3:])]
     moved = np.abs(T[:3, 3] - old[:3, 3]).max() > ROUNDING * size
@@ -254,7 +254,7 @@ class Origin(NamedTuple):
 
 
 class Carried(NamedTuple):
-    """The origins that stand behind a row (from 1) of a robot's table, in their order."""
+    """The origins after a row (from 1) of a robot's table, in order."""
 
     row: int
     origins: tuple[Origin, ...]
@@ -262,7 +262,7 @@ class Carried(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Displaced(Term):
-    """The term of `displaced`, with what it is made of."""
+    """The term of `displaced`, with its origins."""
 
     carried: Carried = field(default_factory=lambda: Carried(1, ()))
     ready = True
@@ -276,7 +276,7 @@ class Displaced(Term):
 
 
 def displaced(carried: Carried) -> Displaced:
-    """Return the term of the origins behind a row of the table: all of them displace what follows, one by one.
+    """Return the term of the origins after a row of the table, which displace the following frames in order.
 
     With F the parent link's frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed
     up by F D^-1 F^-1; D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx) is zero's identity.

@@ -1,4 +1,4 @@
-"""Model extensions: gravity on the joints, and which parameters beyond the table a robot has, with their scales."""
+"""Model extensions: torques of gravity, and a robot's non-geometric parameters with their scales."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SAME = 1e-2
 
 
 class Statics(Weight):
-    """What gravity does to an arm of nominal geometry in one configuration, each quantity built at its first use."""
+    """Gravity on an arm of nominal geometry in one configuration; quantities are computed at first use."""
 
     def __init__(
         self,
@@ -139,7 +139,7 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
 
 
 def moment_slopes(robot: Robot, q: Array) -> Array:
-    """Return what first moments of links mean to joints (N, dof, dof, 3), by joint i, link k and axis a.
+    """Return derivatives of joint torques by first moments of links (N, dof, dof, 3), by joint i, link k and axis a.
 
     z_i . (R_k e_a x g_hat) of the nominal arm at q (N, dof) of the controller; zero for k < i and for prismatic joints.
     A joint's deflection is the sum of these times the parameters ``bend{i}_{k}{a}`` [rad].
@@ -162,7 +162,7 @@ def _draws(robot: Robot) -> Array:
 
 @lru_cache(maxsize=64)
 def bend_names(robot: Robot) -> tuple[str, ...]:
-    """Return the parameters ``bend{i}_{k}{a}`` that say something about a robot, each something else.
+    """Return the non-redundant parameters ``bend{i}_{k}{a}`` of a robot.
 
     Over random joint values, those whose slope (`moment_slopes`) is neither constant nor, but for a factor and a
     constant, that of an earlier one of the same joint. With constants they say all that masses of links can do to
@@ -188,7 +188,7 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
 
 
 def families(robot: Robot) -> dict[str, tuple[str, ...]]:
-    """Return the parameters of every family that may be added to a robot's geometry, by what they describe.
+    """Return the parameters of all model extensions of a robot, by effect.
 
     Compliances are those of the joints whose torque of gravity changes with the configuration.
 

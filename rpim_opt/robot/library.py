@@ -1,4 +1,4 @@
-"""The robot that a problem names: a file of any format, or one of the ready robots."""
+"""Robots by name: files of any format, and ready robots."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from rpim_opt.robot.formats.tables import read_robot, read_sheet
 READY = Path(__file__).resolve().parent / "ready"
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
 REFUSED = {
-    XACRO: "a xacro file, which only a command or a script may name: it is executed",
+    XACRO: "a xacro file, which is executed and so may be named by commands and scripts only",
     ".xml": "an XML file, of MuJoCo or others",
     ".mjcf": "a model of MuJoCo",
     ".sdf": "an SDF file",
@@ -25,7 +25,7 @@ REFUSED = {
 
 
 def robots() -> list[str]:
-    """Return the names of the ready robots, which a problem file may name: ``robot = "ur5e"``.
+    """Return the names of the ready robots, as for ``robot = "ur5e"`` in a problem file.
 
     >>> import rpim_opt as ro
     >>> ro.robots()[-3:]
@@ -54,7 +54,7 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
 def read_arm(
     file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "", origins: bool = False
 ) -> Described:
-    """Return the robot of a file, with base and tool where a URDF or a standard DH table states them."""
+    """Return the robot of a file, with base and tool if a URDF or a standard DH table states them."""
     if file.suffix in (".urdf", XACRO):
         from rpim_opt.robot.formats.urdf import read_urdf
 
@@ -67,7 +67,7 @@ def read_arm(
 
 
 class RobotSource(NamedTuple):
-    """The robot of a new problem, which gets a copy as robot.toml: its file, and where it comes from."""
+    """The robot of a new problem folder: the file to copy as robot.toml, and its origin."""
 
     file: Path
     origin: str

@@ -72,10 +72,12 @@ class Gravity:
         object.__setattr__(self, "payload", _mass(self.payload, "payload"))
         object.__setattr__(self, "payload_centre", _vector(self.payload_centre, "centre of the payload"))
         if len(self.centres) != len(self.masses):
-            raise InputError("gravity", f"{len(self.masses)} masses, {len(self.centres)} centres", "one centre a mass")
+            raise InputError(
+                "gravity", f"{len(self.masses)} masses, {len(self.centres)} centres", "one centre per mass"
+            )
 
     def mounted(self, mounting: str | Sequence[float], base: ArrayLike | None = None) -> Gravity:
-        """Return the same masses on a robot mounted on "floor", "ceiling" or "wall", or where gravity points so (3,).
+        """Return the same masses on a robot mounted on "floor", "ceiling" or "wall", or with a gravity direction (3,).
 
         The base's x axis points up on a wall. ``base`` (3, 3) is the rotation of frame 0 of the table in the base that
         is meant, a URDF's root link for instance.
@@ -112,7 +114,7 @@ def _unit(values: ArrayLike, where: str) -> Vector:
     vector = _vector(values, where)
     length = math.hypot(*vector)
     if not length > 0:
-        raise InputError(where, f"{list(vector)}", "a vector that points somewhere")
+        raise InputError(where, f"{list(vector)}", "a nonzero vector")
     return vector if abs(length - 1) < 1e-15 else _vector(np.array(vector) / length, where)
 
 
@@ -216,7 +218,7 @@ class Robot(Brief):
 
     @property
     def leading(self) -> tuple[int, ...]:
-        """The model's joint (from 0) of every joint of the controller: the first that moves as it does, and alone."""
+        """The model's joint (from 0) of every joint of the controller: the first that moves with this joint alone."""
         n, k = self.joint_map.shape
         if n == k:
             return tuple(range(n))

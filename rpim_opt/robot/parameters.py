@@ -51,31 +51,31 @@ _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|bend\d+
 
 
 def own_name(name: str) -> str:
-    """Return what the robot itself calls a parameter: ``a2`` for ``left.a2`` of several robots."""
+    """Return a parameter's name without the robot: ``a2`` for ``left.a2``."""
     return name.rpartition(".")[2]
 
 
 @lru_cache(KNOWN)
 def of_joint(name: str) -> bool:
-    """Return whether a parameter is a robot's own, and not of a frame."""
+    """Return whether a parameter is of a joint, not of a frame."""
     own = own_name(name)
     return own == EXPANSION or bool(_TABLE.fullmatch(own) or _TERM.fullmatch(own))
 
 
 def of_term(name: str) -> bool:
-    """Return whether a parameter is one of a joint's terms, and not of the table or of a frame."""
+    """Return whether a parameter is of a joint's terms, not of the MDH table or of a frame."""
     return _TERM.fullmatch(own_name(name)) is not None
 
 
 @lru_cache(KNOWN)
 def is_joint_offset(name: str) -> bool:
-    """Return whether a parameter is the offset of a revolute joint: set at assembly, and not machined."""
+    """Return whether a parameter is the offset of a revolute joint, which is set at assembly."""
     return re.fullmatch(r"theta\d+", own_name(name)) is not None
 
 
 @lru_cache(KNOWN)
 def group_of(name: str, dimension: str) -> str:
-    """Return the group whose scale a parameter has: ``tool``, ``session``, ``base``, or its dimension."""
+    """Return the scale group of a parameter: ``tool``, ``session``, ``base``, or its dimension."""
     frame = own_name(name).partition("_")[0]
     if frame in ("tool", "session"):
         return frame
@@ -88,12 +88,12 @@ def session_prefix(session: str) -> str:
 
 
 def of_session(name: str) -> bool:
-    """Return whether a parameter is by how much the readings of a session are shifted or turned."""
+    """Return whether a parameter is a session offset."""
     return own_name(name).startswith("session_")
 
 
 def frame_of(name: str) -> str:
-    """Return the prefix of the frame that a parameter is of: ``session_day_1_`` of ``session_day_1_rx``."""
+    """Return the frame prefix of a parameter: ``session_day_1_`` for ``session_day_1_rx``."""
     return own_name(name).rpartition("_")[0] + "_"
 
 
@@ -210,7 +210,7 @@ class Parameters(Tabled):
         return self.take(np.flatnonzero(self.identified))
 
     def of_robot(self, robot: str) -> Parameters:
-        """Return what one of several robots (``""``: the only one) has of the table, by the robot's own names."""
+        """Return the entries of one of several robots (``""`` for a single one), without the robot's prefix."""
         if not robot:
             return self
         found = self.take(self.places_of(robot))
@@ -218,12 +218,12 @@ class Parameters(Tabled):
         return replace(found, names=tuple(map(own_name, found.names)), terms=terms)
 
     def called(self, robot: str, own: str) -> str:
-        """Return what the table calls one of several robots' own parameter: ``left.a2``, or ``a2`` if shared."""
+        """Return the table's name of a robot's parameter: ``left.a2``, or ``a2`` if shared."""
         called = f"{robot}.{own}"
         return own if not robot or (own in self.names and called not in self.names) else called
 
     def places_of(self, robot: str) -> np.ndarray:
-        """Return where the parameters of one of several robots stand (k,), those that it shares among them."""
+        """Return the indices (k,) of one robot's parameters, including shared ones."""
         if not robot:
             return np.arange(len(self))
         known = {name for name in self.names if name.startswith(f"{robot}.")}
@@ -232,22 +232,22 @@ class Parameters(Tabled):
 
     @property
     def of_frames(self) -> np.ndarray:
-        """(P,) which parameters place something (base, reflectors, sessions, ...) and are not the robot's own."""
+        """Which parameters (P,) are of frames (base, reflectors, sessions, ...), not of the robot."""
         return np.array([not of_joint(name) and name not in self.terms for name in self.names])
 
     @property
     def of_curves(self) -> np.ndarray:
-        """(P,) which are coefficients of the joints' transmission errors: hundreds, that say little one by one."""
+        """Which parameters (P,) are coefficients of transmission errors: hundreds without individual meaning."""
         return np.array([own_name(name).startswith("transmission") for name in self.names], dtype=bool)
 
     @property
     def placed(self) -> np.ndarray:
-        """(P,) which of these may be anywhere: all but the session offsets, which are as small as their scales."""
+        """Which frame parameters (P,) have no informative prior: all except session offsets."""
         return self.of_frames & ~np.array([of_session(name) for name in self.names], dtype=bool)
 
     @property
     def groups(self) -> tuple[str, ...]:
-        """The P groups whose scales they have: ``base``, ``tool``, ``session``, or their dimension."""
+        """The scale groups (P) of the parameters: ``base``, ``tool``, ``session``, or their dimension."""
         return tuple(
             dimension if name in self.terms else group_of(name, dimension)
             for name, dimension in zip(self.names, self.dimensions, strict=True)
@@ -255,7 +255,7 @@ class Parameters(Tabled):
 
     @cached_property
     def periodic(self) -> np.ndarray:
-        """(P,) which parameters are rotations: alpha, theta and beta of joints, roll, pitch and yaw of frames."""
+        """Which parameters (P,) are rotations: alpha, theta and beta of joints, roll, pitch and yaw of frames."""
         frames = "|".join(map(re.escape, ("base_", *self.own_frames)))
         turning = re.compile(rf"(alpha|theta|beta)\d+|({frames}|tool_(.*_)?)r[xyz]")
         return np.array([bool(turning.fullmatch(own_name(name))) for name in self.names])
@@ -449,12 +449,12 @@ def model_parameters(
 
 
 def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str]) -> Parameters:
-    """Return a table with the parameters of a model's terms behind its own, none of them identified yet."""
+    """Return the table with the parameters of a model's terms appended, none of them identified yet."""
     entries = model.entries(joint_types)
     own = tuple(entry.name for entry in entries)
     for name in own:
         if name in parameters.names:
-            raise InputError("model, terms", f"parameter '{name}', which the model has", "a name of its own")
+            raise InputError("model, terms", f"parameter '{name}', which the model has", "a unique name")
     return replace(_extended(parameters, entries), terms=(*parameters.terms, *own)) if own else parameters
 
 

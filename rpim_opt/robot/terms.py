@@ -1,4 +1,4 @@
-"""Terms: what moves an arm besides its joint values, as functions of what they see and of named parameters."""
+"""Terms: motions of an arm in addition to its joint values, as functions of its state and named parameters."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ BEND_SCALE = 1e-4
 
 @dataclass(eq=False)
 class Weight:
-    """Gravity of which nothing is known but that all it does is this symbol; `extensions.Statics` is an arm's."""
+    """Placeholder for gravity whose quantities are all one symbol; `extensions.Statics` is the real one."""
 
     payload: Symbol = 0.0  # mass at the flange [kg]
 
@@ -55,7 +55,7 @@ class Weight:
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """An arm in one configuration, as the joints of the model see it.
+    """State of an arm in one configuration.
 
     Examples
     --------
@@ -73,7 +73,7 @@ class Posture:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """What a term sees of joint ``number`` (from 1) and of its link; one of the base the first, of the tool the last.
+    """Argument of a term: joint ``number`` (from 1) and its link; the first for the base, the last for the tool.
 
     Examples
     --------
@@ -123,11 +123,11 @@ class Joint:
         return 0.0 if self.posture.approach is None else self.posture.approach[self.number - 1]
 
     def moment(self, k: int, axis: str) -> Symbol:
-        """Return z_i . (R_k e_a x g_hat): what the first moment of link k along ``axis`` means to it."""
+        """Return z_i . (R_k e_a x g_hat), the derivative of the torque by the first moment of link k along ``axis``."""
         return self.posture.weight.moment(self.number, k, axis)
 
     def column(self, name: str) -> Symbol:
-        """Return a column of the data [SI] by its name; the term has to name it in its ``columns``."""
+        """Return a column of the data [SI] by its name, which must be in the term's ``columns``."""
         if name not in self.posture.columns:
             raise InputError("term", f"column '{name}'", f"columns={{'{name}': ...}} of the term, with its dimension")
         return self.posture.columns[name]
@@ -147,7 +147,7 @@ class Entry(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Term:
-    """A way in which an arm moves besides its joint values.
+    """A motion of an arm in addition to its joint values.
 
     Parameters
     ----------
@@ -202,9 +202,11 @@ class Term:
             where = f"term, scales, parameter '{entry.name}'"
             if not _STEM.fullmatch(entry.name) or _FRAME.fullmatch(entry.name):
                 accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx of frames"
-                raise InputError(where, "a name that is another's", accepted)
+                raise InputError(where, "a reserved name", accepted)
             if self.at in ENDS and "{}" in entry.name:
-                raise InputError(where, "a place for a number", f"none: the {self.at} has one parameter")
+                raise InputError(
+                    where, "a placeholder for the joint's number", f"none: the {self.at} has one parameter"
+                )
             if not entry.scale >= SMALLEST:
                 raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
         if len({entry.name for entry in self.entries}) < len(self.entries):
@@ -246,7 +248,7 @@ class Term:
         return [entry._replace(name=stem.format(i)) for entry, stem in zip(self.entries, stems, strict=True)]
 
     def places(self, joint_types: Sequence[str]) -> tuple[int, ...]:
-        """Return the numbers of the joints or links that have it; the first for the base, the last for the tool."""
+        """Return the numbers of the joints or links with this term; the first for the base, the last for the tool."""
         if self.at in ENDS:
             return (1 if self.at == "base" else len(joint_types),)
         wanted = tuple(self.joints) or (("revolute",) if self.at == "joint" else ("revolute", "prismatic"))
@@ -254,14 +256,14 @@ class Term:
 
 
 def require_columns(columns: Mapping[str, str], where: str) -> None:
-    """Refuse columns of a dimension that is not known."""
+    """Refuse columns of an unknown dimension."""
     for name, dimension in columns.items():
         if dimension not in ("", *DISPLAY):
             raise InputError(f"{where}, column {name}", repr(dimension), f"'' (no unit), {', '.join(DISPLAY)}")
 
 
 def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
-    """Return by how much a term moves, (1, 1) or (6, 1); None where its parameters are all zero."""
+    """Return the motion of a term, (1, 1) or (6, 1); None if its parameters are all zero."""
     sizes = [value(name) for name in term.names(joint.number)]
     # an effect may take a whole chain to write down: not for a parameter that is not there
     if sizes and all(ca.SX(size).is_zero() for size in sizes):
@@ -299,7 +301,7 @@ class Transmission(Term):
 
 @lru_cache(256)
 def transmission(curve: Curve) -> Transmission:
-    """Return the transmission error of a joint: what it turns further [rad], as a function of its own angle q.
+    """Return the transmission error of a joint, its additional rotation [rad] as a function of its angle q.
 
     ::
 
@@ -339,7 +341,7 @@ def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
 
 @dataclass(frozen=True, eq=False)
 class Model:
-    """The kinematics of an arm, opened: the product of its links, with terms of a user's own.
+    """The kinematic model of an arm: the product of its links, with user-defined terms.
 
     ``terms`` move joints, links, the base or the tool besides those that every arm has (``ratio``, ``ecc_cos``, ...,
     ``compliance``, ``backlash``, ``bend``); two parameters of one name, or one column in two dimensions, are refused.
@@ -371,7 +373,7 @@ class Model:
         stems = [entry.name for term in own for entry in term.entries]
         for stem in stems:
             if stems.count(stem) > 1:
-                raise InputError("model, terms", f"parameter '{stem}' twice", "a name of its own for every parameter")
+                raise InputError("model, terms", f"parameter '{stem}' twice", "a unique name for every parameter")
         for name, dimension in (item for term in self.terms for item in term.columns.items()):
             if self.columns[name] != dimension:
                 raise InputError("model, terms", f"column '{name}' in two dimensions", "one of them")
@@ -396,7 +398,7 @@ class Model:
 
 
 class Dependencies(NamedTuple):
-    """What terms depend on in a row: torques, gravity, its moments of links, directions of approach, columns."""
+    """Inputs of terms from a row: torques, gravity, first moments of links, directions of approach, columns."""
 
     torques: bool = False
     gravity: bool = False
@@ -406,7 +408,7 @@ class Dependencies(NamedTuple):
 
 
 def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str], bool]) -> Dependencies:
-    """Return what the terms depend on that have no parameters, or one of which ``used(name)`` says so."""
+    """Return the inputs of all terms without parameters, or with a parameter for which ``used(name)`` is true."""
     dof = len(joint_types)
     with SYMBOLS:
         q, torque, approach = (ca.SX.sym(name, dof) for name in ("q", "torque", "approach"))
@@ -476,7 +478,7 @@ def displacement(
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> ca.SX | None:
-    """Return the sum of what the terms of a place move, of joint or link i; None where nothing moves it."""
+    """Return the sum of the motions of all terms of joint or link i; None without any."""
     own = [term for term in terms if term.at == at and i in term.places(joint_types)]
     parts = [moved(term, Joint(i, posture), value) for term in own]
     parts = [part for part in parts if part is not None]

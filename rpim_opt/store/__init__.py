@@ -1,4 +1,4 @@
-"""Folders and files in, results out."""
+"""Problem folders and result files."""
 
 import lazy_loader
 

@@ -1,4 +1,4 @@
-"""Problem folders: ``robot.toml``, ``problem.toml`` and tables become a problem with its validation data."""
+"""Loading of problem folders: ``robot.toml``, ``problem.toml`` and tables."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ UNSTATED = 1e-5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Instance(Tabled):
-    """A calibration problem as its folder states it.
+    """A calibration problem of a folder, with validation data and settings.
 
     ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None where hyperparameters
     are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result says of
@@ -86,7 +86,7 @@ class Instance(Tabled):
 
     @property
     def validation(self) -> Dataset | None:
-        """Measurements that no step of the calibration may see."""
+        """Validation data, not used in any step of the calibration."""
         return self.record.validation
 
     def _short(self) -> str:
@@ -100,7 +100,7 @@ class Instance(Tabled):
         return [self.record.source]
 
     def calibrate(self, **changes: Any) -> Calibration:
-        """Return the calibration as the folder wants it, with its record.
+        """Return the calibration with the folder's settings and record.
 
         ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``.
         """
@@ -116,7 +116,7 @@ def load(
     model: KinematicModel | None = None,
     chain: str | None = None,
 ) -> Instance:
-    """Return a problem from its folder, or from the name of one that comes with the package.
+    """Return the problem of a folder, or a shipped problem by name.
 
     Parameters
     ----------
@@ -304,7 +304,7 @@ def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files, Tools]
         rest = data[role].without(exclude)
         if not len(rest):
             file = stated.path.parent / files[role][0]
-            raise InputError("the table", "no row that is not excluded", "at least one", file)
+            raise InputError("the table", "no remaining row (all are excluded)", "at least one", file)
         data[role] = _with_known(rest, stated.table, role, stated.path)
     tools = stated.tools
     if any(each.layout == "robodk" for each in stated.observations):
@@ -355,7 +355,7 @@ def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Da
 
 
 def _require_enough(data: Dataset) -> None:
-    """Refuse what was touched so few times that its touches say nothing."""
+    """Refuse points and planes with too few touches to be informative."""
     blocks = [(block, block.touched) for block in data.blocks if block.touched is not None]
     joined = {name for block, rows in blocks if not block.measurement.touching for names in rows for name in names}
     count: Counter[str] = Counter()

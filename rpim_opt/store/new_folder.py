@@ -1,4 +1,4 @@
-"""A problem folder from a robot and a table of measurements: what it holds, and which rows are kept for validation."""
+"""Creation of problem folders from a robot and tables of measurements."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ CAMERA_CLEARLY = 3.0
 
 @dataclass(frozen=True)
 class Started:
-    """A folder that was made: its files with their rows, a sentence for all that was recognised or guessed."""
+    """A new folder: its files with their rows, and notes on everything recognized or guessed."""
 
     folder: Path
     rows: Mapping[str, int]
@@ -53,7 +53,7 @@ class Started:
     def __str__(self) -> str:
         """Return the files and the sentences."""
         lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
-        then = f"Look at {self.folder / 'problem.toml'}, then: rpim-opt inspect {self.folder}"
+        then = f"Check {self.folder / 'problem.toml'}, then run: rpim-opt inspect {self.folder}"
         return "\n".join([f"Made: {self.folder}", *lines, *self.notes, then])
 
 
@@ -73,7 +73,7 @@ def new_problem(
     dh: str = "",
     understood: Callable[[Understanding], None] | None = None,
 ) -> Started:
-    """Make a problem folder that `load` reads; the folder is whole or not there.
+    """Make a problem folder that `load` reads, completely or not at all.
 
     Parameters
     ----------
@@ -105,10 +105,10 @@ def new_problem(
     """
     folder = Path(folder)
     if folder.exists() or folder.is_symlink():
-        raise InputError("the folder", "one that is there", "a new one: nothing is overwritten", folder)
+        raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
     options = options or TableOptions()
     if validation is not None and hold_out is not None:
-        raise InputError("validation", "a table and a part to hold out", "one of them")
+        raise InputError("validation", "a table and a fraction to hold out", "one of them")
     source = find_source(robot)
     arm = read_arm(source.file, urdf_base, urdf_tip, dh)
     paths = [data] if isinstance(data, str | Path) else data
@@ -135,7 +135,7 @@ def new_problem(
         known = len(np.unique(rows.configuration))
         if not 0 < hold_out < 1 or known < 2:
             part = f"{hold_out:g} of {known} configurations"
-            raise InputError("--hold-out", part, "a part between 0 and 1 of two or more")
+            raise InputError("--hold-out", part, "a fraction between 0 and 1 of two or more configurations")
         drawn = rows.configurations(min(max(round(hold_out * known), 1), known - 1), seed)
         held = np.isin(rows.configuration, drawn.configuration)
         tables = {IDENTIFICATION: _rows(columns, ~held), VALIDATION: _rows(columns, held)}
@@ -181,19 +181,19 @@ def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
 
 @dataclass(frozen=True, eq=False)
 class StatedTarget:
-    """A board: its points, what ``target`` of a problem file says of it, and the table to write, if it has one."""
+    """A board: its points, the value of ``target`` in a problem file, and the table to write, if any."""
 
     board: Board
     stated: str
     table: Columns
 
     def under(self, columns: Columns) -> Columns:
-        """Return the columns of a table of corners with where their points are; as they are without a board."""
+        """Return the columns of a table of corners with the coordinates of their points; unchanged without a board."""
         return on_board(columns, self.board) if self.board else columns
 
 
 def stated_target(text: str) -> StatedTarget:
-    """Return the board that ``--target`` states: a table, or columns, rows and spacing of a grid; empty for nothing.
+    """Return the board of ``--target``: a table, or columns, rows and spacing of a grid; empty without one.
 
     >>> from rpim_opt.store.new_folder import stated_target
     >>> stated_target("7x5,30mm").stated
@@ -288,7 +288,7 @@ def _problem_text(
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
         base="" if base is None else _frame(base),
         how=how,
-        known="where the file has its tip" if arm.tool.any() else "not known, and identified from the flange's origin",
+        known="at the tip of the robot's file" if arm.tool.any() else "unknown, so identified from the flange's origin",
         markers=[_subtable(marker) for marker in markers],
         tool=_frame(arm.tool),
         cameras=cameras,
@@ -305,7 +305,7 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     """Return the base to state, None for registration, and why."""
     rows = posed(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):
-        return arm.base, "The base is as the robot's file has it: these measurements do not depend on it."
+        return arm.base, "The base is that of the robot's file: these measurements do not depend on it."
     found, _, verdict = locate(arm.robot, rows, tools)
     if same_place(found, arm.base):
         offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])

@@ -1,4 +1,4 @@
-"""Measurement types and terms in Python files of a problem folder: code that runs only where the caller allows it."""
+"""User-defined measurement types and terms in Python files of a problem folder, executed only if allowed."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _ALLOWED: ContextVar[bool] = ContextVar("allow_code", default=False)
 
 @contextmanager
 def allow_code() -> Iterator[None]:
-    """Allow that problem folders and results that are read meanwhile run the Python files that they name.
+    """Allow problem folders and results read in this context to execute the Python files that they name.
 
     >>> import rpim_opt as ro
     >>> with ro.store.allow_code():
@@ -33,12 +33,12 @@ def allow_code() -> Iterator[None]:
 
 
 def is_own(name: object) -> bool:
-    """Tell whether a name is that of an object in a Python file, ``mine:height`` for ``height`` in ``mine.py``."""
+    """Return whether a name is of an object in a Python file, ``mine:height`` for ``height`` in ``mine.py``."""
     return isinstance(name, str) and ":" in name
 
 
 def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
-    """Return an object of a Python file that lies beside ``file``, which names it as the value of ``where``.
+    """Return an object of a Python file beside ``file``, which names it as the value of ``where``.
 
     InputError where code is not allowed, the Python file is missing or cannot be run, or the object is of another kind.
     """
@@ -55,7 +55,7 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
     try:
         spec.loader.exec_module(content)
     except (Exception, SystemExit) as error:  # code of somebody else may raise anything
-        raise InputError(where, f"{type(error).__name__}: {error}", "code that runs", source) from error
+        raise InputError(where, f"{type(error).__name__}: {error}", "code that runs without errors", source) from error
     found = getattr(content, attribute, None)
     if not isinstance(found, kind):
         raise InputError(where, f"{attribute} = {found!r}"[:80], f"a {kind.__name__} of that name", source)

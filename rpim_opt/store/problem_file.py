@@ -1,4 +1,4 @@
-"""``problem.toml``: its schema, its variants, and what it states before any table is read."""
+"""The file ``problem.toml``: its schema, its variants, and the settings that need no table."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def problems_folder() -> Path:
-    """Return the folder of the problems that come with the package: inside it, or beside it in a checkout.
+    """Return the folder of the shipped problems: inside the package, or beside it in a checkout.
 
     >>> import rpim_opt as ro
     >>> (ro.store.problems_folder() / "position" / "problem.toml").is_file()
@@ -53,7 +53,7 @@ def problems_folder() -> Path:
 
 
 def find_problem(name: str | Path) -> Path:
-    """Return the folder of a problem, given its path or the name of one that comes with the package.
+    """Return the folder of a problem from its path, or of a shipped problem by name.
 
     >>> import rpim_opt as ro
     >>> ro.store.find_problem("position").name
@@ -77,7 +77,7 @@ def named_formulation(text: str, file: Path | None = None) -> Formulation:
 
 
 def named_weight(text: str, file: Path | None = None) -> float | Selector | None:
-    """Return the selector of that name, or the number that the text is; None where hyperparameters are estimated."""
+    """Return the selector of that name, or the number in the text; None if hyperparameters are estimated."""
     if text == LEARNED:
         return None
     try:
@@ -91,7 +91,7 @@ def named_weight(text: str, file: Path | None = None) -> float | Selector | None
 
 
 class FrameTable(Table):
-    """Where a frame is: x, y, z and roll, pitch, yaw about fixed axes."""
+    """Pose of a frame: x, y, z and roll, pitch, yaw about fixed axes."""
 
     x: Length = 0.0
     y: Length = 0.0
@@ -102,7 +102,7 @@ class FrameTable(Table):
 
 
 class ScatterTable(Table):
-    """The robot's repeatability, where it is known."""
+    """Known repeatability of the robot."""
 
     position: Length = Field(default=0.0, ge=0)
     orientation: Angle = Field(default=0.0, ge=0)
@@ -121,7 +121,7 @@ Pair = Annotated[list[Name], Field(min_length=2, max_length=2)]
 
 
 class DistanceTable(Table):
-    """A known distance; ``mm = 50`` is short for ``distance_mm = 50``. One that validates identifies nothing."""
+    """A known distance; ``mm = 50`` is short for ``distance_mm = 50``. One for validation is not used in the fit."""
 
     between: Pair
     validation: bool = False
@@ -243,7 +243,7 @@ class ProblemTable(Table):
 
 @dataclass(frozen=True, eq=False)
 class ProblemFile:
-    """What a problem file states, checked, before any table is read.
+    """The checked content of a problem file, before any table is read.
 
     ``placed`` are the tables that place a measurement's anchor, plane or sphere; ``base`` is None for registration.
     """
@@ -260,7 +260,7 @@ class ProblemFile:
     board: Board | None = None
 
     def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
-        """Return the parameters with the file's scales and tolerances, and those identified that it names."""
+        """Return the parameters with the file's scales, tolerances and selection of identified parameters."""
         table = self.table
         parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
         return parameters.identify(identifiable(table.identify, self.robot, parameters, data))
@@ -273,7 +273,7 @@ def read_problem(
     model: KinematicModel | None = None,
     chain: str | None = None,
 ) -> ProblemFile:
-    """Return what a problem file states, of several chains of one, the first by default; the rest as for `load`."""
+    """Return the content of a problem file, of the first of several chains by default; arguments as for `load`."""
     folder = find_problem(name)
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
@@ -371,7 +371,7 @@ def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
 
 
 def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
-    """Return the repeatability that a file states, or None."""
+    """Return the stated repeatability, or None."""
     if isinstance(table.scatter, str):
         if table.scatter not in LEARNED_NOISE:
             accepted = choices(table.scatter, LEARNED_NOISE) + ", or a table"

@@ -1,4 +1,4 @@
-"""Raw tables of a robot, understood: what every column means, before anything is computed."""
+"""Interpretation of raw tables: the meaning of every column."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ Files = Sequence[tuple[Path | None, RawTable]]
 
 @dataclass(frozen=True, eq=False)
 class Understanding:
-    r"""What raw tables say.
+    r"""Interpretation of raw tables.
 
     ``kind`` is what was measured, ``columns`` one table with our names (texts and numbers as the files have them),
     ``raw`` the same rows with theirs, ``tables`` what was understood of every file, ``notes`` how they were joined and
@@ -70,7 +70,7 @@ class Understanding:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """The names of columns that mean nothing here, of all files."""
+        """The names of ignored columns of all files."""
         return tuple(dict.fromkeys(name for table in self.tables for name in table.left_out))
 
     @property
@@ -79,7 +79,7 @@ class Understanding:
         return len(next(iter(self.columns.values())))
 
     def __str__(self) -> str:
-        """Return what every column means as a table, and the sentences."""
+        """Return the table of column meanings, and the sentences."""
         parts = []
         for each in self.tables:
             rows = [["column", "meaning", "name here", "unit", "why"]]
@@ -95,7 +95,7 @@ class Understanding:
 
     @property
     def sentences(self) -> tuple[str, ...]:
-        """The same in sentences, without what stands as it was."""
+        """The interpretation as sentences, without unchanged columns."""
         said = []
         for each in self.tables:
             said += [f"{each.file}: {note}" for note in each.notes]
@@ -123,7 +123,7 @@ def understand_tables(
     urdf_tip: str | None = None,
     dh: str = "",
 ) -> Understanding:
-    r"""Return what raw tables of a robot say: every column's meaning, unit, and why.
+    r"""Interpret raw tables of a robot: meaning, unit and reason for every column.
 
     Several files are stacked where each is whole, and joined by a key where some have the joint values and others the
     measured ones. Whether a quaternion's numbered components begin with w is checked against the nominal robot.
@@ -181,7 +181,7 @@ def rows_of(
     kind: Measurement,
     noise: Mapping[str, float] | None = None,
 ) -> Dataset:
-    """Return the measurements in understood columns; an error names the column as the file does."""
+    """Return the measurements of interpreted columns; errors use the file's column names."""
     try:
         return read_data(columns, arm.robot, usual_noise(kind) if noise is None else noise, kind)
     except InputError as error:
@@ -204,7 +204,7 @@ def understand_of(
     options: TableOptions | None = None,
     targets: bool = False,
 ) -> Understanding:
-    """Return what raw tables of an arm say, files or data frames, as `understand_tables` does; or tables of targets."""
+    """Interpret raw tables (files or data frames) as `understand_tables` does, or tables of targets."""
     options = options or TableOptions()
     files = [each for source in data for each in _sheets(source, options)]
     columns = [raw.columns for _, raw in files]
@@ -281,10 +281,10 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
         if misfit[USUAL] <= CLEARLY * misfit[best]:
             return first
         missed = f"turns that the nominal robot misses by {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
-        accepted = f"--rotation '{best}' if that is what they are, or '{USUAL}'"
+        accepted = f"--rotation '{best}' if correct, or '{USUAL}'"
         raise InputError("rx, ry, rz", missed, accepted, first.file)
     if misfit[second] <= CLEARLY * misfit[best]:
         accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
-        raise InputError("the order of the quaternion", f"no clear one ({figures})", accepted, first.file)
+        raise InputError("the order of the quaternion", f"an ambiguous order ({figures})", accepted, first.file)
     note = f"the quaternion's order is {best}: the nominal robot misses {figures}."
     return replace(found[best], notes=(*found[best].notes, note))

@@ -1,4 +1,4 @@
-"""Result files: a calibration goes to one JSON file and comes back, without the problem's folder."""
+"""Result files: a calibration in one JSON file, independent of the problem's folder."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def save_result(result: Calibration, path: str | Path) -> None:
-    """Write a calibration to one JSON file, which `load_result` reads; the file is whole or not written at all.
+    """Write a calibration to one JSON file, which `load_result` reads; the file is written completely or not at all.
 
     Parameters
     ----------
@@ -146,8 +146,8 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         raise error.within(path) from None
     except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
         # well-formed parts that somebody put together by hand
-        found = f"parts that do not fit together ({error})"
-        raise InputError("the file", found, "one as it was written", path) from None
+        found = f"inconsistent content ({error})"
+        raise InputError("the file", found, "an unmodified file", path) from None
     return result
 
 
@@ -156,12 +156,12 @@ def _require_whole(stored: Any) -> None:
     if not isinstance(stored, dict) or stored.get("format") != FORMAT:
         raise InputError("the file", "no result of rpim-opt", "a file of `rpim-opt calibrate --out` or save_result()")
     if stored.get("version") != VERSION:
-        accepted = f"{VERSION}; the rpim-opt that wrote it reads others"
+        accepted = f"{VERSION}; read other versions with the rpim-opt that wrote them"
         raise InputError("key version", repr(stored.get("version"))[:40], accepted)
     known = stored.get("digest", "nothing")
     if known != digest(stored):
         found = f"{str(known)[:12]} for a content of {digest(stored)[:12]}"
-        raise InputError("key digest", found, "the file as it was written: something in it was changed")
+        raise InputError("key digest", found, "the unmodified file: its content was changed")
 
 
 def _result_path(path: str | Path) -> Path:
@@ -173,7 +173,7 @@ def _result_path(path: str | Path) -> Path:
 
 
 class OwnTerm(NamedTuple):
-    """A term of a user's own, whose function only a script has: where it acts, its parameters and columns."""
+    """A user-defined term without its function: where it acts, its parameters and columns."""
 
     at: str
     parameters: list[str]
@@ -186,7 +186,7 @@ class OwnTerm(NamedTuple):
 
 
 class Trust(NamedTuple):
-    """What a loss of a script made of the equations: a factor, and those that it left out."""
+    """Equations that a script's loss kept, and their factor."""
 
     factor: float
     left_out: list[int]
@@ -200,7 +200,7 @@ class Forms(NamedTuple):
 
 
 class RowErrors(NamedTuple):
-    """The errors of one row [mm], before and after; None where it measures no length."""
+    """The errors of one row [mm], before and after; None if it measures no length."""
 
     label: str
     nominal_mm: float | None
@@ -209,7 +209,7 @@ class RowErrors(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Stored:
-    """What everything else in a result file follows from, in SI, by its keys."""
+    """The primary content of a result file in SI, from which everything else follows."""
 
     formulation: str
     """Name of the formulation."""
@@ -266,7 +266,7 @@ class Stored:
 
 
 def content(result: Calibration) -> dict[str, Any]:
-    """Return what a file says of a calibration: its figures [mm, deg], what they follow from [SI], and a digest."""
+    """Return the content of a result file: figures [mm, deg], the data they follow from [SI], and a digest."""
     from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
 
     result = replace(result, record=result.record.dated(), known_causes=result.causes)
@@ -305,7 +305,7 @@ def content(result: Calibration) -> dict[str, Any]:
 
 
 def figures(result: Calibration) -> dict[str, Any]:
-    """Return what a reader looks for first: errors [mm], the weight and where it came from, the parameters."""
+    """Return the main figures: errors [mm], the weight and its origin, the parameters."""
     validation = None
     if result.record.validation is not None:
         validation = statistics(result.errors(result.record.validation))
@@ -368,7 +368,7 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
 
 
 def _trust(result: Calibration) -> Trust | None:
-    """Return what a loss of a script made of the rows; a ready one says it again when it is called."""
+    """Return the equations that a script's loss kept; a ready loss recomputes them."""
     if result.kept is not None:  # an earlier file said it
         if result.kept.linear is None:
             return None
@@ -387,7 +387,7 @@ def _trust(result: Calibration) -> Trust | None:
 
 
 def definition(formulation: Formulation) -> dict[str, Any]:
-    """Return the functions of a formulation by the names of ready ones; None for those of a script."""
+    """Return the names of a formulation's ready functions; None for those of a script."""
     return {
         "loss": _name(formulation.loss),
         "penalty": _name(formulation.penalty),
@@ -398,7 +398,7 @@ def definition(formulation: Formulation) -> dict[str, Any]:
 
 
 def formulation_of(name: str, stated: Mapping[str, Any]) -> Formulation:
-    """Return the formulation that a file holds; one that cannot be solved where it names functions of a script."""
+    """Return the formulation of a file; with functions of a script it cannot be solved."""
     functions = [stated[key] for key in ("loss", "penalty", "penalty_over")]
     return Formulation(
         name,

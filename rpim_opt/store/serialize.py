@@ -1,4 +1,4 @@
-"""Values as JSON and back, by the annotations of their classes: dataclasses, named tuples, arrays, mappings."""
+"""Conversion of dataclasses, named tuples, arrays and mappings to JSON and back, by annotations."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ KINDS = {bool: "truth value", int: "integer", str: "text"}
 
 
 def plain(value: Any) -> Any:
-    """Return a value as JSON has it: numbers with the fewest digits that read back to the same bits."""
+    """Return a value as JSON data; numbers have the fewest digits that read back exactly."""
     return _converter().unstructure(value)
 
 
 def structured(content: Any, kind: type[T]) -> T:
-    """Return the instance of a class that `plain` wrote, without what a file cannot hold: a robot's terms, models."""
+    """Return the instance of a class from the output of `plain`, without functions, which a file cannot hold."""
     from cattrs import BaseValidationError
 
     try:
@@ -43,7 +43,7 @@ def structured(content: Any, kind: type[T]) -> T:
 
 
 def digest(content: Mapping[str, Any]) -> str:
-    """Return the SHA-256 of a file's content without its digest, however it is laid out and ordered."""
+    """Return the SHA-256 of a file's content without its digest, independent of layout and order."""
     rest = {key: value for key, value in content.items() if key != "digest"}
     text = json.dumps(rest, sort_keys=True, separators=(",", ":"), allow_nan=False)
     return sha256(text.encode()).hexdigest()
@@ -153,4 +153,4 @@ def _refusal(error: BaseException, place: str = "") -> InputError:
         return InputError(f"{where}, {error.where}" if error.where else where, error.found, error.accepted)
     if isinstance(error, KeyError):
         return InputError(where, "nothing", "this key is required")
-    return InputError(where, f"another kind of value ({error})", "what was written")
+    return InputError(where, f"another kind of value ({error})", "the written kind")

@@ -1,4 +1,4 @@
-"""Simulated problem folders: tables made from a truth that is known, by a seed and one command."""
+"""Simulation of problem folders: tables from known true parameters and a seed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ PREFIXES = ("", "to_")
 
 
 class PlaneTable(Table):
-    """A square of a plane that is touched, in the robot's base frame."""
+    """A square plane to touch, in the robot's base frame."""
 
     at_mm: list[float]
     normal: list[float]
@@ -70,7 +70,7 @@ class Simulation(Table):
 
 @dataclass(frozen=True, eq=False)
 class Simulated:
-    """Tables by file name, and the truth they were made from: deviations [SI] by parameter, labels of blunders."""
+    """Simulated tables by file name, with the true deviations [SI] by parameter and the labels of gross errors."""
 
     tables: Mapping[str, Columns]
     deviations: Mapping[str, tuple[str, float]]
@@ -97,7 +97,7 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
         if file:
             place = inside(stated.path.parent, file, f"key {role}", stated.path).resolve()
             if place.suffix.lower() != ".csv" or place in taken:
-                raise InputError(f"key {role}", f"{file!r}", "a name of its own for every table, in .csv", stated.path)
+                raise InputError(f"key {role}", f"{file!r}", "a unique name for every table, in .csv", stated.path)
             taken.add(place)
     fixtures, parameters = _parameters(stated)
     free = parameters.free
@@ -244,7 +244,7 @@ class _Table:
         q, beyond = target.reached(len(wanted), self.rng.spawn(1)[0], self.plan.joint_share)
         if beyond is not None:
             found = "a plane or sphere out of reach"
-            raise InputError("table simulation", found, "one that the robot can touch", self.stated.path)
+            raise InputError("table simulation", found, "a surface within reach", self.stated.path)
         return q
 
     def _labelled(self, count: int) -> tuple[Columns, list[int]]:
@@ -346,7 +346,7 @@ class _Table:
         if self.noisy:
             points, planes, each = plan.points_mm, plan.planes, plan.configurations
         if bool(points) == bool(planes):
-            raise InputError("table simulation", "points_mm and planes", "one of them, for either table")
+            raise InputError("table simulation", "points_mm and planes", "one of them, for both tables")
         if planes:
             things = {}
             for name, square in planes.items():

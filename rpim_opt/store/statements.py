@@ -86,7 +86,7 @@ class Constraints(Table):
     places: dict[Name, dict[str, Any]] = Field(default_factory=dict)
 
     def all(self, robot: Robot, data: Dataset) -> tuple[Constraint, ...]:
-        """Return them as functions of a formulation of a problem with this robot and identification data."""
+        """Return the constraint functions for a problem with this robot and identification data."""
         boxes = (
             (self.at_nominal, at_nominal),
             (self.positive, partial(signed, 1)),
@@ -97,7 +97,7 @@ class Constraints(Table):
         for name, table in self.places.items():
             where = f"key constraints.places.{name}"
             if name in (MEASURED, WORKSPACE):
-                raise InputError(where, "a place that every problem has", "another name")
+                raise InputError(where, "a predefined place", "another name")
             places[name] = _place(table, robot, data, where)
         return (*made, *(equal(*names) for names in self.equal), *(parse(text, places) for text in self.stated))
 
@@ -162,7 +162,7 @@ class PriorTable(Table):
     scale: dict[str, float | int] = Field(default_factory=dict)
 
     def files(self, path: Path) -> dict[str, Path]:
-        """Return the files that the prior is read from, inside the problem's folder, by their names in its file."""
+        """Return the files of the prior in the problem's folder, by their names in the problem file."""
         named = [(file, "key prior.fleet") for file in self.fleet]
         if self.earlier:
             named.append((self.earlier, "key prior.from"))
@@ -185,14 +185,14 @@ def stated_prior(
     path: Path,
     measurements: Sequence[Measurement],
 ) -> Prior:
-    """Return the prior that a problem file states, which fits the problem's parameters.
+    """Return the prior of a problem file, checked against the problem's parameters.
 
     What ``scale`` says of joint offsets alone, or of a parameter by its name, is taken at its word: somebody has
     thought of it, as of a certificate's standard uncertainty of a reflector's place.
     """
     for key in ("inflate", "without"):
         if key in table.model_fields_set and not table.earlier:
-            raise InputError(f"key prior.{key}", "no key from beside it", "from = 'other/result.json'", path)
+            raise InputError(f"key prior.{key}", "no key from in addition", "from = 'other/result.json'", path)
     offsets = {}
     for key, value in scale.items():
         stem = split_unit(key)[0]
@@ -238,10 +238,10 @@ def stated_prior(
 
 
 def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
-    """Return what ``[record]`` states, in the order of `FIELDS`."""
+    """Return the entries of ``[record]``, in the order of `FIELDS`."""
     for key, value in table.items():
         if key not in FIELDS:
-            raise InputError(f"key record.{key}", "a key that is not known", choices(key, FIELDS))
+            raise InputError(f"key record.{key}", "an unknown key", choices(key, FIELDS))
         if isinstance(value, bool) or not isinstance(value, str | int | float | date | datetime):
             raise InputError(f"key record.{key}", repr(value)[:60], "a text, a number or a date")
         length = len(str(value).strip())
@@ -251,7 +251,7 @@ def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
 
 
 def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requirement | None:
-    """Return what ``[acceptance]`` requires; None for an empty table.
+    """Return the requirement of ``[acceptance]``; None for an empty table.
 
     ::
 
@@ -302,7 +302,7 @@ def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]
     own: dict[str, float] = {}
     for table, content in placed.items():
         if table not in used:
-            raise InputError(f"table {table}", "a place for no measurement here", choices(table, used))
+            raise InputError(f"table {table}", "a fixture of no measurement in this problem", choices(table, used))
         for fixture, coordinates in used[table].items():
             part: Any = content
             where = f"table {table}"

@@ -1,4 +1,4 @@
-"""Comparisons, by anyone."""
+"""Comparisons of methods, and studies."""
 
 import lazy_loader
 

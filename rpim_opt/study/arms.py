@@ -1,4 +1,4 @@
-"""Simulated arms with errors in all six directions after every link, of sizes that differ from arm to arm."""
+"""Simulated arms with errors in all six directions after every link, of magnitudes that vary between arms."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ VALIDATION_COUNT = 200
 
 
 class SimulatedArm(NamedTuple):
-    """What a tracker saw of an arm whose truth is known.
+    """Simulated tracker measurements of an arm with known true parameters.
 
     ``problem`` has the identification data and generic scales, ``true`` the positions of validation configurations as
     they are [m], ``read`` the same as the tracker reads them.

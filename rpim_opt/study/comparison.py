@@ -1,4 +1,4 @@
-"""Comparisons: problems, formulations and selectors, one replicate each, and the tables that they become."""
+"""Comparisons of formulations, selectors and baselines on problems, and their tables."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def compare(
     resume: bool | None = True,
     progress: bool | Callable[[int, int], None] = True,
 ) -> Comparison:
-    """Compare formulations, selectors and anybody's methods on problems, by their errors on held-out data.
+    """Compare formulations, selectors and user-defined methods on problems, by errors on held-out data.
 
     Every problem with every formulation and every selector, every split and every seed: one replicate each. What cannot
     be (a lasso with REML) and what fails is a replicate with its reason. All methods see the same data: the same
@@ -210,17 +210,17 @@ class Comparison:
 
     @property
     def metric(self) -> str:
-        """What summaries are of, unless they are asked for another."""
+        """The default metric of summaries."""
         return self.metrics[0]
 
     @property
     def methods(self) -> tuple[str, ...]:
-        """The labels of the methods, in the order they were asked."""
+        """The labels of the methods, in the order given."""
         return tuple(dict.fromkeys(row["method"] for row in self.rows))
 
     @property
     def problems(self) -> tuple[str, ...]:
-        """The labels of the problems, in the order they were asked."""
+        """The labels of the problems, in the order given."""
         return tuple(dict.fromkeys(row["problem"] for row in self.rows))
 
     def to_frame(self) -> Any:
@@ -262,12 +262,12 @@ class Comparison:
             known = [method for method, values in of.items() if values]
             if not known:
                 reason = f"{self.rows[0]['status']}: {self.rows[0]['reason']}"
-                raise InputError("comparison", f"no replicate with figures; {reason}", "one")
+                raise InputError("comparison", f"no replicate with results; {reason}", "one")
             return known[0]
         if against not in of:
             raise InputError("against", f"'{against}'", choices(against, of))
         if not of[against]:
-            raise InputError("against", f"'{against}', which has no figures", "a method that has some")
+            raise InputError("against", f"'{against}', which has no results", "a method with results")
         return against
 
     def __repr__(self) -> str:

@@ -1,4 +1,4 @@
-"""Figures and page of a comparison, and figures of studies; it is imported where one is drawn."""
+"""Figures and page of a comparison, and figures of studies (imported only when drawing)."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SHADES = (1.02, 1.1, 1.3, 2.0, 5.0)
 
 
 def picture(figure: Any, name: str, kind: str) -> bytes:
-    """Return a figure as a file: the same bytes for the same figure."""
+    """Return a figure as a reproducible file."""
     stream = io.BytesIO()
     metadata = {"Date": None} if kind == "svg" else None
     with rc_context({"svg.hashsalt": name}):
@@ -36,7 +36,7 @@ def picture(figure: Any, name: str, kind: str) -> bytes:
 
 
 def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
-    """Return a figure with one line of dots a name, logarithmic, its median marked; names from top to bottom.
+    """Return a logarithmic dot plot with one line per name, from top to bottom, and marked medians.
 
     ``values`` are positive figures by name; ``label`` says what they are, with their unit.
 
@@ -119,8 +119,8 @@ def _inside(ratios: Any) -> Any:
 # --- the page --------------------------------------------------------------------------------------------------------
 
 RATIOS = (
-    "Every replicate's figure over the reference's on the same data, and the geometric mean with its interval (green "
-    "or red where that leaves 1 out)."
+    "Metric of every replicate over that of the reference on the same data, and the geometric mean with its "
+    "95 % interval (green or red if the interval excludes 1)."
 )
 
 
@@ -133,12 +133,12 @@ def write_page(
     heading = f"{len({row['method'] for row in rows})} methods on {where}"
     height = max(18.0 * len(summary.standings) + 90, HEIGHT)
     ratios = figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height)
-    title = f"{summary.metric} of the rows held out; * where the interval leaves 1 out"
+    title = f"{summary.metric} of the held-out rows; * 95 % interval excludes 1"
     ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes)]
     sections: list[tuple[str, list[Block]]] = [
         ("Methods", ranking),
         ("By problem", [("table", _medians(rows, summary, problems))]),
-        ("How it was made", [("facts", [*axes.items(), *provenance.items()])]),
+        ("Provenance", [("facts", [*axes.items(), *provenance.items()])]),
     ]
     top: list[Block] = [("lead", {"text": headline(summary), "alarm": False}), ("figures", [ratios])]
     kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
@@ -157,7 +157,7 @@ def write_page(
 
 
 def headline(summary: Summary) -> str:
-    """Return which method is best in a sentence or two."""
+    """Return sentences on the best method."""
     best = summary.standings[0]
     better = [each for each in summary.standings if each.different and (each.ratio or 1) < 1]
     if best.method == summary.reference and not better:

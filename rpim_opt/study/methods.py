@@ -51,20 +51,20 @@ def each_once(where: str, labelled: Sequence[Labelled], what: str) -> tuple[Labe
     labels = [each.label for each in labelled]
     for label in labels:
         if labels.count(label) > 1:
-            raise InputError(where, f"'{label}' twice", f"a name of its own for each: {{'a name': {what}}}")
+            raise InputError(where, f"'{label}' twice", f"a unique name for each: {{'a name': {what}}}")
     return tuple(labelled)
 
 
 @dataclass(frozen=True, eq=False)
 class Source:
-    """A problem by its name; a function of a seed is another problem for every seed."""
+    """A named problem, or a function of a seed with another problem for every seed."""
 
     label: str
     problem: Instance | Callable[[int], Any]
 
     @property
     def drawn(self) -> bool:
-        """Whether a seed draws it."""
+        """Whether it depends on a seed."""
         return not isinstance(self.problem, Instance)
 
     def instance(self, seed: int) -> Instance:
@@ -78,7 +78,7 @@ class Source:
 
 
 def sources_of(problems: Any) -> tuple[Source, ...]:
-    """Return what a comparison runs on; InputError for what is no problem, and a name that occurs twice."""
+    """Return the problems of a comparison; InputError for anything else, and for duplicate names."""
     sources = each_once("problems", list(_sources(problems)), "problem")
     if not sources:
         raise InputError("problems", "none", ACCEPTED)
@@ -131,7 +131,7 @@ def _instance(given: Any, label: str) -> Instance | None:
 
 @dataclass(frozen=True)
 class Split:
-    """A way to hold configurations out: a random part of them, or each once in a number of folds."""
+    """A split of configurations: a random fraction held out, or folds."""
 
     label: str
     part: float = 0.0
@@ -151,7 +151,7 @@ class Split:
 
 
 def splits_of(stated: Any) -> tuple[Split, ...]:
-    """Return what ``splits`` says: ``"folder"``, a part (0.25), a number of folds (5), or several of them."""
+    """Return the splits: ``"folder"``, a fraction (0.25), a number of folds (5), or several of them."""
     if isinstance(stated, Sequence) and not isinstance(stated, str) and stated:
         return tuple(dict.fromkeys(_split(each) for each in stated))
     return (_split(stated),)
@@ -165,12 +165,12 @@ def _split(stated: Any) -> Split:
         return Split(f"{stated:g} held out", part=float(stated))
     if number and 2 <= stated <= MOST_FOLDS and stated == int(stated):
         return Split(f"{int(stated)} folds", folds=int(stated))
-    accepted = f"'folder', a part of the configurations between 0 and 1, or a number of folds, 2 to {MOST_FOLDS}"
+    accepted = f"'folder', a fraction of the configurations between 0 and 1, or a number of folds, 2 to {MOST_FOLDS}"
     raise InputError("splits", f"{stated!r}", accepted)
 
 
 def divide(instance: Instance, split: Split, fold: int, count: int | None, noise: float, seed: int) -> Instance:
-    """Return an instance with the data to fit, and the data that are held out as its validation data.
+    """Return an instance with the data to fit, and the held-out data as its validation data.
 
     Of the configurations that a split's fold (from 1) leaves, ``count`` are fitted, drawn at random, or all; their
     noise is ``noise`` times what it was. InputError for fewer configurations, or nothing that is held out.
@@ -182,7 +182,9 @@ def divide(instance: Instance, split: Split, fold: int, count: int | None, noise
         held_out = data.take(np.flatnonzero(held))
         data = data.take(np.flatnonzero(~held))
     if held_out is None:
-        raise InputError("splits", "no validation data", "a folder with some, a part (0.25), or folds (5)")
+        raise InputError(
+            "splits", "no validation data", "a folder with validation data, a fraction (0.25), or folds (5)"
+        )
     if count is not None:
         data = data.configurations(count, seed)
     if noise > 1:
@@ -191,7 +193,7 @@ def divide(instance: Instance, split: Split, fold: int, count: int | None, noise
 
 
 def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
-    """Return data with as much normal noise added that it is ``factor`` times what it was, and declared so.
+    """Return data with normal noise added to reach ``factor`` times the declared noise, which is updated.
 
     To a row of covariance S comes noise of covariance (factor^2 - 1) S; it then declares factor^2 S.
     """
@@ -211,7 +213,7 @@ def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
 
 @dataclass(frozen=True, eq=False)
 class Answer:
-    """What a method returns: the errors (N,) of data by dimension [m or rad], and its calibration if it is one."""
+    """Result of a method: errors (N,) of data by dimension [m or rad], and its calibration, if any."""
 
     errors: Callable[[Dataset, str], Array]
     result: Calibration | None = None
@@ -219,7 +221,7 @@ class Answer:
 
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A method by the names that rows call it, and the function of an instance whose result `answer_of` takes."""
+    """A method: its names in the rows, and its function of an instance, whose result `answer_of` interprets."""
 
     label: str
     solve: Callable[[Instance], Any]
@@ -228,7 +230,7 @@ class Method:
 
 
 def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
-    """Return what a function of a problem returned: a calibration, a baseline, x (n,), or a function of q (N, dof).
+    """Interpret the result of a method: a calibration, a baseline, x (n,), or a function of q (N, dof).
 
     Instead of x alone it may be a problem that identifies other parameters, and x; InputError for anything else.
     """
@@ -288,7 +290,7 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
         for selector, weight in pairs:
             label = name if selector == NONE else f"{name}, {selector}"
             if name == selector == FOLDER:
-                label = "as the folder says"
+                label = "as in the folder"
             own = stated if selector == FOLDER else {**stated, "weight": weight}
             methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
     for label, each in _listed(functions):
@@ -348,7 +350,7 @@ def _selector(label: str, each: Any) -> tuple[str, Any]:
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """The answer of a method, and the data that it did not see: what a metric of one's own is a function of.
+    """Argument of metrics: the result of a method, and the held-out data.
 
     The ``problem`` was fitted and the rows ``held_out`` were not; ``answer`` has the method's errors of data, and the
     ``result`` of a calibration; ``seconds`` is its time.
@@ -372,7 +374,7 @@ class Fitted:
         return self.answer.errors(self.held_out, dimension)
 
     def fit_errors(self) -> Array:
-        """Return those (N,) [m] of the rows that were fitted."""
+        """Return the errors (N,) [m] of the identification rows."""
         return self.answer.errors(self.problem.data, "length")
 
 
@@ -406,7 +408,7 @@ USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")
 
 
 def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
-    """Return metrics by their names, which are columns and carry their units; InputError for anything else."""
+    """Return metrics by their names with units; InputError for anything else."""
     metrics = dict(_named(label, each, METRICS, "metrics", "a fit") for label, each in _listed(stated))
     if not metrics:
         raise InputError("metrics", "none", f"functions of a fit, or {', '.join(METRICS)}")
@@ -414,7 +416,7 @@ def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
 
 
 def measure(instance: Instance, answer: Answer, seconds: float, metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the metrics of an answer; None for one that is no number."""
+    """Return the metrics of a result; None for a metric that is not finite."""
     if instance.validation is None:
         raise InputError("splits", "nothing held out", "validation data")
     fitted = Fitted(instance.problem, instance.validation, answer, seconds)
@@ -428,7 +430,7 @@ def measure(instance: Instance, answer: Answer, seconds: float, metrics: Mapping
 def replicate(
     source: Source, split: Split, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
 ) -> Row:
-    """Return the figures of a method on a problem's split; whatever goes wrong becomes a status and a reason."""
+    """Return the metrics of a method on one split of a problem; a failure becomes a status and a reason."""
     row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
     seed = case["seed"]
     try:

@@ -1,4 +1,4 @@
-"""Methods ranked by what each does on the same replicates, with intervals of what is independent."""
+"""Ranking of methods by paired replicates, with confidence intervals over independent units."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ Rows = Sequence[Mapping[str, Any]]
 
 @dataclass(frozen=True)
 class Standing:
-    """How a method does, and how it does against the reference on the same replicates.
+    """Metrics of a method, and its ratio to the reference on the same replicates.
 
     Of its ``replicates`` some are ``missing`` (without a figure) or ``unconverged`` (their figures count); ``median``
     and ``worst`` are of its figures. ``ratio`` is the geometric mean of its figures over those of the reference, every
@@ -65,16 +65,16 @@ class Standing:
 
     @property
     def different(self) -> bool:
-        """Whether the interval of the ratio leaves one out."""
+        """Whether the interval of the ratio excludes 1."""
         return self.low is not None and self.high is not None and not self.low <= 1 <= self.high
 
 
 @dataclass(frozen=True)
 class Summary:
-    """Methods by their figures, those that are best in the geometric mean first.
+    """Methods ranked by the geometric mean of their metric.
 
     Less of the ``metric`` is better; others are compared with the ``reference``. ``standings`` are one a method that
-    has figures; ``notes`` say of what the intervals speak, and what has no figures, with the reason.
+    has figures; ``notes`` say of what the intervals speak, and what has no results, with the reason.
 
     >>> import rpim_opt as ro
     >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
@@ -96,10 +96,10 @@ class Summary:
 
     @property
     def header(self) -> tuple[str, ...]:
-        """What the columns are called."""
+        """The column names."""
         over = f"over {self.reference}"
         columns = ("method", f"median {self.metric}", "worst", over, "95 % interval", "better/tie/worse")
-        return (*columns, "no figure") if any(each.missing for each in self.standings) else columns
+        return (*columns, "no result") if any(each.missing for each in self.standings) else columns
 
     def cells(self) -> list[list[str]]:
         """Return the table's rows as text."""
@@ -125,7 +125,7 @@ class Summary:
 
 
 def number(value: float | None) -> str:
-    """Return a figure with three digits; nothing for none."""
+    """Return a number with three digits; an empty text for None."""
     if value is None:
         return ""
     if 1e-3 <= abs(value) < 1e4:
@@ -135,7 +135,7 @@ def number(value: float | None) -> str:
 
 
 def summarize(rows: Rows, metric: str, reference: str, drawn: AbstractSet[str]) -> Summary:
-    """Return the methods in their order, each against a reference; ``drawn`` are problems that a seed draws."""
+    """Return the methods in order, each against a reference; ``drawn`` are problems that depend on a seed."""
     of = figures(rows, metric)
     other = of[reference]
     least = np.finfo(float).tiny  # figures that are zero are as good as a rounding error
@@ -159,7 +159,7 @@ def summarize(rows: Rows, metric: str, reference: str, drawn: AbstractSet[str]) 
 
 
 def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
-    """Return the figures of every method, by what they were measured on."""
+    """Return the metrics of every method by replicate."""
     of: dict[str, dict[Pair, float]] = {}
     for row in rows:
         own = of.setdefault(row["method"], {})
@@ -210,7 +210,7 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
 
 
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> tuple[str, ...]:
-    """Return what a reader must know besides the table."""
+    """Return the notes below the table."""
     said = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
     compared = sum(each.low is not None and each.method != reference for each in standings)
     if compared:
@@ -219,7 +219,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         if len(problems) < ENOUGH:
             of_family = problems <= drawn
             scope = "other arms of the same family" if of_family else "these problems alone, with other seeds or folds"
-        text = f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * leaves 1 out."
+        text = f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1."
         if compared > 1:
             chance = (1 - CONFIDENCE) * compared
             text += " No correction for multiple comparisons: without any difference, "

@@ -98,16 +98,16 @@ def _resumed(
         base.executemany("INSERT INTO code VALUES (?, ?)", list(code.items()))
         return {}
     if resume is None:
-        accepted = "resume, to continue with them, or no-resume, to start again"
+        accepted = "--resume to continue with them, or --no-resume to start again"
         raise InputError("resume", f"{len(stored)} replicates of an interrupted run", accepted, path)
     for part in [*code, *known]:
         if code.get(part) != known.get(part):
-            accepted = "what began, or no-resume, to start again"
+            accepted = "the same code, data and versions, or --no-resume to start again"
             raise InputError("resume", f"replicates of another {part}", accepted, path)
     for key, text, digest in stored:
         if digest != _digest(code, key, text):
             found = f"a replicate that was changed afterwards: {key}"
-            raise InputError("resume", found, "replicates as they were computed, or no-resume", path)
+            raise InputError("resume", found, "unmodified replicates, or --no-resume", path)
     return {key: parse_json(text) for key, text, _ in stored}
 
 
@@ -127,14 +127,14 @@ def _sentence(path: Path | None) -> Iterator[None]:
 
 
 def remove_journal(path: Path) -> None:
-    """Remove a journal, and the file beside it that a kill may leave."""
+    """Remove a journal, and the auxiliary file that an interrupted process may leave."""
     with refused(path):
         path.unlink(missing_ok=True)
         path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
 
 
 def require_package(name: str, where: str) -> None:
-    """Refuse what needs a package of the extra ``studies`` that is not there, before anything is computed."""
+    """Refuse to start without a required package of the extra ``studies``."""
     if find_spec(name) is None:
         raise InputError(where, f"no package {name}", "pip install 'rpim-opt[studies]'")
 
@@ -143,7 +143,7 @@ def require_package(name: str, where: str) -> None:
 
 
 def compute(tasks: Sequence[tuple[str, Work]], workers: int, scheduler: Any) -> Iterator[tuple[str, Row]]:
-    """Return an iterator of keys with what was computed, as it is finished.
+    """Yield keys and results as they are finished.
 
     ``workers`` are processes on this machine, -1 for all processors; ``scheduler`` the address of a Dask scheduler to
     compute on instead, or a client of one.
@@ -178,7 +178,7 @@ def _in_processes(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[t
         yield from finished
     except BrokenExecutor as error:
         raise RpimError(
-            f"A process ended before its replicate was done: {error} Finished replicates are kept."
+            f"A process ended before its replicate was finished: {error} Finished replicates are kept."
         ) from None
 
 
@@ -200,14 +200,14 @@ def _on_cluster(tasks: Sequence[tuple[str, Work]], scheduler: Any) -> Iterator[t
                 yield future.result()
         except (KilledWorker, CancelledError) as error:  # whoever computes it dies, or the scheduler has
             said = next(iter(str(error).splitlines()), type(error).__name__)
-            raise RpimError(f"Dask gave a replicate up: {said} Finished replicates are kept.") from None
+            raise RpimError(f"Dask failed to compute a replicate: {said} Finished replicates are kept.") from None
 
 
 # --- what made them --------------------------------------------------------------------------------------------------
 
 
 def package_code() -> dict[str, str]:
-    """Return digests of the package and of its problems, and the versions of what computes."""
+    """Return digests of the package and its problems, and the versions of numerical libraries."""
     digests = {}
     for name, folder, pattern in (("package", PACKAGE, "**/*.py"), ("set of problems", problems_folder(), "*/*.*")):
         content = sha256()
@@ -219,7 +219,7 @@ def package_code() -> dict[str, str]:
 
 
 def versions() -> str:
-    """Return the versions of what computes."""
+    """Return the versions of numerical libraries."""
     packages = ", ".join(f"{package} {version_of(package)}" for package in PACKAGES)
     return f"{platform.python_implementation()} {platform.python_version()}, {packages}"
 
@@ -237,7 +237,7 @@ def package_state() -> str:
 
 
 def commit(folder: Path, *paths: Path) -> str:
-    """Return the commit that paths are of, and whether it lacks them (``untracked``) or has others (``dirty``).
+    """Return the commit of some paths, with ``untracked`` or ``dirty`` if they differ from it.
 
     Results of studies do not count.
     """

@@ -1,4 +1,4 @@
-"""Studies: a question with cases in a Python file, run in parallel, resumed, and gated against a baseline."""
+"""Studies: Python files with a question and cases, run in parallel, resumable, and compared with a baseline."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ REPLICATES = "replicates"
 
 @dataclass(frozen=True)
 class Metric:
-    """A figure of a study that must not get worse: its direction, and by how much of the baseline it may vary.
+    """A metric of a study that must not get worse: its direction, and its relative tolerance.
 
     ``better`` is ``"lower"`` or ``"higher"``, ``tolerance`` what part of the baseline it may be worse by.
 
@@ -127,7 +127,7 @@ def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
 
 
 def files_of(path: Path, study: ModuleType) -> dict[str, str]:
-    """Return digests of the files that a study's replicates follow from, by their names in its folder.
+    """Return digests of the files that a study depends on, by their names in its folder.
 
     That is whatever lies in its folder. Where the study says ``DEPENDS = ["data/*.csv"]``, it is that and Python files;
     hidden files never count, results of studies where they are named.
@@ -169,7 +169,7 @@ def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
 
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:
-    """Return which command, commit, files and versions make the replicates."""
+    """Return a sentence on the command, commit, files and versions that produce the replicates."""
     own = path.parent == studies_folder()
     command = f"rpim-opt study {_label(path) if own else path.name}{' --quick' if quick else ''}"
     if own:
@@ -262,7 +262,7 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
 
 
 def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> list[str]:
-    """Return a sentence for every metric that is worse than ``baselines.json`` beside the study allows."""
+    """Return a sentence for every metric that is worse than ``baselines.json`` of the study allows."""
     file = find_study(name)
     path = file.parent / "baselines.json"
     known = read_json(path) if path.is_file() else {}

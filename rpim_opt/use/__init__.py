@@ -1,4 +1,4 @@
-"""What a calibrated robot is for."""
+"""Uses of a calibrated robot: compensation, validation, recalibration, monitoring, export."""
 
 import lazy_loader
 

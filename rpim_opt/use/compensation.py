@@ -1,4 +1,4 @@
-"""Joint commands that bring the calibrated robot where its controller assumes it, and the errors that remain."""
+"""Compensation: corrected joint commands for the calibrated robot, and the remaining errors."""
 
 from __future__ import annotations
 
@@ -110,12 +110,12 @@ class Compensation:
                 where = " in the robot's base frame" if status == UNREACHABLE else ""
                 lines.append(f"{status.capitalize()}{where}: {named}.")
         if self.missed:
-            lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target: do not run these rows.")
+            lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target; do not execute these rows.")
         return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])
 
     @property
     def missed(self) -> list[str]:
-        """The labels of rows whose commands miss the target: unreachable, or above the limit."""
+        """The labels of rows whose commands miss the target: unreachable, or error above the limit."""
         return [label for label, each in zip(self.label, self.status, strict=True) if each in (UNREACHABLE, ABOVE)]
 
     def _largest_corrections(self) -> dict[str, float]:
@@ -145,7 +145,7 @@ class Compensation:
         }
 
     def csv(self) -> str:
-        """Return labels, corrected commands, what is left of the errors, and status as CSV text."""
+        """Return labels, corrected commands, remaining errors and status as CSV text."""
         return noted(columns_csv(self._columns(), joint_columns(self.robot.joint_dimensions)), ".csv", self.note)
 
 
@@ -172,7 +172,7 @@ def compensate(
     robot: str = "",
     despite_verdict: bool = False,
 ) -> Compensation:
-    """Correct joint commands so that the calibrated robot goes where the nominal one would.
+    """Correct joint commands so that the calibrated robot reaches the poses of the nominal one.
 
     A target is the pose of the tool in the robot's base: that of the nominal robot at a command q, or one given.
     The corrected command q + D minimizes, within the joint limits and with no joint moved by more than ``largest``,
@@ -248,8 +248,11 @@ def compensate(
     mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
     if payload is not None or payload_centre is not None:
         if not cell.loads.payload:
-            accepted = "a calibration that identified compliances from the torques of gravity, or a term that sees it"
-            raise InputError("payload", "a payload that bends nothing", accepted)
+            accepted = (
+                "a calibration with compliances identified from torques of gravity, or a term that depends"
+                " on the payload"
+            )
+            raise InputError("payload", "a payload without effect on the model", accepted)
         if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
             raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
     if cell.loads.payload:
@@ -368,16 +371,18 @@ class _Tooled(NamedTuple):
             if C is not None:
                 still = identified[p.identified]
                 C = C[np.ix_(still, still)]
-            point = f"Moved is the tool as stated, at {placed(frame)} in the flange frame."
+            point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
             return cls(replace(p, nominal=nominal, identified=identified), x, C, marker, point, True)
         where = f"nominally (stated, or registered) at {placed(nominal[at])} in the flange frame"
         if (np.abs(x[at]) > MISPLACED * (np.minimum(p.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)).any():
             found = p.values(x)[at]
-            where = f"as identified at {placed(found)} in the flange frame; its nominal place is no TCP, as "
+            where = (
+                f"as identified at {placed(found)} in the flange frame; its nominal position is not used as TCP, since "
+            )
             where += f"the data contradict it ({placed(nominal[at])})"
             nominal[at] = found
             x[at] = 0.0
-        point = f"Moved is the reflector, {where}: a controller with another TCP needs --tool."
+        point = f"Target point: the reflector, {where}; a controller with another TCP needs --tool."
         return cls(replace(p, nominal=nominal), x, C, marker, point)
 
 

@@ -1,4 +1,4 @@
-"""The identified robot, and files of other tools that hold it: all of them are written, or none."""
+"""Export of the identified robot to files of other tools."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 
 
 def identified(result: Calibration, marker: str | None = None) -> Described:
-    """Return what a calibration identified: the robot, its base in the instrument's frame, and a reflector as tool.
+    """Return the identified robot, its base in the instrument's frame, and a reflector as tool.
 
     Parameters
     ----------
@@ -67,7 +67,7 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     of = dict(zip(p.names, parameter_values(result.problem, result.x), strict=True))
     extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
     if extras:
-        accepted = "MDH parameters, base and tool: files hold nothing else; `compensate` corrects commands for them"
+        accepted = "MDH parameters, base and tool: files support nothing else; use `compensate` for other parameters"
         raise InputError("the calibration", listed(extras, 6), accepted)
     prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
     if prefix + "x" not in of:
@@ -92,7 +92,7 @@ def export_files(
     despite_verdict: bool = False,
     **frames: Any,
 ) -> tuple[list[Path], list[str]]:
-    """Write the identified robot for other tools: all files that are asked for, or none.
+    """Export the identified robot to files of other tools; all requested files are written, or none.
 
     Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
 
@@ -148,7 +148,7 @@ def export_files(
         if len(sources) > 1 or target.is_dir():
             target = target / source.name
         if target.resolve() == source.resolve():
-            raise InputError("--out", f"the original, {source}", "another place: the original stays")
+            raise InputError("--out", f"the original, {source}", "another file: the original is not overwritten")
         writers.append((target, partial(write, source)))
     plain = [
         (mdh, lambda target: write_robot(identified(result, marker).robot, target)),
@@ -178,7 +178,7 @@ def export_files(
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
-    """Return the calibration without the model extensions that the evidence added, and what that costs in a sentence.
+    """Return the calibration without the model extensions selected by evidence, and a sentence on the loss of accuracy.
 
     Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
     measurements are calibrated once more. A calibration to which nothing was added is returned as it is.
@@ -243,7 +243,7 @@ def export_urdf(
     marker: str | None = None,
     despite_verdict: bool = False,
 ) -> list[str]:
-    """Write a URDF with the identified robot's origins, and base and tool where they are the file's.
+    """Write a URDF with the identified origins, and base and tool if they belong to the file.
 
     An identified base or reflector that lies near the file's root or tip is the same frame, known better, and is
     written. Elsewhere it is the instrument's or the reflector's own, and the file's frame stays as it is. Returned is a
@@ -316,7 +316,7 @@ def export_urdf(
 
 
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
-    """Write a ``calibration.conf``; what alpha1 and a1 say is where the controller's Base is, and is left out."""
+    """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
     robot = identified(result).robot
     nominal = result.problem.robot
     if np.abs(nominal.mdh[0, :2]).max() > 0:
@@ -327,8 +327,8 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     notes = []
     if b"joint_checksum" in read_bytes(Path(source)):
         notes.append(
-            "joint_checksum stands as in the source: its algorithm is not published, so that a controller may "
-            "refuse the file. Keep the original."
+            "joint_checksum stands as in the source: its algorithm is not published, so a controller may refuse "
+            "the file. Keep the original."
         )
     if not np.array_equal(mdh, robot.mdh):
         notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
@@ -373,7 +373,7 @@ def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple
 
 
 def noted(text: str, ending: str, note: str) -> str:
-    r"""Return the text of a file with a note: as a comment, of CSV as a column, of JSON in the key ``source``.
+    r"""Return the text of a file with a note: a comment, a column of CSV, or the key ``source`` of JSON.
 
     >>> from rpim_opt.use.export import noted
     >>> noted("a: 1\n", ".yaml", "Not delivered.").splitlines()
@@ -395,12 +395,12 @@ def noted(text: str, ending: str, note: str) -> str:
 
 
 def write_all(writers: Sequence[Writer], note: str = "") -> list[str]:
-    """Write several files with a note in each, or none if one cannot be written; return what their writers say."""
+    """Write several files with a note in each, or none if one fails; return the writers' messages."""
     targets = [target for target, _ in writers]
     for target in targets:
         if target.is_dir() or targets.count(target) > 1:
-            found = "a folder" if target.is_dir() else "two files for it"
-            raise InputError("the file", found, "a name of its own for every file", target)
+            found = "a folder" if target.is_dir() else "two files with this name"
+            raise InputError("the file", found, "a unique name for every file", target)
     notes: list[str] = []
     contents: dict[Path, bytes] = {}
     with TemporaryDirectory() as folder:

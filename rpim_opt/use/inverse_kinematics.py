@@ -1,4 +1,4 @@
-"""Inverse kinematics of a robot whose parameters are all known, within joint limits, for many rows at once."""
+"""Inverse kinematics of a robot with known parameters, within joint limits, for many rows at once."""
 
 from __future__ import annotations
 
@@ -164,7 +164,7 @@ def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
 
 
 def joint_units(robot: Robot, equations: int) -> Array:
-    """Return what counts as one for every joint: the ranges where there are more joints than equations, else 1."""
+    """Return the unit of every joint: its range if there are more joints than equations, else 1."""
     span = np.ptp(robot.limits, axis=1)
     unit = np.ones(robot.dof)
     if robot.dof > equations:
@@ -176,7 +176,7 @@ def joint_units(robot: Robot, equations: int) -> Array:
 
 
 def attainable(J: Array) -> Array:
-    """Return matrices W (N or 1, k, k) that project errors on those that count, from Jacobians (N, k, n).
+    """Return matrices W (N or 1, k, k) that project errors on the attainable ones, from Jacobians (N, k, n).
 
     With six joints or more, or positions alone, all do. With fewer position comes first: of the orientation counts what
     can be turned without moving the point, which makes as many equations as joints.

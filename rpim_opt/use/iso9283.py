@@ -1,4 +1,4 @@
-"""Pose accuracy and pose repeatability as ISO 9283:1998 defines them (7.2.1 and 7.2.2), of arrays and of tables."""
+"""Pose accuracy and pose repeatability by ISO 9283:1998 (7.2.1 and 7.2.2), from arrays and tables."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Triple = tuple[float, float, float]
 
 
 class PosePerformance(NamedTuple):
-    """Accuracy and repeatability at one pose, of so many approaches (``cycles``).
+    """Accuracy and repeatability at one pose, from ``cycles`` approaches.
 
     AP and AP_axes are the distance [m] of the barycentre of the attained positions from the command, and along x, y, z;
     None where no command is known. RP is the positioning repeatability [m]. AP_angles and RP_angles are of the
@@ -104,7 +104,7 @@ class Performance(Tabled):
             there = f"there {verb} {counted(len(self.poses), 'pose')}, approached {times} times"
             lines.append(f"The standard has {POSES} poses approached {CYCLES} times each: {there}.")
         if self.accuracy is None:
-            lines.append("No command is known: there is repeatability, and no accuracy.")
+            lines.append("No commanded poses are known: repeatability is computed, accuracy is not.")
         return lines
 
     def _frame_rows(self) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Drift of a calibrated robot in check readings over time: each check, their cumulative sum, and every parameter."""
+"""Monitoring of a calibrated robot by check readings: single checks, cumulative sum (CUSUM), drifting parameters."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ class Monitoring:
 
     @property
     def alarm(self) -> int | None:
-        """The first check at which the sum passes its limit; None where it does not."""
+        """The first check at which the cumulative sum exceeds its limit; None if it does not."""
         return next((int(i) for i in np.flatnonzero(self.sums > self.limit)), None)
 
     @property
@@ -127,7 +127,7 @@ class Monitoring:
         lines = [f"The robot deviates from its calibration in {count}." if self.drifts else f"No drift in {count}."]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
-            lines.append(f"Beyond the interval of a new reading: {listed(named, between='; ')}.")
+            lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
         if self.alarm is not None:
             since = self._named(self._since(self.alarm))
             lines.append(f"Cumulative sum above its limit: alarm at {self._named(self.alarm)}, since {since}.")
@@ -141,7 +141,7 @@ class Monitoring:
                 f"{cause.gain:.1f}, p-value {cause.p_value:.2g}."
             )
         elif self.drifts:
-            lines.append("No parameter and no frame explains it alone.")
+            lines.append("No single parameter or frame explains it.")
         if self.drifts and self.mistake:
             lines.append(self.mistake)
         worst = int(np.argmax(self.sigmas / self.allowed))
@@ -174,7 +174,7 @@ class Monitoring:
 
 
 def monitor(result: Calibration, data: Dataset, when: Array | None = None, times: tuple[str, ...] = ()) -> Monitoring:
-    """Compare checks over time with the predictions of a calibration: each alone, and all together.
+    """Compare checks over time with the predictions of a calibration, singly and by their cumulative sum.
 
     A check is judged by the prediction interval of a new reading, given the calibration and all checks before it; the
     innovations are summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before

@@ -1,4 +1,4 @@
-"""Tables of targets, measurements and checks, read as the calibration's own were."""
+"""Reading of targets, measurements and checks, with the options of the calibration's tables."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
 def read_commands(
     result: Calibration, source: str | Path, options: TableOptions | None = None
 ) -> tuple[Targets, tuple[str, ...]]:
-    """Return the targets of a table that is read as the calibration's own were, and the columns that were left out."""
+    """Return the targets of a table, read with the options of the calibration's tables, and the ignored columns."""
     found = _understood(result, source, pose, options or TableOptions(), targets=True)
     try:
         if any(each.doubt == "quaternion" for each in found.tables):
@@ -163,7 +163,7 @@ def read_measurements(
     columns = found.columns
     if found.left_out and not columns:
         accepted = f"joints' values and {', '.join(kind.columns)}"
-        known = f"nothing that is known among {', '.join(found.left_out)}"[:200]
+        known = f"only unknown columns {', '.join(found.left_out)}"[:200]
         raise InputError("the header", known, accepted, found.file)
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):

@@ -1,4 +1,4 @@
-"""Recalibration with the previous result as prior: whether the robot changed, which parameters, and the new result."""
+"""Recalibration with the previous result as prior: detection of changed parameters, and the new result."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ class Fit(NamedTuple):
 
     @property
     def likely(self) -> bool:
-        """Whether chance alone makes it as large in more than one robot of a hundred."""
+        """Whether its p-value is above 0.01."""
         return self.probability >= FALSE_ALARM
 
     def __str__(self) -> str:
@@ -72,7 +72,7 @@ class Fit(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """A change that may be why readings miss their predictions.
+    """A change that may explain the deviation of readings from their predictions.
 
     Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much
     chi-squared falls with it, the p-value of that where nothing changed, and the posterior probability.
@@ -87,7 +87,7 @@ class Cause(NamedTuple):
 
 
 class Moved(NamedTuple):
-    """By how much a parameter moved, and the standard deviation of that [SI]."""
+    """Change of a parameter, and its standard deviation [SI]."""
 
     name: str
     dimension: str
@@ -125,12 +125,12 @@ class Update:
 
     @property
     def changed(self) -> bool:
-        """Whether the robot, or where it stands, is not what it was."""
+        """Whether the robot or one of its frames changed."""
         return any(cause.kind != "reading" for cause in self.changes)
 
     @property
     def explained(self) -> bool:
-        """Whether readings and the previous calibration agree, but for the changes."""
+        """Whether readings and the previous calibration agree, apart from the changes."""
         return self.after.likely
 
     def content(self) -> dict[str, Any]:
@@ -155,7 +155,7 @@ class Update:
             verdict = "The robot has changed" if self.changed else "The robot has not changed, but readings are wrong"
             lines = [f"{verdict}: {self.before} as it was."]
         elif self.before.likely:
-            lines = [f"The robot has not changed, as far as {count} can tell: {self.before}."]
+            lines = [f"No change of the robot is detectable from {count}: {self.before}."]
         else:
             lines = [f"{count} lie outside the prediction intervals of the last calibration: {self.before}."]
         for cause in self.changes:
@@ -166,9 +166,9 @@ class Update:
             lines.append(f"Moved since: {joined([str(each) for each in self.moved])}.")
         rivals = [c.name for c in self.causes[1:] if self.changes and c.probability > RIVAL]
         if rivals:
-            lines.append(f"These readings do not distinguish it from a change of {joined(rivals)}: measure more.")
+            lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
         if self.changes:
-            lines.append(f"With these changes: {self.after}.")
+            lines.append(f"After these changes: {self.after}.")
         if not self.explained:
             lines.append(
                 "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "
@@ -208,7 +208,7 @@ def update(
     >>> first = ro.calibrate(problem.on(problem.data.take(np.arange(32))))
     >>> found = ro.use.update(first, problem.data.take(np.arange(32, 40)))
     >>> print(str(found).splitlines()[0])
-    The robot has not changed, as far as 8 readings can tell: chi-squared 25.9 of 24, p-value 0.37.
+    No change of the robot is detectable from 8 readings: chi-squared 25.9 of 24, p-value 0.37.
     >>> [earlier.title for earlier in found.result.record.earlier], found.changes
     (['ABB IRB 120-3/0.58'], ())
     """
@@ -289,7 +289,7 @@ def update(
 
 
 def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
-    """Return a result's problem with other measurements; sessions that it does not know stand behind."""
+    """Return a result's problem with other measurements; new sessions are appended."""
     problem = result.problem
     if not isinstance(problem, CalibrationProblem):
         raise InputError("the result", "a calibration of data in blocks", "one of measurements in memory")
@@ -357,7 +357,7 @@ def _recalibrated(
 
 
 class Misfit:
-    """By how much new readings miss their predictions, in standard deviations of those.
+    """Deviations of new readings from their predictions, in standard deviations.
 
     With the readings' equations A z ~ b and the prior's L z ~ c, all in standard deviations, a change d of some
     deviations moves the prior alone, L (z - d) ~ c. By the residual e of both together and M = I - B (B'B)^-1 B' of
@@ -402,7 +402,7 @@ class Misfit:
 
 
 def candidates(free: Parameters, reset: Sequence[str] = ()) -> list[Cause]:
-    """Return the changes to look for: each of the robot's parameters, and every frame as a whole, but for the reset."""
+    """Return the candidate changes: all parameters of the robot and all frames as a whole, without the reset ones."""
     causes = []
     frames: dict[str, list[str]] = {}
     for name, frame in zip(free.names, free.of_frames, strict=True):

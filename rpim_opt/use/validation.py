@@ -60,12 +60,12 @@ class Validation:
 
     @property
     def worse(self) -> bool:
-        """Whether the errors are larger than the nominal robot's, beyond chance."""
+        """Whether the errors are significantly larger than those of the nominal robot."""
         return worse_than_nominal(self.nominal, self.error)
 
     @property
     def beyond(self) -> tuple[int, ...]:
-        """Rows beyond what the prediction's uncertainty allows, the worst first."""
+        """Rows outside their prediction intervals, the worst first."""
         order = np.argsort(-np.nan_to_num(self.sigmas / self.allowed))
         return tuple(int(i) for i in order if self.sigmas[i] > self.allowed[i])
 
@@ -113,7 +113,7 @@ class Validation:
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
         covered = ""
         if self.coverage is not None:
-            covered = f" {100 * self.coverage:.0f} % of the coordinates lie in their 95 % intervals of a reading."
+            covered = f" {100 * self.coverage:.0f} % of the coordinates are within their 95 % prediction intervals."
         named = [f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond]
         judgement = f"Outside their prediction intervals: {listed(named)}.{covered}"
         if not np.isfinite(self.sigmas).any():
@@ -131,7 +131,7 @@ class Validation:
 
 
 def validate(result: Calibration, data: Dataset) -> Validation:
-    """Return the errors of a calibration on measurements, and whether its uncertainty explains them.
+    """Return the errors of a calibration on new measurements, compared with its predicted uncertainty.
 
     ``data`` are in the same instrument's frame, by reflectors of the calibration, which may be one of `load_result`.
 

@@ -158,7 +158,7 @@ def both(*changes: Change) -> Change:
     return changed
 
 
-MAPPED = "Joint mapping found from the data"
+MAPPED = "Joint mapping estimated from the data"
 """What is said where signs and zeros of joints were found: the calibration is right then."""
 BY_TEXT = sorted(range(COUNT), key=lambda i: str(i + 1))
 IN_TABLES: dict[str, tuple[Change, str]] = {

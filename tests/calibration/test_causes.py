@@ -330,7 +330,7 @@ def test_rows_that_were_left_out_together_are_an_instrument_that_moved() -> None
     problem = simulated_arm("ur5e")
     last = np.arange(COUNT)[:, None] >= COUNT - 5
     causes = likely_causes(ro.calibrate(values(lambda y: y + last * [0.03, -0.02, 0.01])(problem)))
-    assert any("did the instrument or the robot's foot move" in text for text in causes), causes
+    assert any("did the instrument or the robot's base move" in text for text in causes), causes
 
 
 def test_many_scattered_outliers_are_no_instrument_that_moved() -> None:

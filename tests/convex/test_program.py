@@ -152,7 +152,7 @@ def test_squares_of_a_loss_have_its_value() -> None:
         squared = program.squared
         value = np.sum((squared.A @ Z - squared.b) ** 2) + squared.offset
         assert value == pytest.approx(program.value(Z)[0], rel=1e-9)
-    with pytest.raises(ro.InputError, match="a loss that is no square"):
+    with pytest.raises(ro.InputError, match="a loss that is not quadratic"):
         _ = ro.convex.pose(ro.robust, MODEL).squared
 
 

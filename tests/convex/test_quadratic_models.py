@@ -125,7 +125,7 @@ def test_what_is_a_sum_over_residuals() -> None:
 
 
 def test_what_triangles_cannot_hold_is_refused() -> None:
-    with pytest.raises(ro.InputError, match="found a loss that is no sum, with data in blocks"):
+    with pytest.raises(ro.InputError, match="found a loss that is not a sum, with data in blocks"):
         in_blocks(ro.minimax, lambda: 120)
     squares = Squares(cp.norm1, "bent", "equation")
     flat: Any = SimpleNamespace(slope=lambda v: None)

@@ -197,7 +197,7 @@ def test_ready_is_what_means_the_same_whenever_it_is_asked() -> None:
 
 @pytest.mark.parametrize("threshold", [0.0, -1.0, np.inf, np.nan])
 def test_a_threshold_is_above_zero(threshold: float) -> None:
-    with pytest.raises(ro.InputError, match="a number of sigmas above zero"):
+    with pytest.raises(ro.InputError, match="a positive number of standard deviations"):
         ro.huber(threshold)
 
 
@@ -214,7 +214,5 @@ def test_a_loss_is_over_equations_or_configurations() -> None:
 
 
 def test_what_a_file_could_not_hold_says_so() -> None:
-    with pytest.raises(
-        ro.InputError, match="formulation 'mine': found functions that the file of a result cannot hold"
-    ):
+    with pytest.raises(ro.InputError, match="formulation 'mine': found functions that a result file cannot hold"):
         lost("mine")(1, 2, 3)

@@ -233,7 +233,7 @@ def test_two_points_of_a_distance() -> None:
     assert np.array_equal(same.q[0, 0], same.q[0, 1])
     moved = read(base + ",to_q1_deg,to_q2_deg", "a,A,A,1,2,30,3,4", noise, "distance").blocks[0]
     assert np.degrees(moved.q[0]) == pytest.approx(np.array([[1, 2], [3, 4]]))
-    with pytest.raises(ro.InputError, match="row a: found twice the same reflector in the same configuration"):
+    with pytest.raises(ro.InputError, match="row a: found the same reflector twice in one configuration"):
         read(base, "a,A,A,1,2,30", noise, "distance")
     with pytest.raises(ro.InputError, match="no column for 'to_q2'"):
         read(base + ",to_q1_deg", "a,A,A,1,2,30,3", noise, "distance")

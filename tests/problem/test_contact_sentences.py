@@ -36,7 +36,7 @@ def sockets(names: tuple[str, ...]) -> ro.CalibrationProblem:
 def test_the_scale_that_touches_show_is_said() -> None:
     many = " ".join(contact_sentences(sockets(("A", "B", "C", "D"))))
     assert "24 touches of 4 points" in many
-    assert "a known distance between two touched places ([[known_distance]]) would determine it." in many
+    assert "a known distance between two touched points ([[known_distance]]) would determine it." in many
     assert len(list(contact_sentences(ro.load("contact").problem))) == 1
     planes = " ".join(contact_sentences(ro.load("datum_cube").problem))
     assert " planes: " in planes
@@ -90,7 +90,7 @@ def test_rows_that_do_not_belong_together_are_named() -> None:
     problem, _ = simulated(("theta2",), 30)
     assert list(unrelated_rows(problem, 0.05)) == []
     (text,) = unrelated_rows(problem, 1.0)
-    assert "do the rows of the two belong together?" in text
+    assert "do the rows of the two tables match?" in text
 
 
 def test_a_lost_decimal_point_is_named() -> None:

@@ -174,4 +174,4 @@ def test_poses_are_designed_with_their_orientations() -> None:
 def test_a_bound_that_says_nothing_is_said() -> None:
     """One row of many unknowns: what the best set would reach is not known within a factor of two."""
     found = ro.problem.Design(np.array([1]), np.ones(3), "V", 3.0, 1.0, 2.0)
-    assert str(found).endswith("too few for a useful bound on how near the best set is; choose more.")
+    assert str(found).endswith("too few for a useful optimality bound; choose more.")

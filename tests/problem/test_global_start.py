@@ -87,7 +87,7 @@ def test_random_signs_and_zeros_are_found(name: str) -> None:
     result = ro.calibrate(problem)
     assert result.converged
     assert result.mapping is not None
-    assert "Joint mapping found from the data: " in result.message
+    assert "Joint mapping estimated from the data: " in result.message
     assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen)
     assert np.abs(np.degrees(result.x[["theta" in n for n in result.problem.parameters.free.names]])).max() < 3
 

@@ -146,7 +146,7 @@ def test_a_report_says_what_a_reader_must_know() -> None:
     text = page(result)
     assert "Not delivered: this robot should not be used." in text
     assert "40 validation rows repeat" in page(replace(result, record=ro.data.Record(validation=result.problem.data)))
-    assert "(there are no validation data)" in text
+    assert "(no validation data)" in text
     assert "Without validation data" in text
 
 
@@ -177,8 +177,8 @@ def test_a_result_of_a_lost_formulation_has_a_report(tmp_path: Path) -> None:
     ro.store.save_result(ro.calibrate(problem, mine, 1.0), tmp_path / "result.json")
     text = page(ro.load_result(tmp_path))
     assert "it cannot be solved again" in text
-    assert "a function of a script, not in the file" in text
-    assert "Certificate, computed anew" in text
+    assert "a function of a script, not stored in the file" in text
+    assert "Certificate at the solution" in text
 
 
 def test_the_command(monkeypatch, capsys, arm, arm_page, tmp_path: Path) -> None:
@@ -269,7 +269,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     words = " ".join(read.words.split())
     assert (
         0
-        <= words.index(f"{verdict}: expanded uncertainty of the position reached U =")
+        <= words.index(f"{verdict}: maximum maximum expanded uncertainty of the position reached U =")
         < words.index("Mean error, nominal")
     )
     assert "A. <b>Person</b>" in words
@@ -291,7 +291,7 @@ def test_both_figures_are_said_where_all_rows_were_used() -> None:
     result = ro.calibration.refit_all(result_of("position"))
     words = " ".join(Reader(page(result)).words.split())
     assert "On 40 measurements that were held out the mean position error falls from" in words
-    assert "with parameters from 40 rows; those delivered here come from all 80." in words
+    assert "with parameters from 40 rows; the delivered parameters are from all 80." in words
     assert "held out, from 40 rows, identified" in words
 
 
@@ -314,6 +314,6 @@ def test_a_robot_less_certain_than_the_nominal_one_errs_is_not_called_delivered(
     found = ro.use.update(first, problem.data.take(np.arange(32, 40)), reset=["*"])  # 8 readings, 33 parameters
     text = Reader(page(found.result)).words
     assert "Inconclusive" in text
-    assert "is above the nominal robot" in text
+    assert "is above the error of the nominal robot" in text
     assert "Delivered" not in text
     assert summary.inconclusive(first, summary.workspace(first)) == ""

@@ -195,7 +195,7 @@ def test_mountings_are_words_or_a_vector() -> None:
         ({"direction": (0, 0, 0)}, "direction of gravity: found"),
         ({"direction": (0, np.nan, 1)}, "three finite numbers"),
         ({"payload": -1.0}, "payload: found -1.0"),
-        ({"masses": (1.0,)}, "one centre a mass"),
+        ({"masses": (1.0,)}, "one centre per mass"),
         ({"masses": (np.inf,), "centres": ((0, 0, 0),)}, "mass of a link: found inf"),
         ({"payload_centre": (0, 0)}, "centre of the payload"),
     ],
@@ -349,7 +349,7 @@ def test_mountings_are_where_gravity_points_in_the_base_frame() -> None:
 
 @pytest.mark.parametrize("direction", [(1.0, 2.0), ("a", 0, 0), (np.nan, 0, 1), (0.0, 0.0, 0.0), 3.0])
 def test_a_direction_that_is_none_is_refused(direction: object) -> None:
-    with pytest.raises(ro.InputError, match=r"three finite numbers|a vector that points somewhere"):
+    with pytest.raises(ro.InputError, match=r"three finite numbers|a nonzero vector"):
         ro.robot.Gravity(direction)  # type: ignore[arg-type]
 
 

@@ -104,5 +104,5 @@ def test_without_its_package_the_sentence_says_what_to_install(file: Path, monke
 
 def test_a_problem_folder_may_name_none(file: Path) -> None:
     """A folder may be somebody else's, and a xacro file is carried out."""
-    with pytest.raises(ro.InputError, match="only a command or a script may name"):
+    with pytest.raises(ro.InputError, match="may be named by commands and scripts only"):
         find_robot(file.name, file.parent)

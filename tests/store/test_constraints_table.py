@@ -91,7 +91,7 @@ four = { x_mm = [400, 500], y_m = [-0.3, 0.3], z_mm = [-200, 200] }
         ('stated = "a3 = 425 mm"', "'a3 = 425 mm'"),
         ("stated = [3]", "3"),
         ('stated = ["move at most 3 mm: nowhere"]', "place 'nowhere'"),
-        ("places.measured = { q_deg = [0, 0, 0, 0, 0, 0] }", "a place that every problem has"),
+        ("places.measured = { q_deg = [0, 0, 0, 0, 0, 0] }", "a predefined place"),
         ("places.here = { q_deg = [0, 0, 0] }", "3 joint values"),
         ("places.here = { q_mm = [0, 0, 0] }", "no unit of the right dimension"),
         ("places.here = { q_deg = [[0, 0], [0]] }", "lists of different lengths"),

@@ -19,8 +19,8 @@ from tests import ROOT
 from tests.simulate import simulated
 
 PROBLEMS = {
-    "a place for no measurement": (
-        "position", "[noise]", "[anchor]\nx_mm = 1\n[noise]", "a place for no measurement here"
+    "a fixture of no measurement": (
+        "position", "[noise]", "[anchor]\nx_mm = 1\n[noise]", "a fixture of no measurement in this problem"
     ),
     "an anchor that no row names": (
         "cable", "[anchor.B]", "[anchor.C]\nx_mm = 1\n[anchor.B]", "table anchor: found 'C'"
@@ -30,7 +30,7 @@ PROBLEMS = {
         "position", "[noise]", '[published."other.csv"]\nmean_mm = 1.0\n[noise]', "the name of a table in this folder"
     ),
     "a reference without tolerance": ("position", "[0.", "[1.0, 2.0, 0.", "[value, tolerance]"),
-    "all rows excluded": ("position", "[noise]", "[exclude]\nALL\n[noise]", "no row that is not excluded"),
+    "all rows excluded": ("position", "[noise]", "[exclude]\nALL\n[noise]", "no remaining row (all are excluded)"),
     "scatter below zero": ("position", "[noise]", "[scatter]\njoint_mrad = -1.0\n[noise]", "greater than or equal"),
     "a tool that is a number": ("markers", "[tool.A]", "[tool]\nA = 3\n[tool.D]", "key tool.A: found 3"),
     "a record without a word": (
@@ -106,12 +106,12 @@ BLOCK = ("data", "identification", "blocks", 0)
     ("at", "value", "said"),
     [
         (("robots",), None, "key robots: found nothing, accepted: this key is required"),
-        (("x",), [0.0] * 3, "parts that do not fit together"),
+        (("x",), [0.0] * 3, "inconsistent content"),
         ((*BLOCK, "q"), [[[0.0] * 6]], "accepted"),
         ((*BLOCK, "q"), [[[0.0] * 6], [[0.0]]], "rows of different lengths"),
         ((*BLOCK, "y"), [[0.0] * 3], "accepted"),
         ((*BLOCK, "measurement"), "smell", "found 'smell', accepted: measurements=[...] with it"),
-        (("rows", "identification"), [], "parts that do not fit together"),
+        (("rows", "identification"), [], "inconsistent content"),
         (("rows", "identification", 0, "nominal_mm"), 10**400, "found 1000"),
     ],
 )

@@ -156,7 +156,7 @@ def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
         ('from = "nowhere.json"', "nowhere.json"),
         ('from = "robot.toml"', "robot.toml"),
         ('fleet = ["robot.toml"]', "robot.toml"),
-        ("inflate = 2", "no key from beside it"),
+        ("inflate = 2", "no key from in addition"),
         ('form = "x.json"', "from"),
     ],
 )

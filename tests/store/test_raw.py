@@ -94,7 +94,7 @@ def test_commanded_joints_serve_where_none_were_measured_and_it_is_said(monkeypa
     path = tmp_path / "raw.csv"
     path.write_text(text([["Point", *(f"Commanded {name}" for name in HEAD[1:7]), *HEAD[7:]]], ROWS))
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run") == 0
-    assert "commanded, as no measured value is there" in capsys.readouterr().out
+    assert "commanded values are used, since there are no measured ones" in capsys.readouterr().out
     path.write_text(text([[*HEAD[:7], *(f"Commanded {name}" for name in HEAD[7:])]], ROWS))
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run") == 2
     assert "no positions among" in capsys.readouterr().err
@@ -156,7 +156,7 @@ REFUSED = {
     ),
     "a quaternion of no order": (
         text([[*HEAD, "Q0", "Q1", "Q2", "Q3"]], beside(ROWS, [["0.5"] * 4] * COUNT)), [],
-        ["no clear one", "--quaternion"],
+        ["an ambiguous order", "--quaternion"],
     ),
     "no matrices": (
         text([[*HEAD[:7], *(f"m{i}{j}" for i in range(4) for j in range(4))]],
@@ -211,7 +211,7 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
     said = capsys.readouterr().out
     assert f"joined by label: {COUNT - 1} rows of {COUNT} with joints and {COUNT} measured" in said
-    assert f"without a partner, left out: P{COUNT}, P0." in said
+    assert f"without a match, left out: P{COUNT}, P0." in said
 
 
 def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, arm) -> None:
@@ -321,7 +321,7 @@ def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_pat
     late = [["late", "99000", *POINTS[0]]]
     files[1].write_text(files[1].read_text() + text([], late))
     assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.006") == 0
-    assert "1 measured rows without a partner within 0.006 s, left out: late." in capsys.readouterr().out
+    assert "1 measured rows without a match within 0.006 s, left out: late." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

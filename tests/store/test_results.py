@@ -120,9 +120,7 @@ def test_functions_of_a_script_are_missing_and_nothing_else(tmp_path: Path) -> N
     assert again.certificate == result.certificate
     assert "cannot be solved again" in str(again)
     assert "cannot be solved again" not in str(result)
-    with pytest.raises(
-        ro.InputError, match="formulation 'mine': found functions that the file of a result cannot hold"
-    ):
+    with pytest.raises(ro.InputError, match="formulation 'mine': found functions that a result file cannot hold"):
         ro.calibrate(again.problem, again.formulation, 1.0)
     twice = saved(tmp_path, again)
     assert str(twice) == str(again)
@@ -161,8 +159,8 @@ BAD = {
     "a list": (lambda t: "[1, 2]", "no result of rpim-opt"),
     "a newer version": (lambda t: t.replace('"version": 3', '"version": 4', 1), "key version: found 4, accepted: 3"),
     "a key twice": (lambda t: t.replace('"weight": 1.0', '"weight": 1.0, "weight": 1.0', 1), "the key 'weight' twice"),
-    "not a number": (lambda t: t.replace('"weight": 1.0', '"weight": NaN', 1), "parts that do not fit"),
-    "a key left out": (lambda t: t.replace('"history"', '"hist"', 1), "something in it was changed"),
+    "not a number": (lambda t: t.replace('"weight": 1.0', '"weight": NaN', 1), "inconsistent content"),
+    "a key left out": (lambda t: t.replace('"history"', '"hist"', 1), "its content was changed"),
     "an edited parameter": (lambda t: re.sub(r'"x": \[\S+,', '"x": [0.001,', t, count=1), "was changed"),
 }  # fmt: skip
 

@@ -24,7 +24,7 @@ def labels(formulations: Any, selectors: Any, functions: Any = ()) -> list[str]:
 
 
 def test_methods_are_called_as_a_person_calls_them() -> None:
-    assert labels("folder", "folder") == ["as the folder says"]
+    assert labels("folder", "folder") == ["as in the folder"]
     assert labels(["tikhonov", "folder"], 2) == ["tikhonov, 2", "folder, 2"]
     assert labels([ro.tikhonov, OWN, ro.least_squares], None) == [
         "tikhonov, learned",

@@ -59,7 +59,7 @@ def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
     assert broken._repr_html_() is None
     some = compared({"a": {"p": 1.0}, "b": {"p": None}})
     assert str(some).startswith(f"{some!r}\n\n")
-    for against, said in (("c", "against: found 'c'"), ("b", "'b', which has no figures")):
+    for against, said in (("c", "against: found 'c'"), ("b", "'b', which has no results")):
         with pytest.raises(ro.InputError, match=said):
             some.summary(against=against)
     with pytest.raises(ro.InputError, match="metric: found 'max_mm', accepted: rms_mm"):

@@ -302,7 +302,7 @@ def cluster():
 
 @pytest.mark.slow
 def test_what_ends_every_worker_of_a_cluster_is_a_sentence(cluster) -> None:
-    with pytest.raises(RpimError, match=r"Dask gave a replicate up: .* What was finished is kept"):
+    with pytest.raises(RpimError, match=r"Dask failed to compute a replicate: .* What was finished is kept"):
         list(compute([("a", dies)], 1, cluster.scheduler_address))
 
 
@@ -311,7 +311,7 @@ def test_a_scheduler_that_dies_is_a_sentence(cluster, monkeypatch: pytest.Monkey
     from distributed import Future
 
     monkeypatch.setattr(Future, "result", gives_up)
-    with pytest.raises(RpimError, match=r"Dask gave a replicate up: .*connection-lost"):
+    with pytest.raises(RpimError, match=r"Dask failed to compute a replicate: .*connection-lost"):
         list(compute([("a", dict)], 1, cluster.scheduler_address))
 
 

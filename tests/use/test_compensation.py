@@ -363,7 +363,7 @@ def test_a_reflector_that_the_data_contradict_is_no_tcp() -> None:
     stated = replace(result, problem=result.problem.with_parameters(replace(far, nominal=nominal)), x=x[p.identified])
     assert found.q == pytest.approx(ro.use.compensate(stated, q, orientation=False).q, abs=1e-9)
     assert "as identified at" in found.point
-    assert "its nominal place is no TCP" in str(found)
+    assert "its nominal position is not used as TCP" in str(found)
     assert "nominally (stated, or registered)" in ro.use.compensate(result, q).point
 
 

@@ -150,7 +150,7 @@ def test_a_payload_that_cannot_count_is_refused() -> None:
             ro.use.compensate(result, q, payload=wrong)
     stiff = result.problem.with_parameters(result.problem.parameters.identify(GEOMETRY))
     geometry = ro.calibrate(stiff, ro.tikhonov, 1.0)
-    with pytest.raises(ro.InputError, match="payload that bends nothing"):
+    with pytest.raises(ro.InputError, match="payload without effect on the model"):
         ro.use.compensate(geometry, q, payload=1.0, despite_verdict=True)
     with pytest.raises(ro.InputError, match="joint torques"):
         ro.use.compensate(result, q, torque=np.zeros((2, 6)))
@@ -314,5 +314,5 @@ def test_a_simulated_folder_bends_by_gravity_without_a_column_of_torques(tmp_pat
 
 def test_a_urdf_does_not_hold_what_bends(tmp_path: Path) -> None:
     result, *_ = calibrated(arm())
-    with pytest.raises(ro.InputError, match=r"compliance2.*files hold nothing else"):
+    with pytest.raises(ro.InputError, match=r"compliance2.*files support nothing else"):
         ro.use.identified(result)

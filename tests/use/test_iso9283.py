@@ -52,7 +52,7 @@ def test_what_the_standard_asks_for_is_said_where_it_is_not_there() -> None:
     few = ro.use.iso9283(poses[:62], rng.normal(size=(62, 3)))
     assert few.content()["notes"] == [
         "The standard has 5 poses approached 30 times each: there are 3 poses, approached 2 to 30 times.",
-        "No command is known: there is repeatability, and no accuracy.",
+        "No commanded poses are known: repeatability is computed, accuracy is not.",
     ]
     assert few.accuracy is None
     assert whole.accuracy == max(each.AP for each in whole.poses)

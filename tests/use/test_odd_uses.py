@@ -57,7 +57,7 @@ def unlikely(fit: Any) -> Any:
 
 def test_an_update_says_what_came_out() -> None:
     found = updated()
-    assert str(found).startswith("The robot has not changed, as far as 8 readings can tell: chi-squared")
+    assert str(found).startswith("No change of the robot is detectable from 8 readings: chi-squared")
     assert found.explained
     lost = replace(found, before=unlikely(found.before), after=unlikely(found.after), changes=())
     assert "8 readings lie outside the prediction intervals of the last calibration" in str(lost)
@@ -68,7 +68,7 @@ def test_an_update_says_what_came_out() -> None:
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
     assert str(moved).startswith("The robot has changed: ")
-    assert "These readings do not distinguish it from a change of theta3: measure more." in str(moved)
+    assert "These readings do not distinguish this from a change of theta3: measure more." in str(moved)
     assert "left out" not in str(moved)
     sure = replace(moved, causes=(JOINT,))
     assert "do not tell it apart" not in str(sure)
@@ -77,7 +77,7 @@ def test_an_update_says_what_came_out() -> None:
 @pytest.mark.parametrize(
     ("drift", "said"),
     [
-        (None, "No parameter and no frame explains it alone."),
+        (None, "No single parameter or frame explains it."),
         (Drift(JOINT, 0, True, MOVED), "theta2 +0.0573 deg (standard deviation 0.0057), steadily from"),
         (Drift(JOINT, 0, False, MOVED), "before the first check"),
         (Drift(JOINT, 3, False, None), "theta2, at once before '4'"),
@@ -94,7 +94,7 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     assert said in lines[2]
     assert found.content()["since"] == "3"
     only = replace(quiet, sigmas=quiet.sigmas + 100.0 * (np.arange(8) == 5), drift=drift)
-    assert "Beyond the interval of a new reading: '6', " in str(only)
+    assert "Outside the prediction interval of a new reading: '6', " in str(only)
     assert "Cumulative" not in str(only)
     assert only.content()["alarm"] is None
     moved = found.content()["moved"]
@@ -131,7 +131,7 @@ def test_compensation_knows_no_spread_where_the_formulation_has_none() -> None:
     assert np.isfinite(found["lasso"].position_before).all()
     with pytest.raises(ro.InputError, match="robot: found 'left'"):
         ro.use.compensate(calibrated(), q=q, robot="left")
-    with pytest.raises(ro.InputError, match="a payload that bends nothing"):
+    with pytest.raises(ro.InputError, match="a payload without effect on the model"):
         ro.use.compensate(calibrated(), q=q, payload=3.0)
 
 
@@ -169,7 +169,9 @@ def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_pa
     path = tmp_path / "raw.csv"
     head = [*(f"J{i} [deg]" for i in range(1, 7)), "X [mm]", "Y [mm]", "Z [mm]", "Q0", "Q1", "Q2", "Q3"]
     path.write_text(",".join(head) + "\n" + ",".join(["1"] * 9 + ["1", "0", "0", "0"]) + "\n")
-    with pytest.raises(ro.InputError, match=r"no clear one .* accepted: --quaternion wxyz or xyzw, or names qw, qx"):
+    with pytest.raises(
+        ro.InputError, match=r"an ambiguous order .* accepted: --quaternion wxyz or xyzw, or names qw, qx"
+    ):
         ro.use.read_measurements(pose.calibrate(weight=1.0), path)
 
 
@@ -213,7 +215,7 @@ def test_what_no_file_holds_is_named_and_counted() -> None:
 
 
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
-    with pytest.raises(ro.InputError, match="a folder, accepted: a name of its own for every file"):
+    with pytest.raises(ro.InputError, match="a folder, accepted: a unique name for every file"):
         write_all([(tmp_path, lambda path: None)])
     with pytest.raises(ro.InputError):
         write_all([(tmp_path / "a", lambda path: None)] * 2)
@@ -227,7 +229,7 @@ def test_validation_says_what_it_knows_and_what_not() -> None:
     assert pose.validation is not None
     said = str(ro.use.validate(pose.calibrate(weight=1.0), pose.validation))
     assert "orientation, identified [mrad]" in said
-    assert "95 % intervals of a reading" in said
+    assert "95 % prediction intervals" in said
 
 
 def test_everything_may_be_let_go() -> None:

@@ -105,7 +105,7 @@ def test_nothing_is_accused_where_nothing_changed() -> None:
     assert not found.changes
     assert found.explained
     assert found.before == found.after
-    assert str(found).startswith("The robot has not changed, as far as 8 readings can tell")
+    assert str(found).startswith("No change of the robot is detectable from 8 readings")
 
 
 def test_a_wrong_reading_is_no_change_of_the_robot() -> None:
@@ -177,7 +177,7 @@ def test_an_update_that_released_nothing_is_reported(monkeypatch, tmp_path) -> N
     assert run(monkeypatch, "update", str(tmp_path), validation, "--out", out) == 0
     assert run(monkeypatch, "report", out) == 0
     page = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
-    assert "changed since: nothing that these measurements identify" in page
+    assert "changed since: no identifiable combination" in page
 
 
 def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:
@@ -193,7 +193,7 @@ def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Ro
     for side in stored["record"]["earlier"][0]["ranges"][""]:
         side.pop()
     path.write_text(json.dumps({**stored, "digest": digest(stored)}), encoding="utf-8")
-    with pytest.raises(InputError, match="parts that do not fit together"):
+    with pytest.raises(InputError, match="inconsistent content"):
         ro.load_result(path)
 
 

@@ -1,4 +1,4 @@
-"""Rules that look for the corner of the L-curve, where the misfit begins to pay for a smaller penalty."""
+"""Selection rules by the corner of the L-curve."""
 
 from __future__ import annotations
 

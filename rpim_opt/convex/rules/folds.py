@@ -1,4 +1,4 @@
-"""Rules that predict configurations held out, all equations of one together: leave-one-out, folds, the paper's two."""
+"""Selection rules by cross-validation over whole configurations: leave-one-out, k-fold, the paper's two steps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ MANY = 1_000_000
 
 @on_squares
 def leave_one_out(program: Program, exact: bool = False) -> Selection:
-    """Choose by leaving every configuration out once and predicting it, all its equations together.
+    """Choose by leave-one-out cross-validation of whole configurations.
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
     With constraints, another penalty or loss the program is solved without each; of more than 100 configurations
@@ -54,7 +54,7 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     form = program.loss_form
     mixed = form is not None and not form.diagonal  # a square then belongs to no configuration
     if program.closed_form and not mixed:
-        note = "smallest error of configurations left out one by one"
+        note = "smallest leave-one-out error"
         return linear_rule(program, "leave_one_out", _of_squares, note)
     return _least(program, "leave_one_out", held_out_error(program, None if exact else _singly(program)))
 
@@ -87,7 +87,7 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
 
 @on_squares
 def two_step(program: Program) -> Selection:
-    """Choose by the paper's two steps after a coarse L-curve (section III B and Figs. 7 to 10).
+    """Choose by the paper's two steps: a coarse L-curve, then held-out error (section III B and Figs. 7 to 10).
 
     1. From the corner down, 30 weights over ten decades. The residual norm falls with the weight, so its
        minimum is always the smallest weight; what the paper reads off its Fig. 7 is where the fall ends:
@@ -142,7 +142,7 @@ def _least(program: Program, name: str, error: Score) -> Selection:
         weights, score, best = searched(error, weight_grid(program, COARSE))
     interior = 0 < best < len(weights) - 1
     failed = np.isnan(score)
-    note = "smallest error of configurations held out" if interior else edge(best)
+    note = "smallest k-fold cross-validation error" if interior else edge(best)
     note += skipped(int(failed.sum()))
     return Selection(float(weights[best]), name, weights[~failed], score[~failed], interior, note)
 
@@ -163,7 +163,7 @@ def _singly(program: Program) -> list[np.ndarray] | None:
 
 
 def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) -> Score:
-    """Return what gives the RMS (K,) of the whitened residual of parts held out, predicted by solving without them.
+    """Return a function for the RMS (K,) of whitened residuals of held-out parts, predicted by solving without them.
 
     A loss that is no square judges the median of their norms: an outlier held out is no error of the prediction.
     """

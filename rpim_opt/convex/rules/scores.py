@@ -1,4 +1,4 @@
-"""Selectors by a score of the linear estimator: likelihood, cross-validation, misfit, change, white residual."""
+"""Selection rules by a score of the linear estimator: REML, GCV, discrepancy, quasi-optimality, NCP."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def influence(model: LinearModel, form: Ridge) -> tuple[Array, Array, Array]:
 
 @on_squares
 def reml(program: Program) -> Selection:
-    """Choose the most likely weight: restricted maximum likelihood, with the noise level profiled out.
+    """Choose by restricted maximum likelihood (REML), with the noise level profiled out.
 
     The penalty is read as a normal prior of variance sigma^2 / weight on the robot's parameters and sigma^2 as
     unknown, so that declared noise that leaves out backlash or gravity does no harm. Frames (base, reflectors,
@@ -88,7 +88,7 @@ def reml(program: Program) -> Selection:
     """
     if program.model.constrained and program.penalty_form is not None:
         weights = weight_grid(program)
-        note = "points on a plane or sphere do not determine it: stated noise and scales are used"
+        note = "points on a plane or sphere do not determine the weight: stated noise and scales are used"
         return Selection(1.0, "reml", weights, np.zeros(len(weights)), interior=False, note=note)
     chosen = linear_rule(program, "reml", _restricted_likelihood, "largest restricted likelihood", local=True)
     if chosen.interior or chosen.weight < 1.0:
@@ -146,7 +146,7 @@ def robust_gcv(program: Program, gamma: float = 1.4) -> Selection:
     rank = program.model.rank
     if m < 3 * rank:
         found = f"{m} equations for {rank} directions"
-        raise InputError("selector robust_gcv", found, "three equations a direction; gcv or reml with fewer")
+        raise InputError("selector robust_gcv", found, "three equations per direction; gcv or reml with fewer")
     note = f"smallest cross-validation error with gamma {gamma:g}"
     return linear_rule(program, "robust_gcv", partial(_gcv, gamma), note)
 
@@ -165,7 +165,7 @@ def _gcv(gamma: float, program: Program) -> Score:
 
 @on_squares
 def discrepancy(program: Program) -> Selection:
-    """Choose the largest weight that fits as well as the declared noise allows (Morozov 1966).
+    """Choose the largest weight whose misfit agrees with the declared noise (Morozov 1966).
 
     rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: without that room one data set in two would fit at no weight.
     InputError for another penalty than a quadratic.
@@ -180,11 +180,14 @@ def discrepancy(program: Program) -> Selection:
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights
     if not len(fits):
-        why = "no weight fits as well as the stated noise implies: it is too small, or the model lacks an effect"
+        why = (
+            "no weight fits as well as the stated noise implies: the noise is stated too small, or the model "
+            "lacks an effect"
+        )
         return replace(chosen, weight=float(weights[0]), interior=False, note=why)
     k = int(fits[-1])
     if k == len(weights) - 1:
-        why = "every weight fits better than the stated noise: it is stated too large"
+        why = "every weight fits better than the stated noise implies: the noise is stated too large"
         return replace(chosen, weight=float(weights[k]), interior=False, note=why)
     # between the last weight that fits and the next, where the score crosses zero
     share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])

@@ -1,4 +1,4 @@
-"""A chosen weight with its evidence, and the weights that rules try."""
+"""Result of a selection rule, and the grid of weights."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ AROUND = 5
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Selection(Tabled):
-    """A chosen weight with its evidence.
+    """A selected weight with its evidence.
 
     ``name`` is the rule's, ``weights`` and ``score`` (K,) are what it tried and compared; ``interior`` says whether the
     choice lies inside of them, and if not, ``note``, a sentence for the report, what that means.
@@ -84,7 +84,7 @@ Selector = Callable[[Program], Selection]
 
 
 def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
-    """Make a rule see a robust loss as the linear estimator that its fit amounts to, until its choice stays."""
+    """Apply a rule to the equivalent linear estimator of a robust fit, repeated until its choice stays."""
 
     @wraps(rule)
     def chosen(program: Program, *given: Any, **options: Any) -> Selection:
@@ -148,12 +148,12 @@ def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate 
 
 
 def skipped(count: int) -> str:
-    """Return what a note adds about weights at which the solver failed."""
+    """Return a note on weights at which the solver failed."""
     return f"; {counted(count, 'weight')} skipped, where the solver failed" if count else ""
 
 
 def with_rows(program: Program, name: str) -> LinearModel:
-    """Return the model for a rule that leaves rows out, if it has its rows."""
+    """Return the model for a rule that leaves rows out; refuse a model without rows."""
     if program.model.stands_for is not None:
         found = f"{program.model.equations} equations in blocks, of which only the QR factor is kept"
         raise InputError(f"selector {name}", found, "reml, l_curve, gcv, discrepancy, or a number")
@@ -169,7 +169,7 @@ def require_weight(weight: float, where: str, file: object = None) -> float:
 
 
 def weight_grid(program: Program, count: int = 200) -> Array:
-    """Return the weights between which the estimate changes, at equal ratios.
+    """Return a geometric grid of weights that covers all changes of the estimate.
 
     With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a penalty with
     kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid.
@@ -200,7 +200,7 @@ def weight_grid(program: Program, count: int = 200) -> Array:
 
 
 def grid_of(form: Ridge, count: int = 200) -> Array:
-    """Return the weights between which an estimator in closed form changes, by its singular values."""
+    """Return the grid of weights of a closed-form estimator, from its singular values."""
     s = form.s[form.seen]
     if not len(s):
         raise InputError("data", "no sensitivity to any identified parameter", "data that depend on at least one")
@@ -208,7 +208,7 @@ def grid_of(form: Ridge, count: int = 200) -> Array:
 
 
 def least_between(score: Score, weights: Array, best: int) -> tuple[float, float]:
-    """Return the weight of the least score between the neighbours of the best on a grid, and that score."""
+    """Return the weight of smallest score between the neighbours of the best grid point, and that score."""
     low, high = np.log(weights[[best - 1, best + 1]])
     found = minimize_scalar(
         lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": 1e-6}
@@ -217,7 +217,7 @@ def least_between(score: Score, weights: Array, best: int) -> tuple[float, float
 
 
 def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
-    """Return weights (K,), their scores and the place of the least, from a coarse grid halved about its best.
+    """Return weights (K,), their scores and the index of the smallest, from a coarse grid refined around the best.
 
     It ends where the neighbours' scores do not differ from the best's, or their weights hardly from its own; or where
     a score is NaN: there the solver failed.

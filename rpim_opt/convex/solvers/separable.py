@@ -98,7 +98,7 @@ class Rows:
         return v if self.sizes is None else np.repeat(v, self.sizes)
 
     def entries(self, r: Array) -> Array:
-        """Return what the loss gets of a residual (m,): itself, or the norms of the configurations (N,)."""
+        """Return the argument of the loss for a residual (m,): the residual, or the norms of configurations (N,)."""
         return r if self.sizes is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
     def alone(self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int) -> tuple[Small, Array, Array]:
@@ -349,7 +349,7 @@ def gram(A: Array, weights: Array) -> Array:
 
 
 class OutsideDomain(Exception):
-    """Raised where the loss has no derivative."""
+    """Raised outside the domain of the loss, where it has no derivative."""
 
 
 class Loss:

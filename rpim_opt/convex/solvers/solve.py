@@ -23,7 +23,7 @@ GAP = 1e-8
 
 @dataclass(eq=False)
 class Warm:
-    """What one solution leaves to the next: point, width of smoothing, sizes of working sets, Clarabel's data."""
+    """Warm start of the next solution: point, smoothing width, sizes of working sets, Clarabel's data."""
 
     penalty: Canonical
     z: Array | None = None
@@ -42,7 +42,7 @@ class Warm:
         return self.small[rows]
 
     def begun(self, z: Array | None) -> Warm:
-        """Return another one that shares what does not change, to begin at z (n,) or anew."""
+        """Return a copy that shares the constant data, with its start at z (n,) or without one."""
         other = Warm(self.penalty, kink=self.kink)
         if z is not None and len(self.penalty.at) == self.penalty.size:
             other.z, other.x = z, z
@@ -58,7 +58,7 @@ def minimum(
     damping: Damping | None = None,
     accuracy: float = 0.0,
 ) -> Point:
-    """Return the minimum of a convex program; what solves it is told by the structure of the loss.
+    """Return the minimum of a convex program; the structure of the loss selects the solver.
 
     ========================== =====================================================
     quadratic                  the small program of its QR factor

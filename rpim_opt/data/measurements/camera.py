@@ -1,4 +1,4 @@
-"""Cameras on the flange or beside the robot, and the boards that they look at.
+"""Cameras on the flange or beside the robot, and their calibration boards.
 
 The pinhole has radial and tangential distortion; a board's points come from a table or are a pattern.
 """
@@ -83,7 +83,7 @@ _WORDS = Words(
     thing="a camera",
     thing_at="The camera (z forwards, x right, y down in the image)",
     frame="in the frame of the board",
-    noise_of="corners found to a fifth of a pixel",
+    noise_of="corners detected to a fifth of a pixel",
     wrong="a wrong corner",
     columns={"u": "measured pixel, to the right", "v": "measured pixel, downwards"},
 )
@@ -169,7 +169,7 @@ def read_board(source: Any) -> dict[str, Array]:
 
 
 def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: str = "eye_in_hand") -> Dataset:
-    """Return what a camera saw of a board's P points, view by view, at joint values q (V, dof) [rad or m].
+    """Return the dataset of a camera's views of a board's P points at joint values q (V, dof) [rad or m].
 
     The points appear at ``uv`` (V, P, 2) [px], NaN for those that were not found; ``sigma`` is one standard deviation
     [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2]; ``measurement`` is ``"eye_to_hand"`` where the
@@ -203,13 +203,15 @@ def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: 
 
 
 def on_board(table: Columns, board: Board) -> Columns:
-    """Return the columns of a table of corners, with a column point, and where these are on one board or several."""
+    """Return the columns of a table of corners, including point, and the points of one or several boards."""
     own = [name for name in table if split_unit(name)[0] in TARGET]
     if own:
         raise InputError("the header", f"column '{own[0]}' beside a target", "one of them")
     if "point" not in table:
         raise InputError(
-            "the header", f"no column point among {', '.join(table)}", "point: which one of the board it is"
+            "the header",
+            f"no column point among {', '.join(table)}",
+            "a column point with the name of the board's point",
         )
     names = texts(table["point"], "point")
     for i, name in enumerate(names):

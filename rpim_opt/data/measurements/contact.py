@@ -1,4 +1,4 @@
-"""Touches of unmeasured points and planes, and stated relations of two of them."""
+"""Touches of unmeasured points and planes, and known distances and angles between them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ TOUCHED = ("point", "plane")
 
 
 def names_touches(tables: Sequence[Columns]) -> bool:
-    """Return whether a table names what was touched twice (labels are unique), and none has a measured coordinate."""
+    """Return whether a table names touched points repeatedly and has no measured coordinates."""
     named = [(name.strip().lower(), cells) for table in tables for name, cells in table.items()]
     repeated = any(name in TOUCHED and len({str(cell) for cell in cells}) < len(cells) for name, cells in named)
     return repeated and not any(COORDINATE.search(name) for name, _ in named)
@@ -43,7 +43,7 @@ revisit_plane = Measurement(
         thing_at="The tip that touches, a ball's middle,",
         noise_of="a good robot, a tight fit",
         wrong="the tip slipped",
-        columns={"point": "point that was touched", "plane": "plane that was touched"},
+        columns={"point": "touched point", "plane": "touched plane"},
     ),
 )
 """A touch of an unmeasured plane: r_i = n'(c - p_i), with n and c those of the plane that fits best."""
@@ -80,7 +80,7 @@ UNNAMED = (revisit_plane, *KNOWN)
 
 @dataclass(frozen=True)
 class KnownDistance:
-    """A distance between two touched points, or two touched planes that are parallel.
+    """Known distance between two touched points or two parallel touched planes.
 
     ``between`` are their names, ``value`` [m] is greater than zero, ``sigma`` is its standard deviation [m].
 
@@ -106,7 +106,7 @@ class KnownDistance:
 
 @dataclass(frozen=True)
 class KnownAngle:
-    """Two touched planes that are parallel, or at right angles where they are not.
+    """Known angle between two touched planes: parallel or perpendicular.
 
     ``between`` are their names, ``sigma`` is the standard deviation of the angle [rad].
 
@@ -143,7 +143,7 @@ def _require_sound(known: Known) -> None:
 
 
 def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
-    """Return measurements with rows that state what is known of touched points and planes.
+    """Return the measurements with rows added for known distances and angles.
 
     Points that a distance joins belong together from then on: cross-validation leaves out all of them or none. Names
     that no row touches are refused, and points where planes are wanted.

@@ -1,4 +1,4 @@
-"""What a type of measurement is: columns and units, symbolic model, start values, noise, and the words for it.
+"""Measurement types: columns and units, symbolic model, start values, noise, and wording.
 
 Every other module of this folder is one type, which `registry` finds by its ``TYPES``.
 """
@@ -25,7 +25,7 @@ XYZ = {"x": "length", "y": "length", "z": "length"}
 
 
 class Words(NamedTuple):
-    """How readers hear of a type: what is on the flange, whose frame it is in, what its noise and a mistake are like.
+    """Wording of a measurement type: its target, its reference frame, typical noise and a typical mistake.
 
     ``columns`` says what its columns are: ``{"u": "measured pixel, to the right"}``.
     """
@@ -151,7 +151,7 @@ class Measurement(Brief):
 
     @property
     def by_camera(self) -> bool:
-        """Whether a row is where a camera sees a point of a board."""
+        """Whether a row is a camera's view of a board point."""
         return "pixel" in self.components.values()
 
     def __post_init__(self) -> None:

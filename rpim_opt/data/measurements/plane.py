@@ -1,4 +1,4 @@
-"""Unmeasured points on a plane of unknown place."""
+"""Points on a plane of unknown pose."""
 
 from __future__ import annotations
 

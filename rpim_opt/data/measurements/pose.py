@@ -1,4 +1,4 @@
-"""Position and orientation of a reflector: as tables state them, as a residual compares them, as noise turns them."""
+"""Pose of a target: its columns, residual and noise."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ def _posed(y: Array, rotation: scipy.spatial.transform.Rotation) -> Array:
 
 
 def unit_quaternions(y: Array) -> Array:
-    """Return poses (N, 7) with normalized quaternions; refuse what is none."""
+    """Return poses (N, 7) with normalized quaternions; refuse other norms."""
     norm = np.linalg.norm(y[:, 3:], axis=1)
     wrong = np.flatnonzero(np.abs(norm - 1) > 1e-3)
     if len(wrong):
@@ -82,7 +82,7 @@ def unit_quaternions(y: Array) -> Array:
 
 
 def from_matrices(y: Array) -> Array:
-    """Return poses (N, 7) from matrices, row by row (N, 12); refuse what is no rotation."""
+    """Return poses (N, 7) from matrices, row by row (N, 12); refuse matrices that are not rotations."""
     R = y[:, 3:].reshape(-1, 3, 3)
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))

@@ -1,4 +1,4 @@
-"""Several raw tables as one: below each other where each is whole, else joined by a key or the nearest time."""
+"""Joining of raw tables: complete tables are stacked, others are joined by a key or the nearest time."""
 
 from __future__ import annotations
 
@@ -70,11 +70,11 @@ def together(
         place = {name: i for i, name in enumerate(keys)}
         if len(place) < len(keys):
             twice = next(name for name in keys if keys.count(name) > 1)
-            raise InputError(f"the key {how}", f"'{twice}' twice in {moving[0].file}", "every configuration once")
+            raise InputError(f"the key {how}", f"'{twice}' twice in {moving[0].file}", "unique keys")
         right = [i for i, name in enumerate(others) if name in place]
         if not right:
-            found = f"no value that {moving[0].file} and {seen[0].file} share"
-            accepted = "--key with a column whose values both have, --key row, or --time-tolerance for the nearest time"
+            found = f"no common value in {moving[0].file} and {seen[0].file}"
+            accepted = "--key with a column of common values, --key row, or --time-tolerance for the nearest time"
             raise InputError(f"the key {how}", found, accepted)
         names = [others[i] for i in right]
         left = [place[name] for name in names]
@@ -82,7 +82,7 @@ def together(
         known = set(names)
         lonely = [name for name in keys if name not in known] + [name for name in others if name not in place]
         if lonely:
-            notes.append(f"without a partner, left out: {listed(lonely)}.")
+            notes.append(f"without a match, left out: {listed(lonely)}.")
     else:
         if not (np.isfinite(within) and within >= 0):
             raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
@@ -97,7 +97,7 @@ def together(
         if not len(at):
             nearest = float(np.abs(there - then[0]).min())
             found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
-            raise InputError("times", found, "clocks that agree, or a larger --time-tolerance")
+            raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
         left, right = at.tolist(), of.tolist()
         labels = _labels(values.columns)
         names = [labels[i] for i in right]
@@ -107,7 +107,7 @@ def together(
         )
         lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right))]
         if lonely:
-            several = f"{len(lonely)} measured rows without a partner within {within:g} s, left out"
+            several = f"{len(lonely)} measured rows without a match within {within:g} s, left out"
             notes.append(f"{several}: {listed(lonely)}.")
     sides = ((joints, left), (values, right))
     whole = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.columns.items()}
@@ -145,14 +145,14 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
             whole[name].extend(cells)
     labels = [_labels(table.columns) for table in tables]
     counts = ", ".join(f"{table.file} {len(own)}" for table, own in zip(tables, labels, strict=True))
-    notes = [f"rows of the files below each other: {counts}."]
+    notes = [f"rows of the files are stacked: {counts}."]
     names = [name for own in labels for name in own]
     if len(set(names)) < len(names):
         files = [Path(table.file).stem for table in tables]
         if len(set(files)) < len(files):
             files = [str(i) for i in range(1, len(files) + 1)]
         names = [f"{file}:{name}" for file, own in zip(files, labels, strict=True) for name in own]
-        notes.append("labels are there in several files: the file's name is put before them.")
+        notes.append("labels occur in several files: they are prefixed with the name of the file.")
     return Whole({"label": names, **whole}, _raw(tables), tuple(notes))
 
 
@@ -191,7 +191,7 @@ def _keys(
         count, other = (len(next(iter(side.columns.values()))) for side in (joints, values))
         if count != other:
             found = f"{count} rows of joints and {other} measured"
-            raise InputError("--key row", found, "as many of both, or a column that both have")
+            raise InputError("--key row", found, "equal numbers of both, or a common column")
         there = set(others)
         wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
         if names and pair and wrong:
@@ -214,7 +214,7 @@ def _keys(
     if pair:
         return " = ".join(pair), [each.lower() for each in pair], own, others
     found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {moving[0].file} and {seen[0].file}"
-    accepted = "a column that both have, --key row for rows in the same order, or --time-tolerance"
+    accepted = "a common column, --key row for rows in the same order, or --time-tolerance"
     raise InputError("--key", found, f"{accepted} for the nearest time")
 
 
@@ -240,7 +240,7 @@ def _normal(cells: Sequence[Any]) -> list[str]:
 
 
 def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.ndarray, Array]:
-    """Return which times (N,) and (M,) [s] belong together, and by how much they differ (K,) [s].
+    """Return matching pairs of times (N,) and (M,) [s], and their differences (K,) [s].
 
     Each of the fewer belongs to the nearest of the others; of several whose nearest is the same one, the nearest alone
     (of equal times, all).

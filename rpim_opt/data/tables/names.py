@@ -21,7 +21,7 @@ from rpim_opt.basics.tables import Columns, numbers
 
 
 class Reading(NamedTuple):
-    """What a column holds, its unit, why, and whether it was measured, wanted or derived from others."""
+    """Meaning of a column: its quantity, unit and reason, and whether it is measured, commanded or derived."""
 
     stem: str
     unit: str = ""
@@ -103,7 +103,7 @@ VALUE = frozenset({"position", "pos", "angle", "value"})
 
 
 def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
-    """Return what a name means, with why; without a reason where it is not known.
+    """Return the meaning of a column name with its reason, which is empty for unknown names.
 
     >>> from rpim_opt.data.tables.names import recognize
     >>> [recognize(name).stem for name in ("Measured X", "Joint 3", "quat_w", "Std y", "shoulder_pan_joint")]
@@ -135,7 +135,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
 
 
 def endings(stem: str) -> Iterator[tuple[str, str]]:
-    """Yield what may stand before a known name, and the rest: ``robot1_joint_2`` is ``joint_2`` of ``robot1``."""
+    """Yield the possible prefixes of a name, and the rest: ``robot1_joint_2`` is ``joint_2`` of ``robot1``."""
     for match in islice(re.finditer(r"[\s._/:\-]+", stem), MOST_PREFIXES):
         yield stem[: match.end()], stem[match.end() :]
 
@@ -161,7 +161,7 @@ ROUNDED = 1e-6
 
 
 def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
-    """Give the columns of quaternions (in that order) and matrices their names."""
+    """Name the numbered columns of quaternions and matrices."""
     if order not in ORDERS:
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
     for i, (name, letter) in enumerate(zip(quaternion_columns(read, dof), order, strict=False), start=1):
@@ -207,7 +207,7 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
 
 
 def quaternion_columns(read: Readings, dof: int) -> list[str]:
-    """Return the four columns of a quaternion whose components are numbered, in order; none where there is none.
+    """Return the four numbered columns of a quaternion, in order; empty if there is none.
 
     ``q0 ... q3`` are one where other columns are the joints.
     """

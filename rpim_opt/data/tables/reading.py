@@ -97,7 +97,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
             raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
     naming = [column for column in kind.names if column in table]  # points that were touched, or that a camera sees
     if kind.touching and len(naming) != 1:
-        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: what a row touched"
+        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: the touched point"
         raise InputError("the header", ", ".join(table), accepted)
     whole = Block(
         kind,
@@ -116,7 +116,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     if kind.points == 2:
         for i, name in enumerate(label):
             if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
-                found = "twice the same reflector in the same configuration"
+                found = "the same reflector twice in one configuration"
                 raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
     if "configuration" in table:
         configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
@@ -192,12 +192,12 @@ def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
 
 
 def further_columns(robot: Robot, kind: Measurement) -> dict[str, str]:
-    """Return the columns that terms and measurement see, name to dimension: temperature, and a user's own."""
+    """Return the further columns that terms and measurement depend on, name to dimension."""
     return {"temperature": "temperature", **robot.model.columns, **kind.extra}
 
 
 def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str]) -> Numbers:
-    """Return the columns of numbers [SI]; refuse those that are unknown, in two units, or missing."""
+    """Return the columns of numbers [SI]; refuse unknown, duplicate and missing ones."""
     known = number_columns(robot, kind)
     columns = quantities_of(table, known, text_columns(kind), label)
     # joints, measured values, and whole groups of what is there in part
@@ -220,7 +220,7 @@ def numeric(table: Columns, robot: Robot, kind: Measurement, label: Sequence[str
 def quantities_of(
     table: Columns, known: Mapping[str, Sequence[str]], names: Sequence[str], label: Sequence[str]
 ) -> Numbers:
-    """Return all columns but those of names in SI; refuse those that are not known, stem to its dimensions."""
+    """Return all numeric columns in SI; refuse unknown ones."""
     columns: Numbers = {}
     for name in table:
         if name in names:
@@ -262,7 +262,7 @@ def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callabl
 
 
 def labels(table: Columns, N: int) -> tuple[str, ...]:
-    """Return the rows' labels, numbers from 1 by default; refuse names that are missing or there twice."""
+    """Return the rows' labels, by default numbers from 1; refuse missing and duplicate ones."""
     label = tuple(map(str, range(1, N + 1)))
     if "label" in table:
         label = texts(table["label"], "label")
@@ -275,11 +275,11 @@ def labels(table: Columns, N: int) -> tuple[str, ...]:
 
 
 def require_unique(names: Sequence[str], column: str) -> None:
-    """Refuse a row without a name, or with one that an earlier row has."""
+    """Refuse a missing or duplicate label."""
     seen: set[str] = set()
     for i, name in enumerate(names, start=1):
         if not name or name in seen:
-            raise InputError(f"row {i}, column {column}", f"'{name}'", f"a {column} that no other row has")
+            raise InputError(f"row {i}, column {column}", f"'{name}'", f"a unique {column}")
         seen.add(name)
 
 
@@ -287,7 +287,7 @@ def require_unique(names: Sequence[str], column: str) -> None:
 
 
 def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, list[float]]) -> Columns:
-    """Return the columns of the file that RoboDK exports after calibration measurements: their order counts.
+    """Return the columns of RoboDK's export of calibration measurements, which are identified by order.
 
     They are the joints [deg or mm], the measured point x, y, z [mm], and the reflector in the flange frame x, y, z [mm]
     (RoboDK's macro library reads it so). ``joints`` are "angle" or "length" each; ``tools`` are the reflectors that are

@@ -1,4 +1,4 @@
-"""Meaning and unit of every column of a raw table, with the reason; the table under our names."""
+"""Interpretation of raw tables: meaning, unit and reason for every column, under canonical names."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
-    "point": "point that was touched or seen", "rx": "measured roll (extrinsic xyz)",
+    "point": "touched or observed point", "rx": "measured roll (extrinsic xyz)",
     "ry": "measured pitch (extrinsic xyz)", "rz": "measured yaw (extrinsic xyz)",
     r"q(\d+)": r"joint \1", r"tau(\d+)": r"torque of joint \1", r"q([wxyz])": r"quaternion \1",
     r"r(\d)(\d)": r"rotation matrix \1,\2", "u95": "U95 of all axes", "sigma": "standard deviation of all axes",
@@ -39,7 +39,7 @@ MEANINGS = {
 
 
 class Meant(NamedTuple):
-    """A column: its name in the file, what it means, our name, the unit, and why."""
+    """Meaning of a column: its name in the file, its quantity, its canonical name, its unit, and the reason."""
 
     column: str
     meaning: str
@@ -50,7 +50,7 @@ class Meant(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Understood:
-    """A raw table with our names.
+    """A raw table with canonical names.
 
     ``columns`` are cells by our names, ``raw`` those that the file has, of the same rows. ``doubt`` is the option that
     says how orientations are to be read where only a check against the robot shows it: ``quaternion``, ``rotation``.
@@ -70,7 +70,7 @@ class Understood:
 
     @property
     def left_out(self) -> tuple[str, ...]:
-        """Columns that mean nothing here."""
+        """Ignored columns."""
         return tuple(each.column for each in self.meant if each.meaning == "left out")
 
 
@@ -82,7 +82,7 @@ def understand(
     joints: Sequence[str] = (),
     targets: bool = False,
 ) -> Understood:
-    r"""Return what a raw table says of a robot and a measurement type, under the names that `read_data` takes.
+    r"""Interpret a raw table for a robot and a measurement type, with the names that `read_data` takes.
 
     Names that it takes already stay; others are recognized where they can mean one thing only (`names`). What is not
     recognized is left out, and so are rows without any measured or any joint value. ``joints`` are the names that the
@@ -147,7 +147,7 @@ def understand(
 def _readings(
     raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions, joints: Sequence[str], targets: bool
 ) -> tuple[Readings, str]:
-    """Return what every column holds, nothing where it is left out, and the rotation that names tell."""
+    """Return the meaning of every column, None for ignored ones, and the rotation convention in the names."""
     table, dof = raw.columns, robot.dof
     names = [*number_columns(robot, kind), *text_columns(kind)]
     read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
@@ -172,8 +172,8 @@ def _readings(
             raise InputError("the header", f"column '{name}', another point", "a row each, with a column marker")
         if name.lower() in TURNED and each.stem in names and not (options.rotation or options.units.get("rx")):
             accepted = (
-                "roll, pitch, yaw; rx_deg, ry_deg, rz_deg, the same; a quaternion; --rotation vector; "
-                "--rotation 'intrinsic xyz'; or --measurement position"
+                "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "
+                "'intrinsic xyz'; or --measurement position"
             )
             raise InputError("the header", f"column '{name}', of angles or of a rotation vector", accepted)
         wanted = {*options.units, *robot.model.columns}
@@ -191,7 +191,7 @@ def _readings(
 
 
 def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
-    """Return what a column holds; its name as stem where that is not known."""
+    """Return the meaning of a column; an unknown name becomes its stem."""
     text = name.partition(" #")[0]
     stem, unit = split(text)
     group = ""
@@ -203,13 +203,13 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
         if whole in joints:
             return Reading(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
     if stem in known:
-        return Reading(stem, unit, "named so")
+        return Reading(stem, unit, "by its name")
     if stem.lower() in names:  # elsewhere such a column holds labels
-        return Reading(stem.lower(), unit, "what was touched")
+        return Reading(stem.lower(), unit, "touched point")
     found = recognize(stem, joints)
     if group and not found.why:  # the words of a group that tell nothing
         rests = [rest for _, rest in endings(stem)]
-        inner = [Reading(rest, "", "named so") if rest in known else recognize(rest, joints) for rest in rests]
+        inner = [Reading(rest, "", "by its name") if rest in known else recognize(rest, joints) for rest in rests]
         inside = next((each for each in inner if each.why), found)
         found = inside._replace(kind=found.kind or inside.kind)
     return found._replace(unit=unit)
@@ -258,7 +258,7 @@ def _from_one(read: Readings, dof: int) -> Readings:
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
-    """Return what names mean without a prefix that all of the wanted ones have, where none of these is there."""
+    """Return the meanings of names without a common prefix, if no name is known with it."""
     if wanted & {each.stem for each in read.values()}:
         return {}
     found: dict[str, Readings] = {}
@@ -280,7 +280,7 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
 
 
 def _counted(read: Readings, robot: Robot) -> Readings:
-    """Return the joints where a word of whatever language is counted from 1 in their units, and none are known."""
+    """Return the joints from numbered columns of any word with joint units, if no joints are known otherwise."""
     if any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
         return {}
     found: dict[str, Readings] = {}
@@ -295,7 +295,7 @@ def _counted(read: Readings, robot: Robot) -> Readings:
 
 
 def _leave_out(read: Readings, targets: bool) -> None:
-    """Leave out what was computed, and what was wanted where it was measured; of targets what was measured."""
+    """Ignore computed columns, and commanded ones where measured ones exist; for targets ignore measured ones."""
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
     named = {each.stem for name, each in read.items() if each.kind == "measured" and INSTRUMENT.search(name)}
     by_instrument = {"x", "y", "z"} if named >= {"x", "y", "z"} else set()  # one alone is of another frame
@@ -305,15 +305,17 @@ def _leave_out(read: Readings, targets: bool) -> None:
         if each.kind == "derived":
             why = "computed from others"
         elif not each.kind and each.stem in by_instrument and not INSTRUMENT.search(name):
-            why = "another column names the instrument"
+            why = "another column is of the instrument"
         elif targets:
             if each.kind != "wanted" and each.stem in wanted:
-                why = "it is not where the robot is to go"
+                why = "not a target of the robot"
         elif each.kind == "wanted" and (each.stem != "label" or "label" in measured):
             if each.stem not in measured and re.fullmatch(r"(?:to_)?q\d+", each.stem):
-                read[name] = each._replace(why=f"{each.why}; commanded, as no measured value is there")
+                read[name] = each._replace(
+                    why=f"{each.why}; commanded values are used, since there are no measured ones"
+                )
             else:
-                why = "a commanded value is no measurement"
+                why = "commanded, not measured"
         if why:
             read[name] = Reading("", "", why)
 
@@ -328,7 +330,7 @@ def _under_our_names(
     known: Mapping[str, Sequence[str]],
     units: Mapping[str, str],
 ) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
-    """Return the columns that are ours, by our names and in our units, and what every column means."""
+    """Return the columns with canonical names and units, and the meaning of every column."""
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
     unitless: dict[str, str] = {}
@@ -336,7 +338,7 @@ def _under_our_names(
     for name, cells in table.items():
         found = read[name]
         if found.stem not in known and found.stem not in text_columns(kind):
-            meant.append(Meant(name, "left out", "", "", found.why or "no column of these measurements"))
+            meant.append(Meant(name, "left out", "", "", found.why or "not used by this measurement type"))
             continue
         dimensions = [dimension for dimension in known.get(found.stem, []) if dimension]
         if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
@@ -368,7 +370,7 @@ def _under_our_names(
 
 
 def meaning(stem: str) -> str:
-    """Return what a column of ours is, in words: ``U95 of z``, ``second point: joint 1``."""
+    """Return the meaning of a canonical column as text: ``U95 of z``, ``second point: joint 1``."""
     if stem.startswith("to_") and stem not in MEANINGS:
         return f"second point: {meaning(stem.removeprefix('to_'))}"
     matches = ((re.fullmatch(pattern, stem), words) for pattern, words in MEANINGS.items())

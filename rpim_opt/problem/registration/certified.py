@@ -1,4 +1,4 @@
-"""Certified registration: base and tool from closed loops, outliers or not, with a proof that none fit better."""
+"""Certified registration: base and tool from closed loops, with or without outliers, with an optimality certificate."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ LINEAR = 6
 
 @dataclass(frozen=True, eq=False)
 class CertifiedStart:
-    """Base and tool of closed loops, and whether no others fit better.
+    """Base and tool from closed loops, with an optimality certificate.
 
     ::
 
@@ -79,7 +79,7 @@ def certified_hand_eye(
     spread: float = np.inf,
     loss: str = "squares",
 ) -> CertifiedStart:
-    """Return base Z and tool X of A X = Z B, measured_i = Z flange_i X, with a proof that none are better.
+    """Return base Z and tool X of A X = Z B, measured_i = Z flange_i X, with an optimality certificate.
 
     ::
 
@@ -143,11 +143,11 @@ def certified_hand_eye(
     radius = best.radius(float(chdtri(LINEAR + 3 * len(best.rotations), AS_WELL)))
     full = int(np.sum(solved.weights))
     causes = {
-        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): turns about two axes would": (
-            uncertainty > UNKNOWN
-        ),
+        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): rotations about two axes "
+        "would": (uncertainty > UNKNOWN),
         f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
-        f"another start, up to {radius:.2g} rad away, may fit as well: more or other poses would tell": radius > FAR,
+        f"another start, up to {radius:.2g} rad away, may fit as well: measure more or other poses to decide": radius
+        > FAR,
         "the weights of the loss did not converge": not np.array_equal(solved.squares <= beyond, solved.weights),
         f"{full} of {N} measurements agree, and as many others may agree with another start": several,
     }

@@ -44,7 +44,7 @@ FREE = 0.1
 
 
 class Located(NamedTuple):
-    """Where base (6,) and reflectors (6,) by marker are [m, rad], and how that was found, in a sentence."""
+    """Located base (6,) and reflectors (6,) by marker [m, rad], and a sentence on the method."""
 
     base: Array
     tools: dict[str, Array]
@@ -89,7 +89,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
             flange[own], measured[own], sigma=deviations, expected=places[first], spread=TOOL_ERROR
         )
         if start.uncertainty > FREE or (len(count) > 1 and not start.certified):
-            raise InputError("the data", start.reason, "turns about two axes")
+            raise InputError("the data", start.reason, "rotations about two axes")
     except InputError as error:
         how = f"by registration of positions: {error.found}"
         names = list(places)
@@ -126,7 +126,7 @@ APART = 0.1
 
 
 def met(problem: CalibrationProblem) -> dict[str, Array]:
-    """Return where bases (6,) stand by robot, of nominal robots that touched points of others before them.
+    """Return bases (6,) by robot, of nominal robots that touched the same points as robots before them.
 
     The first robot that touched something stands where it is stated, as does one whose base is not identified, and one
     that an instrument has seen. Each other one is put where its touches are nearest to those of the robots so far.
@@ -301,7 +301,7 @@ def starting_parameters(
 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
-    """Return focal lengths and centres [px] by name of cameras of which nothing is stated in ``own``."""
+    """Return focal lengths and centres [px] by name of cameras without entries in ``own``."""
     found = {}
     for block in camera_blocks(data):
         names = {name: of_fixture(name, block.fixture) for name in block.measurement.parameters}
@@ -312,7 +312,7 @@ def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float
 
 
 def relocated(problem: Source) -> Source | None:
-    """Return the problem with base and reflectors where the data put them, if what is stated contradicts that."""
+    """Return the problem with base and reflectors registered to the data, if the stated ones contradict them."""
     p = problem.parameters
     nominal = p.nominal.copy()
     if len(problem.arms) > 1:  # each by itself; of a frame that they share the first one's word counts
@@ -363,7 +363,7 @@ def _misplaced(p: Parameters, k: np.ndarray, place: Array) -> bool:
 
 
 def fitted_frames(problem: Source) -> tuple[Source, Array]:
-    """Return the problem that identifies frames alone, and its solution: what the data say before calibration.
+    """Return the problem that identifies frames alone, and its solution.
 
     ::
 
@@ -391,7 +391,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
 
 def settled(alone: Source, steps: int = 200) -> Array:
-    """Return the deviations (f,) [SI] of a problem that identifies frames alone, about where they are stated.
+    """Return the deviations (f,) [SI] of a problem that identifies frames alone, from their stated values.
 
     Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.
     """

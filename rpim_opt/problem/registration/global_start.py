@@ -1,4 +1,4 @@
-"""Global start: joint signs, joint zeros, base and reflectors of an arm that its nominal model does not explain.
+"""Global start: joint signs, joint zeros, base and reflectors, if the nominal model does not explain the data.
 
 Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, the base eliminated at every step:
 random zeros, all signs in turn, a few steps for all and more for the best, until enough starts end in one optimum.
@@ -57,7 +57,7 @@ RARE_BASIN = 0.005
 
 @dataclass(frozen=True, eq=False)
 class Alternative:
-    """Another mapping that fits as well: signs and zeros (dof,), and how far it is from the first one."""
+    """Another joint mapping of equal fit: signs and zeros (dof,), and its distance from the best one."""
 
     sign: Array
     zero: Array
@@ -67,7 +67,7 @@ class Alternative:
 
 @dataclass(frozen=True, eq=False)
 class JointMapping:
-    """Signs and zeros of joints that were found from the data.
+    """Signs and zeros of joints estimated from the data.
 
     ::
 
@@ -86,9 +86,9 @@ class JointMapping:
 
     @property
     def sentence(self) -> str:
-        """Say what was found, from what, and how certain it is."""
+        """Return a sentence on the mapping, its errors and its certainty."""
         text = (
-            f"Joint mapping found from the data: {described(self.joint_types, self.sign, self.zero)} "
+            f"Joint mapping estimated from the data: {described(self.joint_types, self.sign, self.zero)} "
             f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
             f"{self.starts} random starts: an optimum that one start in {round(1 / RARE_BASIN)} reaches is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
@@ -97,24 +97,24 @@ class JointMapping:
 
     @property
     def ambiguities(self) -> tuple[str, ...]:
-        """Say what fits as well, and what would tell."""
+        """Return sentences on alternatives of equal fit, and on measurements that would decide."""
         said = []
         if self.mirrored:
             said.append(
                 "A left-handed measured frame with the joints as stated fits as well: a known direction in the "
-                "instrument's frame (up, for instance) or measured orientations would tell."
+                "instrument's frame (such as up) or measured orientations would decide."
             )
         for other in self.alternatives:
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
             said.append(
                 f"{described(self.joint_types, other.sign, other.zero).capitalize()} fits as well, and predicts "
-                f"{three_digits(1e3 * other.apart)} mm at other configurations: measure at ({values}) to tell."
+                f"{three_digits(1e3 * other.apart)} mm at other configurations: measure at ({values}) to decide."
             )
         return tuple(said)
 
 
 def described(joint_types: tuple[str, ...], sign: Array, zero: Array) -> str:
-    """Say signs and zeros (dof,) in words."""
+    """Return signs and zeros (dof,) as text."""
     parts = []
     reversed_ = [f"{i + 1}" for i in np.flatnonzero(sign < 0)]
     if reversed_:
@@ -167,7 +167,7 @@ def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | N
 
 
 def explained(robot: Robot, points: Points) -> bool:
-    """Whether the nominal robot explains points but for gross errors."""
+    """Whether the nominal robot explains the points, apart from gross errors."""
     few = points.evenly(FEW)
     candidates = Candidates.of(robot, [few])
 
@@ -205,7 +205,7 @@ def rms(fit: Fit) -> Array:
 
 
 def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
-    """Return the mapping that explains points, None where the nominal one does as well, or none does."""
+    """Return the mapping that explains the points; None if the nominal one does too, or if none does."""
     rng = np.random.default_rng(seed)
     n = robot.dof
     if n < len(robot.mdh):  # a sign or zero of a joint would not say what follows it

@@ -56,7 +56,7 @@ class Points:
 
     @property
     def extent(self) -> float:
-        """How far the points spread [m]."""
+        """Extent of the points [m]."""
         return max(float(np.linalg.norm(self.y.std(axis=0))), 1e-12)
 
 

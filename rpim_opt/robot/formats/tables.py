@@ -1,4 +1,4 @@
-"""Robots as tables: ``robot.toml`` and the same keys in JSON, a row a joint in CSV, and RoboDK's four columns."""
+"""Robots as tables: ``robot.toml`` and the same keys in JSON, one row per joint in CSV, and RoboDK's four columns."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ WITHOUT_COLUMN = {
     "mounting": "a mounting other than on the floor",
     "payload": "a payload",
 }
-"""What a table with a row a joint has no place for."""
+"""What a table with one row per joint has no place for."""
 Mounting = str | list[Annotated[float, Field(strict=False)]]
 """``"floor"``, ``"ceiling"``, ``"wall"``, or where gravity points in the robot's base."""
 
@@ -64,7 +64,7 @@ Mounting = str | list[Annotated[float, Field(strict=False)]]
 
 
 class PayloadTable(Table):
-    """What the flange carries: ``[payload]``."""
+    """The payload on the flange: ``[payload]``."""
 
     mass: Mass
     x: Length = 0.0
@@ -168,8 +168,8 @@ def _ending(path: Path) -> str:
 def read_robot(path: str | Path) -> Robot:
     """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
 
-    TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has a row a joint and the keys of a
-    ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
+    TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
+    of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
     ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
     cell is left out. A column ``convention`` says ``modified`` or ``standard``.
 
@@ -199,7 +199,7 @@ def read_robot(path: str | Path) -> Robot:
 
 
 def read_sheet(path: Path, convention: str = "") -> Described:
-    """Return the robot of a table with a row a joint, in the convention that it or ``convention`` states.
+    """Return the robot of a table with one row per joint, in the convention stated there or by ``convention``.
 
     ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
     Hayati are converted exactly; what follows the last joint becomes the tool::
@@ -210,7 +210,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     raw = read_table(path)
     lost = next((note for note in raw.notes if "is not a row of the table" in note or "is a summary" in note), "")
     if lost:
-        raise InputError("the table", lost.rstrip("."), "a row a joint", path)
+        raise InputError("the table", lost.rstrip("."), "one row per joint", path)
     columns: dict[str, list[str]] = {}
     for name, cells in raw.columns.items():
         stem, unit = split(name.partition(" #")[0])
@@ -407,7 +407,7 @@ def _centre_keys(centre: tuple[float, ...], prefix: str, in_si: bool = False) ->
 
 
 def exact(dimension: str, values: Any, in_si: bool = False) -> tuple[str, list[float]]:
-    """Return values in the unit that is shown, or in SI where that is wanted or they would not read back the same."""
+    """Return values in their display unit, or in SI if requested or needed to read back exactly."""
     if not np.isfinite(values).all():
         raise InputError("limits of the robot", f"{[float(v) for v in values]}", "finite numbers, or no limits")
     unit, si = display(dimension)

@@ -111,7 +111,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     old, places = _deltas(data, path)
     require_same_arm(robot, nominal.mdh, REVOLUTE, path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
-        raise InputError("robot", "alpha1 or a1 that deviate", "a base that holds where axis 1 is", path)
+        raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1", path)
     change = without_beta(robot).mdh - nominal.mdh
     behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
     new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
@@ -221,7 +221,7 @@ def _yaml_chain(data: bytes, path: Path) -> tuple[Chain, dict[tuple[str, str], t
         match = LINE.match(line)
         if match is None:
             found = repr(line.decode(errors="replace").strip()[:40])
-            raise InputError(f"line {number}", found, "one 'key: value' a line", path)
+            raise InputError(f"line {number}", found, "one 'key: value' per line", path)
         key = match[2].decode()
         if not match[3]:
             joint = key

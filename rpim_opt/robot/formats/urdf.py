@@ -1,4 +1,4 @@
-"""URDF: the chain between two links in, identified origins back into the same file, of which every other byte stays.
+"""URDF: reading of a chain between two links, and writing of identified origins with all other bytes unchanged.
 
 A URDF is untrusted input. It goes through expat, which reports where in the file an element stands; document types, and
 with them entities and other files, are refused. A xacro file is expanded by the package that ROS has for it.
@@ -110,8 +110,8 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     for name, i in zip(names, robot.leading, strict=True):
         joint = joints[i - origins]
         if joint.kind != urdf.joints[name].kind:
-            found = f"motion that follows joint '{name}' of another kind, which is not between base and tip"
-            raise joint.error("mimic", found, "a joint of its own kind, or on the way")
+            found = f"a mimic of joint '{name}' of another kind, which is not between base and tip"
+            raise joint.error("mimic", found, "a joint of the same kind, or a joint between base and tip")
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), names)
 
 
@@ -180,7 +180,7 @@ def write_urdf(
             step = way.steps[-1 if at_tip else 0]
             what = f"a tool or beta{len(table)}" if at_tip else "a base"
             found = f"{what} that moves link '{step.end if at_tip else step.start}'"
-            accepted = f"a link that a fixed joint holds, as joint '{step.joint.name}' cannot express it"
+            accepted = f"a link held by a fixed joint, since joint '{step.joint.name}' cannot express it"
             raise InputError("robot", found, f"{accepted}, or no such correction", urdf.path)
     write_bytes(Path(target), spliced(urdf.data, edits))
 
@@ -555,7 +555,7 @@ def _named(elements: Sequence[_Element], path: Path) -> dict[str, _Element]:
         name = element.get("name", "")
         if not name or name in known:
             found = f"'{name}' twice" if name else "one without a name"
-            raise InputError(f"element <{element.tag}>", found, "every one with a name of its own", path)
+            raise InputError(f"element <{element.tag}>", found, "every one with a unique name", path)
         known[name] = element
     return known
 
@@ -574,7 +574,7 @@ def _root_element(data: bytes, path: Path) -> _Element:
         stack.append(element)
 
     def doctype(*_: Any) -> None:
-        raise InputError("the document type", "<!DOCTYPE ...>", "a URDF without one, and without entities", path)
+        raise InputError("the document type", "<!DOCTYPE ...>", "a URDF without a document type and entities", path)
 
     if b"\0" in data:
         raise InputError("the file", "zero bytes, as in UTF-16", "UTF-8 text", path)

@@ -1,4 +1,4 @@
-"""Programs and data lists of controllers, a pattern each: their joint targets if there are some, else their poses.
+"""Programs and data lists of robot controllers: their joint targets, or their poses if there are none.
 
 FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXIS XP1={A1 10.0,A2 -90.0,...}``; ABB
 ``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
@@ -32,7 +32,7 @@ STAUBLI_NAMES = {**{f"j{i}": f"J{i} [deg]" for i in range(1, 7)}, **dict(zip("xy
 
 
 def _rows(joints: Sequence[tuple[str, Mapping[str, str]]], poses: Sequence[tuple[str, Mapping[str, str]]] = ()) -> Rows:
-    """Return a row a joint target, or a pose where there are none; what has no name is numbered."""
+    """Return one row per joint target, or per pose if there are none; unnamed targets are numbered."""
     return [{"label": name or str(i), **values} for i, (name, values) in enumerate(joints or poses, start=1)]
 
 
@@ -55,7 +55,7 @@ def read_fanuc(text: str) -> Rows:
 
 
 def read_kuka(text: str) -> Rows:
-    """Return the targets; where all names begin with X, as inline forms name P1's data, they are without it."""
+    """Return the targets; a prefix X of all names, as in inline forms, is removed."""
     found = KUKA.findall(text)
     found = [each for each in found if re.search(r"\bA1\b", each[1], re.IGNORECASE)] or found
     inline = all(name.upper().startswith("X") for name, _ in found)
@@ -104,7 +104,7 @@ def read_urscript(text: str) -> Rows:
 
 
 def read_yaskawa(text: str) -> Rows:
-    """Return the points; pulses of encoders say no angles without the robot's gear ratios."""
+    """Return the points; refuse encoder pulses, which need the robot's gear ratios."""
     kind = re.search(r"///POSTYPE\s+(\w+)", text)
     if kind is None or kind[1] == "PULSE":
         raise InputError("the positions", "pulses of encoders", "///POSTYPE ANGLE or BASE: export the job so")
@@ -115,7 +115,7 @@ def read_yaskawa(text: str) -> Rows:
 
 
 def read_staubli(text: str) -> Rows:
-    """Return the points by their keys, from 0 where they have none; those of several arrays as ``array[key]``."""
+    """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]``."""
     array, i = "", -1
     found = []
     for element, fields in STAUBLI.findall(text):

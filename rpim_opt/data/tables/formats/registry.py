@@ -1,4 +1,4 @@
-"""The formats of tables that are no plain tables: those of every module in this folder."""
+"""Registry of table formats: those of all modules in this folder."""
 
 from __future__ import annotations
 
