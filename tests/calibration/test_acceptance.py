@@ -297,7 +297,7 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
     text = capsys.readouterr().out
     assert "Accepted: limit 0.2 mm" in text
     assert "Measured by: A. Person" in text
-    assert "those delivered here come from all 80" in text
+    assert "the delivered parameters are from all 80" in text
     head, *rows = (folder / "validation.csv").read_text(encoding="utf-8").splitlines()
     column = head.split(",").index("x_mm")
     cells = [row.split(",") for row in rows]
