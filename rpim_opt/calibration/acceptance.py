@@ -205,14 +205,15 @@ class Acceptance:
     def sentences(self) -> list[str]:
         """Return the verdict and its grounds, sentence by sentence."""
         asked = self.requirement
-        said = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Cannot be decided"}[self.verdict]
-        limit = f"limit {1e3 * asked.limit:g} mm with {percent(asked.confidence)}"
+        said = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Inconclusive"}[self.verdict]
+        limit = f"limit {1e3 * asked.limit:g} mm with {percent(asked.confidence)} confidence"
         lines = [f"{said}: {limit} at every configuration of the region.", f"Region: {asked.where}."]
         found = self.workspace
         if found is not None and np.isfinite(found.largest):
             lines.append(
-                f"Expanded uncertainty of the position reached: U = {1e3 * found.largest:.3f} mm at most (worst of "
-                f"{found.count} configurations and a search from there), median {1e3 * found.typical:.3f} mm."
+                f"Expanded uncertainty of the position reached (U, {percent(asked.confidence)}): at most "
+                f"{1e3 * found.largest:.3f} mm (largest of {found.count} configurations, refined by a search), median "
+                f"{1e3 * found.typical:.3f} mm."
             )
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])

@@ -150,7 +150,7 @@ class LackOfFit:
         if self.robot > NEGLIGIBLE * self.instrument:
             parts.append(f"repeatability {_size(self, self.robot)}")
             if self.joint > NEGLIGIBLE * self.robot:
-                parts[-1] += f", of it {_size(self, self.joint)} from the joints"
+                parts[-1] += f", including {_size(self, self.joint)} from the joints"
         lines = [f"{rms} ({', '.join(parts)})."]
         for family, gain in self.present.items():
             lines.append(f"{EXTENSIONS[family].effect}: -2 ln L falls by {gain:.0f}.")

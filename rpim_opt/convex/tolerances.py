@@ -246,7 +246,7 @@ class _Reader:
                 limit = tolerance or 0.0
                 kind = "within" if limit else "equal"
             if limit < 0:
-                raise self._wrong("a tolerance below zero", "one above zero")
+                raise self._wrong("a negative tolerance", "a positive tolerance")
         for each in sums:
             self._checked(each)
         return Sentence(kind, sums, limit, self.unit)

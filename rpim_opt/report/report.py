@@ -114,12 +114,16 @@ def _headline(content: Content) -> Iterator[Block]:
     found = content.accepted
     yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
     if found is not None:
-        text = f"limit {1e3 * found.requirement.limit:g} mm"
+        confidence = percent(found.requirement.confidence)
+        text = (
+            f"limit {1e3 * found.requirement.limit:g} mm with {confidence} confidence at every configuration of"
+            " the region."
+        )
         if found.bound is not None and np.isfinite(found.bound):
-            text = (
-                f"maximum expanded uncertainty of the position reached U = {1e3 * found.bound:.3f} mm at most, {text}"
+            reached = (
+                f"expanded uncertainty of the position reached (U, {confidence}) at most {1e3 * found.bound:.3f} mm"
             )
-        text += f", with {percent(found.requirement.confidence)} at every configuration of the region."
+            text = f"{reached}, {text}"
         yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
     elif summary.inconclusive(result, content.map):
         text = summary.inconclusive(result, content.map).partition(": ")[2]

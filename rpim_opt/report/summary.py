@@ -25,7 +25,7 @@ if TYPE_CHECKING:
     from rpim_opt.calibration.acceptance import Acceptance, Workspace
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
-COLUMNS = ("rows", "mean", "RMS", "95 % below", "max")
+COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")
 Unit = Literal["mm", "mrad"]
 ANYWHERE = Requirement(limit=1.0)
 """The region of a result without requirement: joints within the measured ranges."""
@@ -137,7 +137,7 @@ def workspace_sentence(found: Workspace) -> str:
     """Return maximum and median of an expanded uncertainty in a sentence."""
     return (
         f"Expanded uncertainty of the position reached (U, {percent(found.requirement.confidence)}): at most "
-        f"{mm(1e3 * found.largest)} mm (worst of {found.count} configurations and a search from there), "
+        f"{mm(1e3 * found.largest)} mm (largest of {found.count} configurations, refined by a search), "
         f"median {mm(1e3 * found.typical)} mm; region: {found.requirement.where}."
     )
 

@@ -18,7 +18,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
 from rpim_opt.basics.tables import csv_text
-from rpim_opt.basics.text import counted, joined, listed
+from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior_terms import prior_penalty
@@ -167,8 +167,8 @@ def export_files(
         region = requirement or Requirement(limit=1.0)
         bound = accept(result, region).bound
         if bound is not None:
-            what = "Expanded uncertainty of the position that a robot of that geometry reaches"
-            notes.append(f"{what}: U = {1e3 * bound:.3f} mm at most; region: {region.where}.")
+            what = f"Expanded uncertainty of the position reached with this geometry (U, {percent(region.confidence)})"
+            notes.append(f"{what}: at most {1e3 * bound:.3f} mm; region: {region.where}.")
     if requirement is not None:
         verdict = accept(whole)
         notes.append(

@@ -112,11 +112,11 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert rms(rows[:, 2] - wave - slow(q)) < 0.2 * 1e3 * SIZE
     assert said[-1].startswith("Transmission errors (RMS, mrad): joint 1")
     assert "subtract it from a command. The corrections belong to the geometry of the whole model" in said[-1]
-    assert "a robot of that geometry reaches: U = " in said[1]
+    assert "reached with this geometry (U, 95 %): at most " in said[1]
     assert "Acceptance" not in " ".join(said)
     required = dataclasses.replace(result.record, requirement=ro.data.Requirement(limit=1e-6))
     _, said = ro.use.export_files(dataclasses.replace(result, record=required), mdh=tmp_path / "arm.csv")
-    assert "whole model: Cannot be decided: limit 0.001 mm" in said[2]
+    assert "whole model: Inconclusive: limit 0.001 mm" in said[2]
     assert "Lacking: " in said[2]
     plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):

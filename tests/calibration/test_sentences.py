@@ -34,7 +34,7 @@ def expanded(count: int, largest: float, typical: float) -> Workspace:
 def test_an_acceptance_says_what_it_rests_on() -> None:
     bare = Acceptance(LIMIT, "undecided", ("Lacking: rows.",))
     assert bare.sentences() == [
-        "Cannot be decided: limit 0.1 mm with 95 % at every configuration of the region.",
+        "Inconclusive: limit 0.1 mm with 95 % confidence at every configuration of the region.",
         "Region: joints within the measured ranges.",
         "Lacking: rows.",
     ]
@@ -47,8 +47,8 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
         LIMIT, "accepted", (), expanded(500, 9e-5, 5e-5), 2e-5, {"rows": 4, "sentence": "Held out: 4 rows."}
     )
     assert whole.sentences()[2:] == [
-        "Expanded uncertainty of the position reached: U = 0.090 mm at most (worst of 500 configurations and a search "
-        "from there), median 0.050 mm.",
+        "Expanded uncertainty of the position reached (U, 95 %): at most 0.090 mm (largest of 500 configurations, "
+        "refined by a search), median 0.050 mm.",
         "Held out: 4 rows.",
     ]
     assert whole.content()["checked"] == {"rows": 4}

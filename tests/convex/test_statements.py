@@ -58,7 +58,7 @@ def test_a_statement_means_what_it_says(text: str, meaning: Sentence) -> None:
         ("a2 = 1", "no unit"),
         ("a2 = 1 kg", "unit 'kg'"),
         ("a2 = 1 mm +- 2 deg", "units mm and deg"),
-        ("a2 = 1 mm +- -2 mm", "a tolerance below zero"),
+        ("a2 = 1 mm +- -2 mm", "a negative tolerance"),
         ("a2 <= 3 mm +- 1 mm", "a tolerance without ="),
         ("a2 = 1 mm <= 3 mm", "= and <="),
         ("1 mm <= a2 >= 3 mm", "<= and >="),

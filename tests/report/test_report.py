@@ -269,7 +269,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     words = " ".join(read.words.split())
     assert (
         0
-        <= words.index(f"{verdict}: maximum maximum expanded uncertainty of the position reached U =")
+        <= words.index(f"{verdict}: expanded uncertainty of the position reached (U, 95 %) at most")
         < words.index("Mean error, nominal")
     )
     assert "A. <b>Person</b>" in words

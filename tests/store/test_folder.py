@@ -106,7 +106,7 @@ def test_priors_come_from_the_folder_alone(monkeypatch, capsys, received, key, h
 def test_simulated_tables_replace_no_other_file(monkeypatch, capsys, received, name) -> None:
     edit(received / "problem.toml", 'identification = "identification.csv"', f'identification = "{name}"')
     before = everything(received)
-    assert "accepted: a name" in refused(monkeypatch, capsys, "simulate", str(received))
+    assert "accepted: a" in refused(monkeypatch, capsys, "simulate", str(received))
     assert everything(received) == before
 
 
