@@ -1,4 +1,4 @@
-"""Formulations: what a user states in CVXPY's own algebra, and the ready ones."""
+"""Formulations: loss, penalty and constraints in CVXPY's algebra, and the ready ones."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Formulation(Brief):
 
     @property
     def ready(self) -> bool:
-        """Whether all its functions are the package's own, which mean the same whenever they are asked."""
+        """Whether all its functions are the package's own, whose result does not change between calls."""
         functions = [self.loss, self.penalty, self.penalty_over, *self.constraints]
         # of a box what matters are its limits
         functions = [getattr(f, "limits", f) for f in functions if f is not None and f != within_tolerance]
@@ -117,11 +117,11 @@ def _huber(v: Any, threshold: Any) -> Any:
 
 
 def lost(name: str) -> Callable[..., Any]:
-    """Return a function in the place of those that a file could not hold: it raises InputError."""
+    """Return a placeholder for functions that a file could not hold; calling it raises InputError."""
 
     def function(*_: Any) -> Any:
-        accepted = "the script that holds them, to calibrate again"
-        raise InputError(f"formulation '{name}'", "functions that the file of a result cannot hold", accepted)
+        accepted = "the script that defines them, to calibrate again"
+        raise InputError(f"formulation '{name}'", "functions that a result file cannot hold", accepted)
 
     return function
 
@@ -140,7 +140,7 @@ def huber(threshold: float = HUBER) -> Function:
     5
     """
     if not (np.isfinite(threshold) and threshold > 0):
-        raise InputError("huber", f"threshold {threshold}", "a number of sigmas above zero")
+        raise InputError("huber", f"threshold {threshold}", "a positive number of standard deviations")
     return Ready("huber", _huber, (threshold,))
 
 

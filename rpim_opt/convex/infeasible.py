@@ -1,4 +1,4 @@
-"""Why a program has no solution: which constraints contradict each other, and by how much."""
+"""Infeasibility: which constraints contradict each other, and by how much."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Stated(NamedTuple):
 
 
 def conflict(structure: Structure) -> Conflict | None:
-    """Return what contradicts what; None where the constraints can be met after all.
+    """Return the contradiction; None if the constraints are feasible after all.
 
     ``constraints`` is irreducible: without any one of them the others can be met (deletion filter; Chinneck and
     Dravnieks 1991, ORSA Journal on Computing 3:157). By how much others would have to give way is the least sum of
@@ -112,7 +112,7 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
 
 
 def name_of(function: Any, k: int) -> str:
-    """Return what a user calls a constraint function."""
+    """Return the user's name of a constraint function."""
     stated = getattr(function, "stated", None)
     if stated:
         maker, *arguments = stated
@@ -122,7 +122,7 @@ def name_of(function: Any, k: int) -> str:
 
 
 def advice(structure: Structure, status: str, found: Conflict | None) -> str:
-    """Return the sentence that says why a program was not solved, and what may help."""
+    """Return a sentence on why a program was not solved, with a remedy."""
     if found is not None:
         return ""
     if status.startswith("unbounded"):

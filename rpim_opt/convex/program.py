@@ -1,4 +1,4 @@
-"""The convex program of one linearization: as a CVXPY problem, its values, and its solutions at any weight."""
+"""The convex program of one linearization: its CVXPY problem, its values, and its solutions at any weight."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ STATUS = {
 
 
 def feasibility_tolerance(z: Array) -> float:
-    """Return by how many scales z (n,) may miss its constraints."""
+    """Return the feasibility tolerance at z (n,), in units of the scales."""
     return FEASIBLE * max(1.0, float(np.max(np.abs(z), initial=0.0)))
 
 
@@ -125,7 +125,7 @@ class Program(Brief):
         return Program(self.formulation, model, self.structure, self._kept)
 
     def anew(self, formulation: Formulation, model: LinearModel, z: Array) -> Program:
-        """Return the program of a formulation whose functions are called once more, to begin near z (n,).
+        """Return the program with the formulation's functions called anew, warm-started at z (n,).
 
         Where they return what they returned to this program, its canonical forms and last minimum serve again.
         """
@@ -135,7 +135,7 @@ class Program(Brief):
         return again.beginning(z)
 
     def apart(self, model: LinearModel) -> Program:
-        """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
+        """Return the program for another model, with a warm start of its own."""
         return replace(self, model=model, _kept={"warm": self._warm.begun(self._warm.z)})
 
     def on_squares(self, model: LinearModel) -> Program:
@@ -147,7 +147,7 @@ class Program(Brief):
         return Program(made.formulation, model, made, kept)
 
     def beginning(self, z: Array) -> Program:
-        """Return the same program, whose next minimum is looked for from z (n,) on."""
+        """Return the program with a warm start at z (n,)."""
         self._kept["warm"] = self._warm.begun(z)
         return self
 
@@ -165,7 +165,7 @@ class Program(Brief):
 
     @property
     def linear_penalty(self) -> bool:
-        """Whether the penalty is quadratic, or there is none: the estimate is then linear in the data."""
+        """Whether there is no penalty or a quadratic one, so that the estimate is linear in the data."""
         return self.formulation.penalty is None or self.penalty_form is not None
 
     @property
@@ -193,7 +193,7 @@ class Program(Brief):
         """The equations whose squares a quadratic loss sums, |L (A z - b) - c|^2; InputError for another loss."""
         form = self.loss_form
         if form is None:
-            raise InputError(f"formulation '{self.formulation.name}'", "a loss that is no square", "a squared loss")
+            raise InputError(f"formulation '{self.formulation.name}'", "a loss that is not quadratic", "a squared loss")
         return _squared(self.model, form)
 
     @cached_property
@@ -250,7 +250,7 @@ class Program(Brief):
         return loss if weight == 0 else loss + weight * penalty
 
     def inside(self, z: Array, towards: Array, weight: float) -> Array:
-        """Return z (n,), or where it lies just outside the functions' domain a point inside.
+        """Return z (n,), or a nearby point inside the functions' domain.
 
         An interior point ends at a boundary within its accuracy, and on either side of it: the point is moved a little
         towards another, or towards nominal, or away from it where that lies outside.
@@ -281,7 +281,7 @@ class Program(Brief):
         return np.inf if found is None else float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
 
     def nearest(self, z: Array) -> Array:
-        """Return the point of the constraints of z that is nearest to z (n,); z itself where none is found."""
+        """Return the projection of z (n,) on the constraints; z itself if it fails."""
         found = self._projected(z)
         return z if found is None or np.linalg.norm(found - z) <= TOUCHING else found
 
@@ -297,7 +297,7 @@ class Program(Brief):
             return None
 
     def trust(self, z: Array) -> Trusted | None:
-        """Return what a robust loss trusts at z (n,); None for a squared loss, which trusts everything.
+        """Return the equations that a robust loss keeps at z (n,); None for a squared loss.
 
         InputError for a loss without a slope, or one that rests on few equations (minimax).
         """
@@ -306,7 +306,7 @@ class Program(Brief):
         return trusted(self.formulation, self.norms(z), self.model.members[1], self.structure.answers.loss)
 
     def trusted(self, z: Array) -> LinearModel:
-        """Return the squared-loss model that a robust fit amounts to: the rows that it trusts at z (n,), downweighted.
+        """Return the equivalent squared-loss model of a robust fit: the rows kept at z (n,), downweighted.
 
         Degrees of freedom, likelihoods and covariances of a robust estimate are those of this model, and it is what
         every rule for the weight sees. With a squared loss it is that loss's. InputError as for `trust`.
@@ -413,7 +413,7 @@ class Program(Brief):
         return [found[weight] for weight in checked.tolist()]
 
     def tangent(self, z: Array, weight: float) -> Array | None:
-        """Return orthonormal directions (n, k) along which z may move with its active constraints; None for all.
+        """Return an orthonormal basis (n, k) of the active constraints' null space at z; None without any.
 
         Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along.
         """
@@ -516,10 +516,10 @@ class Program(Brief):
         verbose: bool,
         first: str = "",
     ) -> Estimate:
-        """Return the minimum that a solver of CVXPY finds; ``first`` is why another way failed before."""
+        """Return the minimum by a solver of CVXPY; ``first`` is the reason why the previous method failed."""
         if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
-            raise InputError("solver", f"{solver!r}", f"one that is installed: {installed}")
+            raise InputError("solver", f"{solver!r}", f"an installed solver: {installed}")
         answers = self.structure.answers
         stated = self.structure.loss_of_r, answers.penalty_of_z, answers.constraints
         problem, z, groups = self._written((*self.rows, weight), stated, damping)

@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.measurement import XYZ, Measurement, Words, orig
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
 """In the name of a column that holds a measured coordinate."""
 TOUCHED = ("point", "plane")
-"""Names of columns that say what a row touched."""
+"""Columns that name the touched point or plane."""
 
 
 def names_touches(tables: Sequence[Columns]) -> bool:
