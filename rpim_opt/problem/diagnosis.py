@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from functools import partial
+from itertools import combinations, product
 from typing import Any
 
 import numpy as np
@@ -24,9 +25,10 @@ from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
-from rpim_opt.problem.registration.points import points_of
+from rpim_opt.problem.registration.points import lengths_of, points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
@@ -65,6 +67,8 @@ MOST_ROUNDS = 20
 """Of telling rows of one reflector from those of another."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
+SPANS = 12
+"""Places between which something may have moved, and moved back."""
 MOST_EQUATIONS = 3000
 """Equations up to which a change is looked for."""
 
@@ -507,6 +511,10 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
             step = float(np.gcd.reduce(digits, axis=None)) / 10.0**decimals  # half degrees are rounded as well
             remedy = "export them with more decimals"
             found.append((f"joint values are rounded to {step:g} {unit}", size * step / np.sqrt(12) * arm, remedy))
+    degrees = np.abs(np.degrees(_all_q(problem.data)[:, turning]))
+    if ((degrees % 1).round(6) < 0.6).all():
+        made = np.radians(0.4) / np.sqrt(3) * arm
+        found.insert(0, ("joint values look like degrees and minutes (no decimals from .60 on)", made, "convert them"))
     for what, made, remedy in found:
         if ALIKE[0] * made < error < ALIKE[1] * made:
             yield (
@@ -553,10 +561,10 @@ def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
             yield f"column {ordered[0]} is in ascending order, and no other one: was it sorted alone?"
         negative = problem.robot.limits[:, 0] < -LEAST_TRAVEL["revolute"]
         unsigned = [f"q{i + 1}" for i in np.flatnonzero((q.min(axis=0) >= 0) & (np.ptp(q, axis=0) > 0) & negative)]
+        for (one, first), (other, second) in combinations(named.items(), 2):
+            if np.ptp(first) > 0 and (first == second).all():
+                yield f"columns {one} and {other} have the same values: is one a copy?"
         if y.shape[1] == 3:
-            for i, j in combinations(range(3), 2):
-                if (y[:, i] == y[:, j]).all():
-                    yield f"columns {'xyz'[i]} and {'xyz'[j]} have the same values: is one a copy?"
             spread = y.std(axis=0)
             for k in np.flatnonzero(spread < FLAT * spread.max()):
                 yield f"column {'xyz'[k]} spreads over {three_digits(1e3 * spread[k])} mm only: is it another column?"
@@ -575,8 +583,8 @@ def decimals_of(values: Array) -> int | None:
 
 
 def moved_far(problem: CalibrationProblem) -> Iterator[str]:
-    """Report the row from which on points fit another base or reflector: an instrument that was moved."""
-    points = points_of(problem)
+    """Report the row from which on points fit another base, anchor or reflector: one that was moved."""
+    points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
     whole = misfit(problem.robot, points)
@@ -588,10 +596,13 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     place = min(left, key=left.__getitem__)
     if left[place] < FITS * whole:
         first, second = (placed(problem.robot, points.take(part)) for part in (rows[:place], rows[place:]))
-        # the second part's points by the other base
-        there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
-        far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
-        other, what = "base", "the instrument or the robot's base moved"
+        if points.lengths:
+            far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
+            other, what = "anchor", "the anchor or the robot's base moved"
+        else:  # the second part's points by the other base
+            there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
+            far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
+            other, what = "base", "the instrument or the robot's base moved"
         reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
         if reflectors > far:
             other, what, far = "reflector", "the reflector was exchanged", reflectors
@@ -639,7 +650,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
 
 def part_way(problem: CalibrationProblem) -> Iterator[str]:
     """Report the approximate row from which on another interpretation of the table fits."""
-    points = points_of(problem)
+    points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
     rows = np.arange(len(points.row))
@@ -652,9 +663,9 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
         yield f"from about row {problem.data.label[points.row[max(fitting)]]} on {better.sentence}"
 
 
-def _places(count: int) -> list[int]:
+def _places(count: int, most: int = 40) -> list[int]:
     """Return before which rows a table may be parted."""
-    return np.unique(np.linspace(FEWEST, count - FEWEST, 40).round().astype(int)).tolist()
+    return np.unique(np.linspace(FEWEST, count - FEWEST, most).round().astype(int)).tolist()
 
 
 # What residuals say
@@ -693,62 +704,93 @@ def _added(model: LinearModel, x: Array, columns: Sequence[Array]) -> tuple[int,
 
 
 def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report residuals at x (n,) due to a gear ratio, a coupling of joints, or the scale or zero of the instrument.
+    """Report residuals at x (n,) due to a gear ratio, a coupling or lag of joints, or to the instrument.
 
-    One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, or that
-    of the scale or offset of distances, of positions by the base's place along them and along their directions.
+    One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, all of
+    these times the way from the row before, or the slope of the scale or offset of distances, of positions by the
+    base's place along them, along their directions, and along one axis.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
     free = problem.parameters.free
     q = problem.joint_values[problem.owners]
+    model = problem.linearize(x)
+    slopes = model.A / free.scale
     zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(problem.robot.joint_types, 1)]
-    pairs = [(i, j) for i, name in enumerate(zeros) for j in range(q.shape[1]) if name in free.names and q[:, j].any()]
-    base = [free.names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in free.names]
+    of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(zeros) if name in free.names}
+    tried: list[tuple[Array, Callable[[float], str]]] = []  # columns (m,), and what is said of their coefficients
+    for i, j in product(of_zero, range(q.shape[1])):
+        if q[:, j].any():
+            tried.append((of_zero[i] * q[:, j], partial(_gear, problem.robot, i, j)))
+    if len(of_zero) == problem.robot.dof:
+        way = np.diff(problem.joint_values, axis=0, prepend=problem.joint_values[:1])[problem.owners]
+        lag = np.sum([of_zero[i] * each for i, each in enumerate((way @ problem.robot.joint_map.T).T)], axis=0)
+        remedy = "wait until the arm stands still before both are read"
+        tried.append((lag, lambda part: f"joint values lag behind by {100 * part:.2g} % of the way: {remedy}"))
+    for column, what in zip(_of_instrument(problem, x, model, slopes), SCALES, strict=False):
+        tried.append((column, what))
+    found = _added(model, x, [column[:, None] for column, _ in tried])
+    if found is not None and abs(found[1][0]) <= SMALL:
+        number, (factor,), rest = found
+        yield f"{tried[number][1](factor)} (that leaves {100 * rest:.0f} % of the residuals)."
+
+
+SCALES: tuple[Callable[[float], str], ...] = (
+    lambda part: f"measured lengths are {100 * part:+.2g} % too long: check the scale of the instrument",
+    lambda part: (
+        f"measured distances are {three_digits(1e3 * part)} mm too long: check the instrument's zero and the "
+        "reflector's radius"
+    ),
+    lambda part: f"column x is {100 * part:+.2g} % too long: check its scale",
+    lambda part: f"column y is {100 * part:+.2g} % too long: check its scale",
+    lambda part: f"column z is {100 * part:+.2g} % too long: check its scale",
+    lambda part: f"column x has {100 * part:+.2g} % of column y in it: are the instrument's axes square?",
+    lambda part: f"column x has {100 * part:+.2g} % of column z in it: are the instrument's axes square?",
+    lambda part: f"column y has {100 * part:+.2g} % of column z in it: are the instrument's axes square?",
+)
+"""What is said of the coefficients of `_of_instrument`, in its order."""
+
+
+def _of_instrument(problem: CalibrationProblem, x: Array, model: LinearModel, slopes: Array) -> Array:
+    """Return the slopes (c, m) of equations by scale and offset of lengths, of positions by scales and skews too."""
+    names = problem.parameters.free.names
+    base = [names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in names]
     y = np.zeros((len(problem.data), 3))
-    lengths = np.zeros((len(problem.data), 2))  # slopes of distances by their scale and offset
+    lengths = np.zeros((len(problem.data), 2))
     for block in problem.data.blocks:
         if block.measurement.name in ("position", "pose") and len(base) == 3:
             y[block.row] = block.y[:, :3]
         elif block.measurement.name in ("cable", "distance"):
             lengths[block.row] = np.column_stack([block.y, np.ones(len(block.y))])
-    model = problem.linearize(x)
-    slopes = model.A / free.scale
-    gears = [slopes[:, [free.names.index(zeros[i])]] * q[:, [j]] for i, j in pairs]
-    along = lengths[problem.owners]
-    if lengths.any():
-        unit = np.linalg.norm(model.A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1)
-        along *= unit[:, None]
-    if len(base) == 3:
-        for k, way in enumerate((y, y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9))):
-            along[:, k] += np.sum(slopes[:, base] * way[problem.owners], axis=1)
-    found = _added(model, x, [*gears, along[:, [0]], along[:, [1]]])
-    if found is None or abs(factor := found[1][0]) > SMALL:
-        return
-    number, _, rest = found
-    left = f"that leaves {100 * rest:.0f} % of the residuals"
-    if number < len(pairs):
-        i, j = pairs[number]
-        to_model = problem.robot.joint_map.copy()
-        to_model[i] += factor * problem.robot.joint_map[j]
-        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
-        if i != j:
-            sign = signs(problem.robot.joint_map)
-            part = sign[i] * factor * sign[j]
-            what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
-        yield f"{what}: {left}; {coupling(to_model)}."
-    elif number == len(pairs):
-        yield f"measured lengths are {100 * factor:+.2g} % too long: {left}; check the scale of the instrument."
-    else:
-        far = three_digits(1e3 * factor)
-        remedy = "check the instrument's zero and the reflector's radius"
-        yield f"measured distances are {far} mm too long: {left}; {remedy}."
+    along = lengths[problem.owners].T
+    if lengths.any():  # in units of the equations
+        jacobian = problem.jacobian(x) * problem.parameters.free.scale
+        along = along * (np.linalg.norm(model.A, axis=1) / np.linalg.norm(jacobian, axis=1))
+    if not y.any():
+        return along
+    of_axis, y = slopes[:, base].T, y[problem.owners].T
+    radial = y / np.maximum(np.linalg.norm(y, axis=0), 1e-9)
+    along += np.array([np.sum(of_axis * y, axis=0), np.sum(of_axis * radial, axis=0)])
+    skew = [of_axis[i] * y[j] for i, j in ((0, 1), (0, 2), (1, 2))]
+    return np.concatenate([along, of_axis * y, skew])
+
+
+def _gear(robot: Robot, i: int, j: int, factor: float) -> str:
+    """Say by which part of joint j joint i turns beside what its encoder reads, and what to write."""
+    to_model = robot.joint_map.copy()
+    to_model[i] += factor * robot.joint_map[j]
+    what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
+    if i != j:
+        sign = signs(robot.joint_map)
+        part = sign[i] * factor * sign[j]
+        what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
+    return f"{what}: {coupling(to_model)}"
 
 
 def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report the row from which on residuals at x (n,) show a moved base, fixture, reflector or joint zero.
+    """Report the rows in which residuals at x (n,) show a moved base, fixture, reflector or joint zero.
 
-    Its columns for the rows from there on are added to the linearization (`_added`).
+    Its columns for the rows from one on, or between two of a few, are added to the linearization (`_added`).
     """
     free = problem.parameters.free
     data = problem.data
@@ -767,21 +809,24 @@ def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     unfit = len(data) < 2 * FEWEST or len(problem.owners) > MOST_EQUATIONS
     if unfit or not any(of[what] for what in ("base", *fixtures)):
         return
-    tried = [(k, what) for k in _places(len(data)) for what, some in of.items() if some]
+    spans = [(k, len(data)) for k in _places(len(data))] + list(combinations(_places(len(data), SPANS), 2))
+    tried = [(span, what) for span in spans for what, some in of.items() if some]
     model = problem.linearize(x)
-    found = _added(model, x, [model.A[:, of[what]] * (problem.owners >= k)[:, None] for k, what in tried])
+    rows = problem.owners
+    found = _added(model, x, [model.A[:, of[what]] * ((rows >= a) & (rows < b))[:, None] for (a, b), what in tried])
     if found is not None:
         number, coefficients, rest = found
-        place, what = tried[number]
+        (place, end), what = tried[number]
         some = of[what]
         equations = Equations.of(data)
-        after = equations.length & (equations.row >= place)
+        after = equations.length & (equations.row >= place) & (equations.row < end)
+        until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
         change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * coefficients)
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
         causes = {"base": "did the instrument or the robot's base move", "reflector": "was the reflector exchanged"}
         causes |= dict.fromkeys(fixtures, "did it, or the robot's base, move")
         yield (
-            f"from row {data.label[place]} on the points are {three_digits(far)} mm from where the others put "
+            f"from row {data.label[place]} {until} the points are {three_digits(far)} mm from where the others put "
             f"them, and fit a {what} that moved (that leaves {100 * rest:.0f} % of the residuals): "
             f"{causes.get(what, 'did the joint slip, or was it remastered')}? Calibrate the two parts separately."
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from functools import reduce
+from functools import partial, reduce
 from itertools import combinations, permutations, product
 from typing import Any, NamedTuple
 
@@ -14,19 +14,16 @@ from scipy.spatial.transform import Rotation
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
-from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import transforms
-from rpim_opt.problem.registration.frames import FIXTURE, settled, starting_parameters
 from rpim_opt.problem.registration.global_start import described, explained, rms, search
-from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
+from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, lengths_of, mirrored, points_of
 from rpim_opt.robot.formats.tables import read_robot
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import tool_prefix
 
 STEPS = 20
 """Steps of a fit of base and reflectors, joint zeros too if they are free."""
@@ -36,9 +33,8 @@ def placed(robot: Robot, points: Points, zeros: bool = False) -> Fit:
     """Return where base and reflectors fit best, joint zeros too if asked; of poses their positions."""
     fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, zeros=zeros, robust=True)
     every = 1 if points.turns is None else 4
-    return Fit(
-        fit.modelled[0, ::every], fit.error[0, ::every], fit.cost[0], fit.base[0], fit.tools[0, ::every], fit.zero[0]
-    )
+    of_points = {name: getattr(fit, name)[0, ::every] for name in ("modelled", "error", "tools")}
+    return Fit(*(each[0] for each in fit))._replace(**of_points)
 
 
 def misfit(robot: Robot, points: Points) -> float:
@@ -86,8 +82,6 @@ WRONG = 0.02
 """Points that are off by more than this part of their extent fit no drawing of their robot."""
 LEFT = 0.05
 """What leaves more than this part of the extent explains nothing, even if gross errors are behind it."""
-ZERO = 0.1
-"""How far joint zeros may be off [rad, m] in fits to distances."""
 FEW = 30
 """Rows of a first try; what comes near the best is tried on more."""
 SAME = 1.05
@@ -118,6 +112,8 @@ ANGLES = {
     1e-3: ("as thousandths of a degree", "divide the joint values by 1000"),
 }
 """The same of joint angles."""
+MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
+"""Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
 DEGREES_PER_MM = np.radians(1) / 1e-3
 """Radians that a metre stands for where millimetres were degrees."""
 
@@ -168,6 +164,11 @@ def _readings(robot: Robot, points: Points) -> list[Reading]:
     if points.seen:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
         return [*readings, Reading("the camera and the board exchanged", remedy, _inverted)]
+    if points.lengths:
+        for factor, (unit, _) in LENGTHS.items():
+            remedy = f"multiply column distance by {factor:g} or name its unit"
+            readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
+        return readings
     readings += _of_positions()
     if points.turns is not None:
         readings += _of_poses()
@@ -319,21 +320,51 @@ def _of_rows(count: int, dof: int) -> Iterator[Reading]:
     yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
 
 
-def _orders(robot: Robot) -> Iterator[Reading]:
+def _factors(robot: Robot, points: Points) -> Iterator[Reading]:
+    """Yield readings with a column, all angles or all lengths times a factor that fits: other units, counts, gears."""
+    eye = np.eye(robot.dof)
+    turning = np.array(robot.joint_dimensions) == "angle"
+    scaled = {f"column q{i + 1}": ("q", eye[i]) for i in range(robot.dof)}
+    scaled |= {"all joint values": ("q", turning), "all measured lengths": ("y", np.ones(points.y.shape[1]))}
+    if not points.lengths:
+        scaled |= {f"column {axis}": ("y", of) for axis, of in zip("xyz", np.eye(3), strict=True)}
+
+    def times(what: str, factor: float, points: Points = points) -> Points:
+        name, of = scaled[what]
+        return replace(points, **{name: getattr(points, name) * (1 + (factor - 1) * of)})
+
+    few = points.evenly(FEW)
+    factors = np.geomspace(1 / MOST_TIMES, MOST_TIMES, FACTORS)
+    tries = [times(what, factor, few) for what in scaled for factor in factors.tolist()]
+    size = misfits(robot, tries).reshape(len(scaled), FACTORS)
+    for k in np.argsort(size.min(axis=1))[:FINER]:
+        what, factor = list(scaled)[k], float(factors[np.argmin(size[k])])
+        ratio = factors[1] / factors[0]
+        while ratio > 1 + 1e-5:
+            near = (factor * ratio ** np.linspace(-1, 1, 9)).tolist()
+            factor = near[int(np.argmin(misfits(robot, [times(what, each, few) for each in near])))]
+            ratio **= 0.25
+        remedy = f"multiply {what} by {factor:.5g}, or name the unit"
+        yield Reading(f"{what} in another unit or scale", remedy, partial(times, what, factor))
+
+
+def _orders(robot: Robot, points: Points) -> Iterator[Reading]:
     """Yield all orders of up to six turning joints."""
+    del points
     if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
         return
     for columns in permutations(range(robot.dof)):  # the columns that hold joints 1, 2, ...
         names = ", ".join(f"q{columns.index(i) + 1}" for i in range(robot.dof))
 
         def change(points: Points, columns: tuple[int, ...] = columns) -> Points:
-            return replace(points, q=points.q[:, columns])
+            return replace(points, q=points.q[..., columns])
 
         yield Reading(f"joints in the order {names}", f"name the columns {names}", change)
 
 
-def _other_robots(robot: Robot) -> Iterator[Reading]:
+def _other_robots(robot: Robot, points: Points) -> Iterator[Reading]:
     """Yield the table in the other Denavit-Hartenberg convention, and the ready robots with such joints."""
+    del points
     for which, shift, end, remedy in (
         ("standard (distal)", 1, 0, "move alpha and a of every row to the next row (the first row's are 0)"),
         ("modified (proximal)", -1, -1, "move alpha and a of every row to the row before"),
@@ -393,11 +424,12 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     """Return the interpretation that fits far better than the table as written, or None.
 
     Single mistakes are tried first, then a second and a third one behind the best of them; where the drawing cannot be
-    right, all orders of up to six joints, and the ready robots. Base and reflectors are fitted anew for every reading.
+    right, all orders of up to six joints, and the ready robots. Base or anchor and reflectors are fitted anew for every
+    reading.
     """
-    points = points_of(problem)
+    points = points_of(problem) or lengths_of(problem)
     if points is None:
-        return _better_lengths(problem)
+        return None
     robot = problem.robot
     mapping = None if explained(robot, points) else search(robot, points)
     if mapping is not None:
@@ -415,13 +447,13 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         return None
     chain, left = _mistakes(robot, points, stated)
     if stated > WRONG and not points.seen:
-        for readings in (_orders, _other_robots):
+        for readings in (_factors, _orders, _other_robots):
             if not left < BETTER * stated:
-                chain, left = _best(robot, points, list(readings(robot)))
+                chain, left = _best(robot, points, list(readings(robot, points)))
     if not left < BETTER * stated or (left > LEFT and not points.seen):
         # a ready robot of nearly the same drawing, a UR10 for a UR10e
         own = misfit(robot, points)
-        for each in [] if points.seen else _other_robots(robot):
+        for each in [] if points.seen else _other_robots(robot, points):
             if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
                 left = misfit(each.robot, points)
                 if left < SIBLING_BETTER * own:
@@ -445,59 +477,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         changed = each.change(changed)
     what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
     remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
-    return Better(what, remedy, stated * points.extent, left * changed.extent)
-
-
-def _better_lengths(problem: CalibrationProblem) -> Better | None:
-    """Return the single mistake that explains distances far better, or None.
-
-    No frame can be eliminated from them, so that a reading is judged by a fit of anchor, reflectors and joint zeros.
-    """
-    blocks = problem.data.blocks
-    kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
-    if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance"):
-        return None
-    order = np.argsort(np.concatenate([block.row for block in blocks]))
-    q, y = (np.concatenate([getattr(block, name) for block in blocks])[order] for name in ("q", "y"))
-    N = len(y)
-    table = Points(q, y, marker=np.zeros(N, dtype=int), tools=np.zeros((1, 3)), turns=None, row=np.arange(N))
-    robot = problem.robot
-    of = blocks[0]
-    p = problem.parameters
-    own = dict(zip(p.names, p.nominal, strict=True))
-    tools = {marker: [own[tool_prefix(marker) + c] for c in FRAME] for marker in of.markers}
-    zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, 1)]
-    reflectors = [tool_prefix(marker) + "[xyz]" for marker in of.markers]
-    fixture = [of_fixture(name, of.fixture) for name in of.measurement.parameters]
-
-    def left(lengths: Points) -> float:
-        """Return the RMS error of the best three quarters of some rows over the extent of the lengths."""
-        some = lengths.evenly(SOME_ROWS)
-        rows = np.arange(len(some.y))
-        block = Block(of.measurement, some.q, some.y, of.covariance[:1], rows, of.markers, of.fixture)
-        data = Dataset((block,), tuple(map(str, rows)), rows)
-        try:
-            parameters = starting_parameters(robot, data, [own[f"base_{c}"] for c in FRAME], tools)
-        except InputError:  # lengths to which no anchor belongs
-            return float("inf")
-        free = parameters.identify([*zeros, *reflectors, *fixture])
-        fit = CalibrationProblem(robot, replace(free, scale=np.where(free.placed, FIXTURE, ZERO)), data)
-        error = np.sort(np.abs(fit.errors(settled(fit, STEPS))))[: 3 * len(rows) // 4]
-        return float(np.sqrt(np.mean(error**2)) / np.ptp(some.y))
-
-    stated = left(table)
-    readings = [*_of_joints(robot), *_of_rows(N, robot.dof)]
-    for factor, (unit, _) in LENGTHS.items():
-        remedy = f"multiply column distance by {factor:g} or name its unit"
-        readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
-    found = np.array([left(each.change(table)) for each in readings])
-    best = float(found.min())
-    if not best < min(BETTER * stated, LEFT):
-        return None
-    alike = [readings[i] for i in np.argsort(found) if found[i] <= SAME * best][:4]
-    what, remedy = (", or ".join(words) for words in zip(*(each[:2] for each in alike), strict=True))
-    extent = float(np.ptp(alike[0].change(table).y))
-    return Better(what, remedy, stated * float(np.ptp(y)), best * extent)
+    return Better(what, remedy, stated * changed.extent, left * changed.extent)
 
 
 def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:

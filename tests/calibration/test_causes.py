@@ -398,7 +398,7 @@ def test_an_anchor_that_is_not_stated_is_found(outliers: bool) -> None:
 
 @pytest.mark.slow
 def test_a_mistake_in_lengths_is_named() -> None:
-    """No frame can be eliminated from them: every reading is a fit of its own."""
+    """A joint that counts the other way; a mirror image would fit as well."""
     result = cable(q=ro.load("cable").problem.data.blocks[0].q * [1, -1, 1, 1, 1, 1])
     assert not result.verdict.delivered
     assert "joint 2 reversed" in result.verdict.reasons[-1]

@@ -116,6 +116,25 @@ def test_poses_show_signs_and_zeros() -> None:
     assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen)
 
 
+@pytest.mark.parametrize("name", ["scara", pytest.param("ur5e", marks=pytest.mark.slow)])
+def test_lengths_show_signs_and_zeros_but_not_which_of_two_mirror_images(name: str) -> None:
+    """A draw-wire whose anchor is not known; held-out lengths are as with the truth stated, for both images."""
+    robot = robot_of(name)
+    problem, unseen, truth = simulated(name, 3)
+
+    def lengths(data: ro.Dataset) -> ro.Dataset:
+        away = np.linalg.norm(data.blocks[0].y - [0.4, 0.9, 1.1], axis=1, keepdims=True)
+        return ro.Dataset.of(data.q, away + 0.05, NOISE, measurement="cable")
+
+    result = ro.calibrate(ro.problem_from(robot, lengths(problem.data)))
+    assert result.mapping is not None
+    assert [each.mirror for each in result.mapping.alternatives] == [True]
+    assert "do not tell an arm from its mirror image" in result.message
+    stated = ro.calibrate(ro.problem_from(truth.robot, lengths(problem.data)))
+    assert stated.mapping is None
+    assert error(result, lengths(unseen)) < 1.2 * error(stated, lengths(unseen))
+
+
 def test_what_is_found_goes_into_the_mapping() -> None:
     """One joint reversed and one a quarter turn off are said exactly, in the words of robot.toml."""
     sign = np.array([1.0, 1, -1, 1, 1, 1])

@@ -1,12 +1,14 @@
-"""Global start: joint signs, joint zeros, base and reflectors, if the nominal model does not explain the data.
+"""Global start: joint signs, joint zeros, frames and reflectors of an arm that its nominal model does not explain.
 
-Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, the base eliminated at every step:
-random zeros, all signs in turn, a few steps for all and more for the best, until enough starts end in one optimum.
-There is no certificate: a better optimum that one start reaches with probability h is missed with (1 - h)^starts.
+Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, the base (of lengths the anchor)
+eliminated at every step: random zeros, all signs in turn, a few steps for all and more for the best, until enough
+starts end in one optimum. There is no certificate: a better optimum that one start reaches with probability h is missed
+with (1 - h)^starts. Lengths do not tell an arm from its mirror image.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 
@@ -14,11 +16,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import joined, three_digits
+from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
-from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, mirrored, points_of
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers
+from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, lengths_of, mirrored, points_of
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
@@ -63,6 +66,7 @@ class Alternative:
     zero: Array
     apart: float  # RMS distance of their predictions at other configurations [m]
     told_by: Array  # (dof,) joint values of the controller at which these are farthest apart [rad or m]
+    mirror: bool = False  # whether it is the mirror image of the first one, so that lengths are the same everywhere
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,22 +97,34 @@ class JointMapping:
             f"{self.starts} random starts: an optimum that one start in {round(1 / RARE_BASIN)} reaches is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
-        return " ".join([text, *self.ambiguities])
+        return " ".join([text, *self._said(self.alternatives)])
 
     @property
     def ambiguities(self) -> tuple[str, ...]:
-        """Return sentences on alternatives of equal fit, and on measurements that would decide."""
+        """Return sentences on alternatives of equal fit; no mirror image of an arm whose joints count as stated."""
+        stated = bool((self.sign > 0).all())
+        return self._said([other for other in self.alternatives if not (other.mirror and stated)])
+
+    def _said(self, alternatives: Sequence[Alternative]) -> tuple[str, ...]:
         said = []
         if self.mirrored:
             said.append(
                 "A left-handed measured frame with the joints as stated fits as well: a known direction in the "
                 "instrument's frame (such as up) or measured orientations would decide."
             )
-        for other in self.alternatives:
+        for other in alternatives:
+            what = described(self.joint_types, other.sign, other.zero).capitalize()
+            if other.mirror:
+                first = described(self.joint_types, self.sign, self.zero)
+                said.append(
+                    f"{what}, fits as well as {first}: lengths do not tell an arm from its mirror image; a few "
+                    "positions would decide, or write what the set-up confirms as sign and theta_deg in robot.toml."
+                )
+                continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
             said.append(
-                f"{described(self.joint_types, other.sign, other.zero).capitalize()} fits as well, and predicts "
-                f"{three_digits(1e3 * other.apart)} mm at other configurations: measure at ({values}) to decide."
+                f"{what} fits as well, and predicts {three_digits(1e3 * other.apart)} mm at other "
+                f"configurations: measure at ({values}) to decide."
             )
         return tuple(said)
 
@@ -148,22 +164,29 @@ def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
 def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | None:
     """Return signs and zeros of the joints where the nominal robot fails, and the mapped problem.
 
-    Sought where base and all reflectors' positions are identified: otherwise their statements decide what joints are.
-    None where nominal signs and small zeros explain the data, no mapping does, or a left-handed measured frame.
+    Sought where the base, of lengths the anchor, and all reflectors' positions are identified: otherwise their
+    statements decide what joints are. None where nominal signs and small zeros explain the data, no mapping does, or a
+    left-handed measured frame.
     """
     if not isinstance(problem, CalibrationProblem) or len(problem.arms) > 1:
         return None
-    prefixes = {tool_prefix(marker) for block in problem.data.blocks for marker in block.markers}
-    frames = {f"base_{c}" for c in FRAME} | {prefix + c for prefix in prefixes for c in FRAME[:3]}
-    if not frames <= set(problem.parameters.free.names):
+    points = points_of(problem) or lengths_of(problem)
+    if points is None:
         return None
-    points = points_of(problem)
-    if points is None or explained(problem.robot, points):
+    needed = {tool_prefix(marker) + c for block in problem.data.blocks for marker in block.markers for c in FRAME[:3]}
+    needed |= set(_anchor(problem)) if points.lengths else {f"base_{c}" for c in FRAME}
+    if not needed <= set(problem.parameters.free.names) or explained(problem.robot, points):
         return None
     found = search(problem.robot, points)
     if found is None or found.mirrored:
         return None
     return found, with_mapping(problem, points, found)
+
+
+def _anchor(problem: CalibrationProblem) -> list[str]:
+    """Return the names of the place and the offset of lengths, none of distances between points of the arm."""
+    block = problem.data.blocks[0]
+    return [of_fixture(name, block.fixture) for name in block.measurement.parameters]
 
 
 def explained(robot: Robot, points: Points) -> bool:
@@ -185,16 +208,23 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
     p = problem.parameters
     values = {f"theta{i}": theta for i, theta in enumerate(robot.mdh[:, 2], start=1)}
     values |= {f"d{i}": d for i, d in enumerate(robot.mdh[:, 3], start=1)}
-    places = {"base_": fit.base[0]}
+    places = {}
+    if not points.lengths:
+        places["base_"] = fit.base[0]
+    elif names := _anchor(problem):
+        stated = numeric_frame(p.nominal[[p.names.index(f"base_{c}") for c in FRAME]])
+        anchor = transformed(stated, -fit.base[0, :3, 3])
+        values |= dict(zip(names, [*anchor, fit.offset[0]], strict=True))
     several = len(fit.tools[0]) // len(points.names)
     for name, tool in zip(points.names, fit.tools[0].reshape(len(points.names), several, 3), strict=True):
         turn = proper((tool[1:] - tool[0]).T) if several > 1 else np.eye(3)
         places[tool_prefix(name)] = rigid(turn, tool[0])
-    free = set(p.free.names)
     for prefix, T in places.items():
-        of_frame = {prefix + c: value for c, value in zip(FRAME, frame_numbers(T), strict=True)}
-        values |= {name: value for name, value in of_frame.items() if name in free}
-    nominal = np.array([values.get(name, value) for name, value in zip(p.names, p.nominal, strict=True)])
+        values |= {prefix + c: value for c, value in zip(FRAME, frame_numbers(T), strict=True)}
+    free = {*p.free.names, *[f"{kind}{i}" for kind in ("theta", "d") for i in range(1, len(robot.mdh) + 1)]}
+    nominal = np.array(
+        [values.get(name, value) if name in free else value for name, value in zip(p.names, p.nominal, strict=True)]
+    )
     return replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
 
 
@@ -280,13 +310,14 @@ def _judged(
         return None
     best = int(np.argmin(left))
     kept = fits.error[best] <= GROSS * np.median(fits.error[best])
-    equations = 3 * int(kept.sum())
+    equations = (1 if points.lengths else 3) * int(kept.sum())
     free = max(equations - max(robot.dof - 2, 0) - fits.tools[0].size - 6, 1)
     cost = (fits.error[:, kept] ** 2).sum(axis=1)
     chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
     near = [i for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
     turning = _turning(robot)
-    low, high = points.q.min(axis=0), points.q.max(axis=0)
+    measured = points.q.reshape(-1, robot.dof)
+    low, high = measured.min(axis=0), measured.max(axis=0)
     elsewhere = np.where(
         turning, rng.uniform(-np.pi, np.pi, (UNSEEN, robot.dof)), rng.uniform(low, high, (UNSEEN, robot.dof))
     )
@@ -296,34 +327,51 @@ def _judged(
     for i in near:
         T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
         there = transformed(T[:, None], fits.tools[i])
-        gaps = [_apart(there, other) for other in said]
+        if points.lengths:
+            there -= there.mean(axis=(0, 1))
+        gaps = [_apart(there, other, points.lengths) for other in said]
         if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
             classes[int(np.argmin(gaps))].append(i)
         else:
             classes.append([i])
             said.append(there)
-    first, *plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
+    plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
+    same = 0.5 * max(least, LEAST_NOISE)
+
+    def mirrors(first: int) -> list[bool]:
+        return [points.lengths and bool(_apart(-there, said[first], True) <= same) for there in said]
+
+    first = min([0, *np.flatnonzero(mirrors(0)).tolist()], key=lambda k: _plain(sign[plainest[k]], zeros[plainest[k]]))
+    mirror = mirrors(first)
     others = []
-    for i, there in zip(plainest, said[1:], strict=True):
-        far = np.linalg.norm(there - said[0], axis=-1).max(axis=-1)
-        others.append(Alternative(sign[i], zeros[i], _apart(there, said[0]), elsewhere[int(np.argmax(far))]))
+    for k, i in enumerate(plainest):
+        if k != first:
+            far = np.linalg.norm(said[k] - said[first], axis=-1).max(axis=-1)
+            told_by = elsewhere[int(np.argmax(far))]
+            apart = _apart(said[k], said[first], points.lengths)
+            others.append(Alternative(sign[i], zeros[i], apart, told_by, mirror[k]))
     nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
-    left_handed = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), LONG, zeros=True, noise=LEAST_NOISE)
-    small_zeros = np.abs(_gauged(robot, left_handed.zero[0])).max() < NEAR_ZERO
-    left_first = float(left[first])
+    left_handed = False
+    if not points.lengths:
+        other = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), LONG, zeros=True, noise=LEAST_NOISE)
+        small_zeros = np.abs(_gauged(robot, other.zero[0])).max() < NEAR_ZERO
+        left_handed = bool(small_zeros and rms(other)[0] < MIRRORED * left[plainest[first]])
     return JointMapping(
         robot.joint_types,
-        sign[first],
-        zeros[first],
+        sign[plainest[first]],
+        zeros[plainest[first]],
         nominal,
-        left_first,
+        float(left[plainest[first]]),
         starts,
         tuple(others),
-        bool(small_zeros and rms(left_handed)[0] < MIRRORED * left_first),
+        left_handed,
     )
 
 
-def _apart(one: Array, other: Array) -> float:
+def _apart(one: Array, other: Array, lengths: bool) -> float:
+    """Return the RMS distance of points (..., 3); of lengths, which know no frame, as they are nearest."""
+    if lengths:
+        one = one @ proper(np.einsum("nmi,nmj->ij", other, one)).T
     return float(np.sqrt(((one - other) ** 2).sum(axis=-1).mean()))
 
 

@@ -1,4 +1,7 @@
-"""Measured points of an arm, and batched Levenberg-Marquardt fits of base, reflectors and joint zeros to them."""
+"""Measured points of an arm, and batched Levenberg-Marquardt fits of base, reflectors and joint zeros to them.
+
+Lengths from an anchor, or between two points of the arm, are fitted in the same way: the anchor is eliminated instead.
+"""
 
 from __future__ import annotations
 
@@ -32,11 +35,11 @@ LARGEST_BATCH = 4_000_000
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """N measured points of a robot."""
+    """N measured points of a robot, or N lengths from an anchor to them (K = 1) or between two of them (K = 2)."""
 
-    q: Array  # (N, dof) joint values of the controller [rad or m]
-    y: Array  # (N, 3) positions [m]
-    marker: np.ndarray  # (N,) numbers of the reflectors
+    q: Array  # (N, dof), of lengths (N, K, dof): joint values of the controller [rad or m]
+    y: Array  # (N, 3) positions or (N, 1) lengths [m]
+    marker: np.ndarray  # (N,), of lengths (N, K): numbers of the reflectors
     tools: Array  # (M, 3) where these are stated in the flange frame [m]
     turns: Array | None  # (N, 3, 3) orientations
     row: np.ndarray  # (N,) of the dataset
@@ -56,8 +59,13 @@ class Points:
 
     @property
     def extent(self) -> float:
-        """Extent of the points [m]."""
-        return max(float(np.linalg.norm(self.y.std(axis=0))), 1e-12)
+        """Extent of the points [m], of one coordinate scaled to three."""
+        return max(float(np.sqrt(3 * np.mean(self.y.var(axis=0)))), 1e-12)
+
+    @property
+    def lengths(self) -> bool:
+        """Whether lengths were measured."""
+        return self.y.shape[1] == 1
 
 
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
@@ -91,6 +99,30 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
     return whole.take(np.argsort(whole.row, kind="stable")).evenly(most)
 
 
+def lengths_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
+    """Return the lengths of a cable or of distances, all by the same reflectors and anchor; None for others, or few."""
+    blocks = problem.data.blocks
+    kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
+    if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance"):
+        return None
+    p = problem.parameters
+    own = dict(zip(p.names, p.nominal.tolist(), strict=True))
+    names = list(dict.fromkeys(blocks[0].markers))
+    if len(problem.data) < problem.robot.dof + 3 * len(names) + len(FRAME):
+        return None
+    row = np.concatenate([block.row for block in blocks])
+    whole = Points(
+        q=np.concatenate([block.q for block in blocks]),
+        y=np.concatenate([block.y for block in blocks]),
+        marker=np.tile([names.index(marker) for marker in blocks[0].markers], (len(row), 1)),
+        tools=np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in names]),
+        turns=None,
+        row=row,
+        names=tuple(names),
+    )
+    return whole.take(np.argsort(row, kind="stable")).evenly(most)
+
+
 def mirrored(points: Points) -> Points:
     """Return the points in a measured frame of the other handedness."""
     mirror = np.diag([1.0, 1.0, -1.0])
@@ -103,20 +135,21 @@ def mirrored(points: Points) -> Points:
 class Fit(NamedTuple):
     """Where base, reflectors and joint zeros fit positions best: of B sets of N points, M reflectors."""
 
-    modelled: Array  # (B, N, 3) [m]
+    modelled: Array  # (B, N, 3), of lengths (B, N, 1) [m]
     error: Array  # (B, N) [m]
     cost: Array  # (B,) weighted [m^2]
-    base: Array  # (B, 4, 4) in the instrument's frame
+    base: Array  # (B, 4, 4) in the instrument's frame; of lengths in a frame about the anchor
     tools: Array  # (B, M, 3) in the flange frame [m]
     zero: Array  # (B, dof) joint zeros [rad or m]
+    offset: Array  # (B,) of lengths [m]
 
 
 class Candidates(NamedTuple):
     """B sets of N points to be fitted at once."""
 
-    q: Array  # (B, N, dof) joint values of the model
-    y: Array  # (B, N, 3) positions [m]
-    marker: np.ndarray  # (B, N) reflectors
+    q: Array  # (B, NK, dof) joint values of the model
+    y: Array  # (B, N, 3) positions or (B, N, 1) lengths [m]
+    marker: np.ndarray  # (B, NK) reflectors
     zero: Array  # (B, dof) start values of joint zeros
     tools: Array  # (B, M, 3) start values of reflectors
     stated: Array  # (M, 3) their stated places
@@ -132,6 +165,7 @@ class Candidates(NamedTuple):
             np.stack([getattr(points, name) for points in tries]) for name in ("q", "y", "marker", "tools")
         )
         B, M, _ = tools.shape
+        q, marker = q.reshape(B, -1, q.shape[-1]), marker.reshape(B, -1)
         spread = np.full(M, TOOL_ERROR)
         turns = [LEVER * points.extent * points.turns for points in tries if points.turns is not None]
         if turns:
@@ -170,60 +204,106 @@ def fit_arms(
     Joint zeros are fitted where ``zeros``; weights w fall as 1 / error beyond three medians of a candidate's errors
     where ``robust``, otherwise they are one; ``noise`` is the error of a point [m].
     """
-    B, N, _ = candidates.y.shape
+    B = len(candidates.y)
     columns = 3 + 3 * len(candidates.stated) + zeros * robot.dof
-    parts = np.array_split(np.arange(B), 1 + B * N * 3 * columns // LARGEST_BATCH)
+    parts = np.array_split(np.arange(B), 1 + B * candidates.q.shape[1] * 3 * columns // LARGEST_BATCH)
     fits = [_fitted(robot, candidates.take(some), steps, zeros, robust, noise) for some in parts]
     return Fit(*(np.concatenate(each) for each in zip(*fits, strict=True)))
 
 
 class _State(NamedTuple):
-    """Candidates at one point: numbers of a candidate (B, ...), and of its points (..., B, N)."""
+    """Candidates at one point: numbers of a candidate (B, ...), and of its points (..., B, NK) or rows (..., B, N)."""
 
     zero: Array
     tools: Array
     base: Array  # (B, 3, 3) from the instrument's frame to the robot's
     cost: Array
-    points: Array  # (3, B, N)
-    turn: Array  # (3, 3, B, N) columns of the flange's rotation
-    axes: Array  # (dof, 3, B, N) of joints
-    origins: Array  # (dof, 3, B, N) of joints
-    mean: Array  # (3, B, 1)
-    residual: Array  # (3, B, N)
+    offset: Array  # (B,) of lengths
+    points: Array  # (3, B, NK)
+    turn: Array  # (3, 3, B, NK) columns of the flange's rotation
+    axes: Array  # (dof, 3, B, NK) of joints
+    origins: Array  # (dof, 3, B, NK) of joints
+    away: Array  # (3, B, N) from the points' mean, from the anchor, or from one point to the other
+    residual: Array  # (3, B, N) or (1, B, N)
 
     def where(self, better: np.ndarray, other: _State) -> _State:
         """Return the other's candidates where they are better."""
         each = []
         for k, (mine, theirs) in enumerate(zip(self, other, strict=True)):
             of_candidate = better.reshape(-1, *[1] * (mine.ndim - 1))
-            each.append(np.where(of_candidate if k < 4 else better[:, None], theirs, mine))
+            each.append(np.where(of_candidate if k < 5 else better[:, None], theirs, mine))
         return _State(*each)
 
 
+def _registered(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
+    """Return base, offset, away and residual (`_State`) of positions y (3, B, N) at the best base."""
+    share = weights / weights.sum(axis=1, keepdims=True)
+    away = points - (points * share).sum(axis=-1, keepdims=True)
+    target = y - (y * share).sum(axis=-1, keepdims=True)
+    base = proper(np.einsum("ibn,jbn->bij", weights * away, target))
+    return base, np.zeros(len(base)), away, away - np.einsum("bij,jbn->ibn", base, target)
+
+
+def _anchored(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
+    """Return the same of lengths y (1, B, N): of pairs of points, or from the best anchor with the best offset.
+
+    ::
+
+        |p - a|^2 = (y - l)^2   is linear in  a, l, |a|^2 - l^2,
+
+    which starts a Gauss-Newton step on |p - a| + l - y: of squares alone long lengths would weigh most.
+    """
+    B, N = weights.shape
+    base = np.tile(np.eye(3), (B, 1, 1))
+    if points.shape[2] == 2 * N:
+        away = points[..., 1::2] - points[..., ::2]
+        return base, np.zeros(B), away, np.linalg.norm(away, axis=0) - y
+    root = np.sqrt(weights)
+
+    def least_squares(columns: Array, right: Array) -> Array:
+        A = (columns * root).transpose(1, 0, 2)
+        H = A @ A.transpose(0, 2, 1)
+        H += 1e-12 * np.trace(H, axis1=1, axis2=2)[:, None, None] * np.eye(len(columns))
+        return np.linalg.solve(H, A @ (right * root)[..., None])[..., 0].T
+
+    start = least_squares(np.concatenate([2 * points, -2 * y, np.ones_like(y)]), (points**2).sum(axis=0) - y[0] ** 2)
+    anchor, offset = start[:3], start[3]
+
+    def beside(anchor: Array, offset: Array) -> tuple[Array, Array, Array]:
+        away = points - anchor[..., None]
+        length = np.maximum(np.linalg.norm(away, axis=0), 1e-9)
+        return away, length, length + offset[:, None] - y[0]
+
+    away, length, residual = beside(anchor, offset)
+    step = least_squares(np.concatenate([away / length, -np.ones_like(y)]), residual)
+    finer = beside(anchor + step[:3], offset + step[3])
+    better = (weights * finer[2] ** 2).sum(axis=1) < (weights * residual**2).sum(axis=1)
+    away = np.where(better[:, None], finer[0], away)
+    residual = np.where(better[:, None], finer[2], residual)
+    return base, offset + better * step[3], away, residual[None]
+
+
 def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
-    B, N, _ = candidates.y.shape
+    B, N, coordinates = candidates.y.shape
     damping = np.full(B, 1e-2)
     weights = np.ones((B, N))
     pull = (noise / candidates.spread) ** 2
     y = np.moveaxis(candidates.y, -1, 0)
+    eliminated = _anchored if coordinates == 1 else _registered
 
     def at(weights: Array, zero: Array, tools: Array) -> _State:
         """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
         turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
         tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
         points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
-        share = weights / weights.sum(axis=1, keepdims=True)
-        mean = (points * share).sum(axis=-1, keepdims=True)
-        centred = points - mean
-        target = y - (y * share).sum(axis=-1, keepdims=True)
-        base = proper(np.einsum("ibn,jbn->bij", weights * centred, target))
-        residual = centred - np.einsum("bij,jbn->ibn", base, target)
+        base, offset, away, residual = eliminated(points, y, weights)
         off = tools - candidates.stated
         cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
-        return _State(zero, tools, base, cost, points, turn, axes, origins, mean, residual)
+        return _State(zero, tools, base, cost, offset, points, turn, axes, origins, away, residual)
 
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
+    columns = size + zeros * robot.dof
     quiet = 0
     for k in range(steps):
         if robust and k % 2 == 0:
@@ -235,7 +315,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
         tools = state.tools + step[:, :size].reshape(state.tools.shape)
         zero = state.zero
         if zeros:
-            zero = zero + step[:, size:-3]
+            zero = zero + step[:, size:columns]
         candidate = at(weights, zero, tools)
         better = candidate.cost < state.cost
         before = state.cost
@@ -244,12 +324,17 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
         quiet = 0 if (before - state.cost > 1e-9 * before).any() else quiet + 1
         if quiet == 5:
             break
+    if coordinates == 1:
+        modelled = candidates.y + np.moveaxis(state.residual, 0, -1)
+        base = rigid(state.base, (state.away[..., 0] - state.points[..., 0]).T)
+        return Fit(modelled, np.abs(state.residual[0]), state.cost, base, state.tools, state.zero, state.offset)
     turn = np.swapaxes(state.base, 1, 2)
     seen = np.einsum("bij,jbn->bni", turn, state.points)
     weight = weights / weights.sum(axis=1, keepdims=True)
     base = rigid(turn, np.einsum("bn,bni->bi", weight, candidates.y - seen))
     modelled = seen + base[:, None, :3, 3]
-    return Fit(modelled, np.linalg.norm(candidates.y - modelled, axis=2), state.cost, base, state.tools, state.zero)
+    error = np.linalg.norm(candidates.y - modelled, axis=2)
+    return Fit(modelled, error, state.cost, base, state.tools, state.zero, state.offset)
 
 
 def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
@@ -283,11 +368,11 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
 def _step(
     robot: Robot, candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool
 ) -> Array:
-    """Return the damped Gauss-Newton steps (B, columns): reflectors, joint zeros, a turn of the base."""
-    B, N, _ = candidates.y.shape
+    """Return the damped Gauss-Newton steps (B, columns): reflectors, joint zeros, then what was eliminated."""
+    B, N, coordinates = candidates.y.shape
     M = len(candidates.stated)
     dof = state.zero.shape[1] if zeros else 0
-    J = np.zeros((B, 3 * M + dof + 3, 3, N))
+    J = np.zeros((B, 3 * M + dof, 3, candidates.q.shape[1]))
     for m in range(M):
         seen = candidates.marker == m
         for k in range(3):
@@ -297,13 +382,22 @@ def _step(
         if robot.joint_types[j] == "revolute":
             slope = np.cross(slope, state.points - state.origins[j], axis=0)
         J[:, 3 * M + j] = np.moveaxis(slope, 0, 1)
-    for k, axis in enumerate(np.eye(3)):
-        J[:, k - 3] = np.moveaxis(np.cross(axis[:, None, None], state.points - state.mean, axis=0), 0, 1)
-    share = (weights / weights.sum(axis=1, keepdims=True))[:, None, None]
+    if coordinates == 1:
+        if J.shape[-1] == 2 * N:
+            J = J[..., 1::2] - J[..., ::2]
+        unit = state.away / np.maximum(np.linalg.norm(state.away, axis=0), 1e-9)
+        J = np.einsum("bcin,ibn->bcn", J, unit)[:, :, None]
+        if candidates.q.shape[1] == N:  # the anchor, and the offset as the mean
+            J = np.concatenate([J, np.moveaxis(unit, 0, 1)[:, :, None]], axis=1)
+    else:
+        turns = [np.cross(axis[:, None, None], state.away, axis=0) for axis in np.eye(3)]
+        J = np.concatenate([J, np.stack(turns).transpose(2, 0, 1, 3)], axis=1)
+    if candidates.q.shape[1] == N:
+        share = (weights / weights.sum(axis=1, keepdims=True))[:, None, None]
+        J -= (J * share).sum(axis=-1, keepdims=True)
     root = np.sqrt(weights)[:, None, None]
-    J -= (J * share).sum(axis=-1, keepdims=True)
-    A = (J * root).reshape(B, -1, 3 * N)
-    r = (np.moveaxis(state.residual, 0, 1) * root[:, 0]).reshape(B, 3 * N, 1)
+    A = (J * root).reshape(B, J.shape[1], -1)
+    r = (np.moveaxis(state.residual, 0, 1) * root[:, 0]).reshape(B, -1, 1)
     H = A @ np.swapaxes(A, 1, 2)
     g = (A @ r)[..., 0]
     at = np.arange(3 * M)
