@@ -13,7 +13,6 @@ from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, read_columns, read_grid
-from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6
@@ -42,11 +41,6 @@ WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
 UNITS_LINE = re.compile(r"\W*(?:units?|einheit(?:en)?|unités?|unidades|unità)\s*[:=]?\s+(.+)", re.IGNORECASE)
 """A line above the header that states units."""
-READING = (
-    "sheet", "encoding", "separator", "decimal", "columns", "units", "quaternion", "rotation", "prefix", "constants",
-    "key", "within", "joints",
-)  # fmt: skip
-"""What a problem file remembers of how its tables were read, so that later ones are read alike."""
 
 
 @dataclass(frozen=True)
@@ -108,8 +102,8 @@ class TableOptions:
     def stated(cls, texts: Mapping[str, str]) -> TableOptions:
         """Return the options from their texts, as in ``[reading]`` of a problem file."""
         for name in texts:
-            if name not in READING:
-                raise InputError("key reading", f"'{name}'", choices(name, READING))
+            if name not in cls.__dataclass_fields__:
+                raise InputError("key reading", f"'{name}'", choices(name, cls.__dataclass_fields__))
         found: dict[str, Any] = dict(texts)
         for name in ("columns", "constants", "joints"):
             found[name] = tuple(filter(None, texts.get(name, "").split(",")))
@@ -119,7 +113,7 @@ class TableOptions:
 
     def texts(self) -> dict[str, str]:
         """Return the options that are set as texts."""
-        said = {name: getattr(self, name) for name in READING}
+        said = {name: getattr(self, name) for name in self.__dataclass_fields__}
         said["within"] = "" if self.within is None else repr(self.within)
         units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
         said |= {"units": ",".join(units)}
@@ -222,13 +216,12 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
     if most < 2:
         found = f"{len(grid.rows)} lines, none of numbers" if len(grid.rows) > 1 else "a header and no rows"
         raise InputError("the table", found, "at least one row of numbers")
-    full = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
-    heads, above = _heads(grid, full, options)
-    first = {i: next(filter(None, grid.rows[i])) for i in full}
-    summing = [i for i in full if first[i].lower().rstrip(":") in SUMMARIES]
-    columns, mark = _columns([grid.rows[i] for i in full if i not in summing], heads, options)
-    notes = [*grid.notes, *_notes(grid, full, above, options)]
-    notes += [f"line {grid.lines[i]} is a summary, not a row: '{first[i]}' left out." for i in summing]
+    numeric = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
+    heads, above = _heads(grid, numeric, options)
+    full = [i for i in numeric if next(filter(None, grid.rows[i])).lower().rstrip(":") not in SUMMARIES]
+    columns, mark = _columns([grid.rows[i] for i in full], heads, options)
+    left = sorted(set(range(numeric[0], len(grid.rows))) - set(full))
+    notes = [*grid.notes, *_notes(grid, above, left, options)]
     if mark == ",":
         notes.append(
             f"decimal commas: {'as requested' if options.decimal else 'no comma can be a thousands separator'}."
@@ -248,30 +241,20 @@ def _count(row: Sequence[str]) -> int:
     return numbers and numbers + sum(cell != "" and is_missing(cell) for cell in row)
 
 
-def _notes(grid: Grid, full: Sequence[int], above: Sequence[int], options: TableOptions) -> list[str]:
-    """Return notes on a header that is not the first line alone, and on lines that are no rows of the table."""
-
-    def lines(rows: Sequence[int]) -> str:
-        return "line " + listed([str(grid.lines[i]) for i in rows])
-
+def _notes(grid: Grid, above: Sequence[int], left: Sequence[int], options: TableOptions) -> list[str]:
+    """Return notes on a header that is not the first line alone, and on lines that are left out."""
     notes = []
     if options.columns:
-        notes.append("column names as requested" + (f", instead of {lines(above)}." if above else "."))
+        notes.append("column names as requested" + (", instead of the header." if above else "."))
     elif len(above) > 1:
         notes.append(f"the header has {len(above)} lines, from line {grid.lines[above[0]]}.")
     if above and above[0]:
         notes.append(f"{above[0]} lines above the header are left out ('{' '.join(grid.rows[0])[:50]}' ...).")
-    header = [grid.rows[i] for i in above]
-    below = sorted(set(range(full[0], len(grid.rows))) - set(full))
-    again = [i for i in below if grid.rows[i] in header]
-    others = [i for i in below if grid.rows[i] not in header]
-    if again:
-        notes.append(f"the header is repeated in {lines(again)}: left out.")
-    for i in others[:MOST_NAMED]:
+    for i in left[:MOST_NAMED]:
         text = ", ".join(filter(None, grid.rows[i]))
         notes.append(f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' left out.")
-    if len(others) > MOST_NAMED:
-        notes.append(f"{len(others) - MOST_NAMED} more lines are not rows of the table: left out.")
+    if len(left) > MOST_NAMED:
+        notes.append(f"{len(left) - MOST_NAMED} more lines are not rows of the table: left out.")
     return notes
 
 

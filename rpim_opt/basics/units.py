@@ -20,40 +20,28 @@ class Unit(NamedTuple):
     zero: float = 0.0
 
 
+_BY_DIMENSION = {
+    "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
+    "length2": {"m2": 1.0, "mm2": 1e-6, "um2": 1e-12},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180},
+    "angle2": {"rad2": 1.0, "mrad2": 1e-6},
+    "length angle": {"m_rad": 1.0, "mm_mrad": 1e-6},
+    "torque": {"Nm": 1.0},
+    "mass": {"kg": 1.0},
+    "ratio": {"ppm": 1e-6},
+    "compliance": {"rad_per_Nm": 1.0, "mrad_per_Nm": 1e-3},
+    "temperature": {"K": 1.0, "degC": 1.0},
+    "ratio per temperature": {"ppm_per_K": 1e-6},
+    "length per temperature": {"m_per_K": 1.0, "mm_per_K": 1e-3, "um_per_K": 1e-6},
+    "angle per temperature": {"rad_per_K": 1.0, "mrad_per_K": 1e-3, "urad_per_K": 1e-6},
+    "pixel": {"px": 1.0},
+    "pixel2": {"px2": 1.0},
+    "length per force": {"m_per_N": 1.0, "mm_per_N": 1e-3, "um_per_N": 1e-6},
+}
 UNITS = {
-    "m": Unit("length", 1.0),
-    "mm": Unit("length", 1e-3),
-    "um": Unit("length", 1e-6),
-    "m2": Unit("length2", 1.0),
-    "mm2": Unit("length2", 1e-6),
-    "um2": Unit("length2", 1e-12),
-    "rad": Unit("angle", 1.0),
-    "mrad": Unit("angle", 1e-3),
-    "urad": Unit("angle", 1e-6),
-    "rad2": Unit("angle2", 1.0),
-    "mrad2": Unit("angle2", 1e-6),
-    "m_rad": Unit("length angle", 1.0),
-    "mm_mrad": Unit("length angle", 1e-6),
-    "deg": Unit("angle", math.pi / 180),
-    "Nm": Unit("torque", 1.0),
-    "kg": Unit("mass", 1.0),
-    "ppm": Unit("ratio", 1e-6),
-    "rad_per_Nm": Unit("compliance", 1.0),
-    "mrad_per_Nm": Unit("compliance", 1e-3),
-    "K": Unit("temperature", 1.0),
-    "degC": Unit("temperature", 1.0, 273.15),
-    "ppm_per_K": Unit("ratio per temperature", 1e-6),
-    "m_per_K": Unit("length per temperature", 1.0),
-    "mm_per_K": Unit("length per temperature", 1e-3),
-    "um_per_K": Unit("length per temperature", 1e-6),
-    "rad_per_K": Unit("angle per temperature", 1.0),
-    "mrad_per_K": Unit("angle per temperature", 1e-3),
-    "urad_per_K": Unit("angle per temperature", 1e-6),
-    "px": Unit("pixel", 1.0),
-    "px2": Unit("pixel2", 1.0),
-    "m_per_N": Unit("length per force", 1.0),
-    "mm_per_N": Unit("length per force", 1e-3),
-    "um_per_N": Unit("length per force", 1e-6),
+    name: Unit(dimension, si, 273.15 if name == "degC" else 0.0)
+    for dimension, units in _BY_DIMENSION.items()
+    for name, si in units.items()
 }
 
 CELSIUS = "temperature_C"
@@ -65,19 +53,10 @@ SMALLEST = 1e-15
 """Standard deviations and scales [SI] that are not zero: below an atom's size, where squares still are numbers."""
 
 DISPLAY = {
-    "length": "mm",
-    "angle": "deg",
-    "torque": "Nm",
-    "mass": "kg",
-    "ratio": "ppm",
-    "compliance": "mrad_per_Nm",
-    "temperature": "K",
-    "ratio per temperature": "ppm_per_K",
-    "length per temperature": "um_per_K",
-    "angle per temperature": "urad_per_K",
-    "length per force": "um_per_N",
-    "pixel": "px",
-}
+    "length": "mm", "angle": "deg", "torque": "Nm", "mass": "kg", "ratio": "ppm", "compliance": "mrad_per_Nm",
+    "temperature": "K", "ratio per temperature": "ppm_per_K", "length per temperature": "um_per_K",
+    "angle per temperature": "urad_per_K", "length per force": "um_per_N", "pixel": "px",
+}  # fmt: skip
 """The unit in which a dimension is shown and written."""
 
 WITH_UNIT = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})\Z")
@@ -222,12 +201,7 @@ def dimension_of(unit: str) -> str:
 
 
 def parse_units(text: str) -> dict[str, str]:
-    """Return the units of ``"deg,mm"`` by dimension, and those of ``"q=rad"`` by column name.
-
-    >>> from rpim_opt.basics.units import parse_units
-    >>> parse_units("q=rad, deg, m")
-    {'q': 'rad', 'angle': 'deg', 'length': 'm'}
-    """
+    """Return the units of ``"deg,mm"`` by dimension, and those of ``"q=rad"`` by column name."""
     units: dict[str, str] = {}
     for part in filter(None, (part.strip() for part in text.split(","))):
         stem, _, sign = (each.strip() for each in part.rpartition("="))

@@ -222,7 +222,8 @@ class Loads(NamedTuple):
             torque = [0.0] * dof
         weight = Weight()
         if self.gravity is not None:
-            weight = Statics(joint_types, parts["q"], nominal, self.gravity, stated.get("payload"))
+            payload = stated.get("payload", self.gravity.payload)
+            weight = Statics(payload, joint_types=joint_types, q=parts["q"], nominal=nominal, gravity=self.gravity)
         return Posture(parts["q"], torque, parts.get("approach"), weight, self.named(stated))
 
     def named(self, stated: Stated) -> dict[str, Symbol]:

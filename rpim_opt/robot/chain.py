@@ -32,16 +32,7 @@ SAME_PLACE = (0.01, 0.1)
 
 @dataclass(frozen=True, eq=False)
 class Described:
-    """A robot from a file; the tip of the file is at base @ MDH chain(q) @ tool.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> robot = ro.load("paper_arm").problem.robot
-    >>> arm = ro.robot.Described(robot, base=[0, 0, 0.5, 0, 0, 0], tool=[0, 0, 0.1, 0, 0, 0])
-    >>> ro.robot.model_parameters(arm.robot, arm.base, {"": arm.tool}).identify(["base_z", "tool_z"]).free.nominal
-    array([0.5, 0.1])
-    """
+    """A robot from a file; the tip of the file is at base @ MDH chain(q) @ tool."""
 
     robot: Robot
     base: Array  # (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them

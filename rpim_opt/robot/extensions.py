@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
 from functools import cached_property, lru_cache
 
 import casadi as ca
@@ -25,23 +26,19 @@ SAME = 1e-2
 """Columns that differ by less, relatively, say the same: far from rounding, and from tilts of some milliradians."""
 
 
+@dataclass(eq=False, kw_only=True)
 class Statics(Weight):
     """Gravity on an arm of nominal geometry in one configuration; quantities are computed at first use."""
 
-    def __init__(
-        self,
-        joint_types: Sequence[str],
-        q: Sequence[Symbol],  # of the model
-        nominal: Callable[[str], Symbol],  # numbers of the table, nominal("alpha2")
-        gravity: Gravity,
-        payload: Symbol | None = None,  # [kg], instead of that of ``gravity``
-    ) -> None:
-        super().__init__(gravity.payload if payload is None else payload)
-        self.joint_types = joint_types
-        self.q = q
-        self.nominal = nominal
-        self.gravity = gravity
-        self.direction = ca.DM(gravity.direction)
+    joint_types: Sequence[str]
+    q: Sequence[Symbol]  # of the model
+    nominal: Callable[[str], Symbol]  # numbers of the table, nominal("alpha2")
+    gravity: Gravity
+
+    @property
+    def direction(self) -> ca.DM:
+        """Where gravity points in the robot's base, a unit vector (3, 1)."""
+        return ca.DM(self.gravity.direction)
 
     def torque(self, i: int) -> Symbol:
         """Return z_i . sum over masses beyond joint i of m g (p - o_i) x g_hat [Nm]; zero about a prismatic joint."""
@@ -97,7 +94,8 @@ def _function(joint_types: tuple[str, ...], gravity: Gravity) -> ca.Function:
     table, value = table_symbols(dof)
     q = ca.SX.sym("q", dof)
     payload = ca.SX.sym("payload")
-    statics = Statics(joint_types, ca.vertsplit(q), value.__getitem__, gravity, payload)
+    nominal = value.__getitem__
+    statics = Statics(payload, joint_types=joint_types, q=ca.vertsplit(q), nominal=nominal, gravity=gravity)
     joints = range(1, dof + 1)
     torques = ca.vertcat(*(statics.torque(i) for i in joints))
     slopes = ca.vertcat(*(statics.moment(i, k, axis) for i in joints for k in joints for axis in AXES))

@@ -75,13 +75,11 @@ def link(alpha: Symbol, a: Symbol, theta: Symbol, d: Symbol, beta: Symbol) -> li
 
 def numeric_link(alpha: float = 0, a: float = 0, theta: float = 0, d: float = 0, beta: float = 0) -> Array:
     """Return the link's transform (4, 4) as numbers."""
-    return _link()(alpha, a, theta, d, beta).full()
+    return LINK(alpha, a, theta, d, beta).full()
 
 
-@lru_cache(maxsize=1)
-def _link() -> ca.Function:
-    numbers = [ca.SX.sym(name) for name in MDH]
-    return ca.Function("link", numbers, [ca.densify(product(link(*numbers)))])
+_numbers = [ca.SX.sym(name) for name in MDH]
+LINK = ca.Function("link", _numbers, [ca.densify(product(link(*_numbers)))])
 
 
 def roll_pitch_yaw(R: Array) -> Array:
@@ -114,13 +112,11 @@ def placed(nominal: Sequence[Symbol], deviation: Sequence[Symbol] = (0,) * 6) ->
 
 def numeric_frame(place: Sequence[float] | Array) -> Array:
     """Return the transform (4, 4) of a frame's six numbers."""
-    return _frame()([float(v) for v in place]).full()
+    return PLACE([float(v) for v in place]).full()
 
 
-@lru_cache(maxsize=1)
-def _frame() -> ca.Function:
-    numbers = ca.SX.sym("place", 6)
-    return ca.Function("frame", [numbers], [frame(ca.vertsplit(numbers))])
+_six = ca.SX.sym("place", 6)
+PLACE = ca.Function("frame", [_six], [frame(ca.vertsplit(_six))])
 
 
 def frame_numbers(T: Array) -> Array:

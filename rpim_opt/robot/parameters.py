@@ -24,18 +24,12 @@ EXPANSION, REFERENCE = "expansion", "reference_temperature"
 JOINT_OFFSET = "joint_offset"
 """Stands in tables for every theta."""
 DEFAULT_SCALE = {
-    ("length", "length"): 1e-3,
-    ("angle", "angle"): 1e-3,
-    ("tool", "length"): 10e-3,
-    ("tool", "angle"): 10e-3,
-    ("session", "length"): 1e-4,
-    ("session", "angle"): 1e-4,
-    ("base", "length"): 100e-3,
-    ("base", "angle"): 100e-3,
-    ("camera", "pixel"): 10.0,
-    ("camera", "ratio"): 1e-3,
-    ("camera", ""): 0.05,
-}
+    ("length", "length"): 1e-3, ("angle", "angle"): 1e-3,
+    ("tool", "length"): 10e-3, ("tool", "angle"): 10e-3,
+    ("session", "length"): 1e-4, ("session", "angle"): 1e-4,
+    ("base", "length"): 100e-3, ("base", "angle"): 100e-3,
+    ("camera", "pixel"): 10.0, ("camera", "ratio"): 1e-3, ("camera", ""): 0.05,
+}  # fmt: skip
 """Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
 STEEL = 12e-6
 """By how much steel grows [1/K]; aluminium by 23e-6."""
@@ -261,14 +255,7 @@ class Parameters(Tabled):
         return np.array([bool(turning.fullmatch(own_name(name))) for name in self.names])
 
     def wrapped(self, x: Array) -> Array:
-        """Return the deviations x (n,) [SI] of the same robot with every rotation in (-pi, pi].
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> free = ro.load("position").problem.parameters.identify(["a2", "theta2"]).free
-        >>> free.wrapped(np.array([4.0, 4.0])).round(3)  # [m], [rad]
-        array([ 4.   , -2.283])
-        """
+        """Return the deviations x (n,) [SI] of the same robot with every rotation in (-pi, pi]."""
         turns = np.ceil((x - np.pi) / (2 * np.pi))
         return x - 2 * np.pi * np.where(self.periodic, turns, 0.0)
 
@@ -306,12 +293,6 @@ class Parameters(Tabled):
 
         A sum, except for the roll, pitch and yaw of a frame, whose deviation is a rotation about the
         parent's axes (`kinematics.frame`): there the angles of the composed rotation.
-
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> frame = ro.load("position").problem.parameters.identify(["base_r?"]).free
-        >>> frame.nominal.round(3), frame.values(np.array([0.1, 0, 0])).round(3)
-        (array([ 0.02 , -0.035,  1.901]), array([-0.012, -0.129,  1.904]))
         """
         result = self.nominal + x
         index = {name: i for i, name in enumerate(self.names)}
@@ -342,13 +323,7 @@ class Parameters(Tabled):
         return replace(self, scale=overlay(self, self.scale, table, "table scale", file=file))
 
     def toleranced(self, table: Mapping[str, float], file: object = None) -> Parameters:
-        """Return the same table with other tolerances, as `scaled` does with scales.
-
-        >>> import rpim_opt as ro
-        >>> parameters = ro.load("position").problem.parameters.toleranced({"length_mm": 0.5})
-        >>> parameters.identify(["alpha2", "a2"]).free.tolerance  # [rad], [m]
-        array([   inf, 0.0005])
-        """
+        """Return the same table with other tolerances, as `scaled` does with scales."""
         return replace(self, tolerance=overlay(self, self.tolerance, table, "table tolerance", file=file))
 
 

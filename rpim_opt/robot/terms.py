@@ -55,14 +55,7 @@ class Weight:
 
 @dataclass(frozen=True, eq=False)
 class Posture:
-    """State of an arm in one configuration.
-
-    Examples
-    --------
-    >>> import rpim_opt as ro
-    >>> ro.robot.Posture(q=[0.1, 0.5], columns={"temperature": 3.0}).torque is None
-    True
-    """
+    """State of an arm in one configuration."""
 
     q: Sequence[Symbol]  # of the model [rad or m]
     torque: Sequence[Symbol] | None = None  # measured [Nm]; None where those of gravity stand for them

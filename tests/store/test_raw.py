@@ -230,9 +230,9 @@ def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, 
 def test_rows_that_were_left_out_are_named(monkeypatch, capsys, tmp_path, arm) -> None:
     for shape, expected in (
         ("beam lost", "rows without measured values are left out: lost."),
-        ("footer and means", "is a summary, not a row: 'Mean' left out."),
+        ("footer and means", "is not a row of the table: 'Mean, 1.5,"),
         ("footer and means", "is not a row of the table: 'End of export' left out."),
-        ("header again on every page", "the header is repeated in line 7: left out."),
+        ("header again on every page", "line 7 is not a row of the table: 'Point, J1 [deg],"),
         ("preamble", "3 lines above the header are left out ('Export of cell 7' ...)."),
         ("Latin-1 with degrees", "read as cp1252: not UTF-8."),
         ("semicolon and decimal comma", "decimal commas: no comma can be a thousands separator."),

@@ -36,15 +36,8 @@ INDEX_BEFORE = re.compile(r"[_\s(\[{]*i\s*[-\u2212]\s*1[)\]}]*", re.IGNORECASE)
 """Of alpha and a of the link before: the table is modified."""
 INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
 """Of the joint itself, ``d(i)``, ``theta_i``: that tells no convention."""
-SHEET = {
-    "\u03b1": "alpha",
-    "θ": "theta",
-    "β": "beta",
-    "twist": "alpha",
-    "theta offset": "theta",
-    "offset": "theta",
-    "r": "a",
-}
+SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
+         "r": "a"}  # fmt: skip
 """Other names of columns."""
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")
 """Columns of the joints' own names."""
@@ -208,7 +201,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
     raw = read_table(path)
-    lost = next((note for note in raw.notes if "is not a row of the table" in note or "is a summary" in note), "")
+    lost = next((note for note in raw.notes if "is not a row of the table" in note), "")
     if lost:
         raise InputError("the table", lost.rstrip("."), "one row per joint", path)
     columns: dict[str, list[str]] = {}
@@ -281,15 +274,6 @@ def write_robot(robot: Robot, path: str | Path) -> None:
 
     The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV, which
     has no place for them, a coupling of joints, a mounting other than on the floor, and a payload.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=1e-3)
-    >>> ro.robot.write_robot(result.robot, "identified.toml")
-    >>> bool((ro.read_robot("identified.toml").mdh == result.robot.mdh).all())
-    True
     """
     path = Path(path)
     ending = _ending(path)
@@ -317,20 +301,6 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
 
     Returned is a warning where axes are so nearly parallel that rounded numbers lose the robot; refused are signs or
     couplings of joints, and a beta after the last joint.
-
-    Examples
-    --------
-    >>> from pathlib import Path
-    >>> import rpim_opt as ro
-    >>> notes = ro.robot.write_robodk(ro.load("paper_arm").problem.robot, "robodk.csv")
-    >>> print(Path("robodk.csv").read_text())
-    joint,alpha_deg,a_mm,theta_deg,d_mm
-    1,0.0,0.0,0.0,99.927
-    2,90.0,0.0,0.0,106.95
-    3,0.0,428.052,0.0,0.0
-    4,0.0,398.551,0.0,0.0
-    5,-90.0,0.0,0.0,93.16
-    6,-90.0,0.0,0.0,81.91
     """
     table = without_beta(robot).mdh
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):

@@ -91,18 +91,6 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
 
     ``robot`` is in the controller's Base; ``source``, its own file, may be the target, too. Refused are alpha1 or a1
     that deviate (the base has to hold them), beta6, and axes too nearly parallel.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> from rpim_opt.robot.library import find_robot
-    >>> nominal = ro.read_robot(find_robot("ur10"))
-    >>> robot = ro.robot.read_ur_calibration("calibration.conf", nominal).robot  # or an identified one
-    >>> ro.robot.write_ur_calibration("calibration.conf", robot, nominal, "identified.conf")
-    >>> again = ro.robot.read_ur_calibration("identified.conf", nominal).robot
-    >>> bool(np.allclose(again.mdh, robot.mdh, atol=1e-9))
-    True
     """
     path = Path(source)
     if not path.exists():
@@ -178,17 +166,6 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
 
     ``source`` is the original, or ur_description's default_kinematics.yaml of the model; its `read_ur_kinematics` has
     to be the robot whose parameters were identified. Refused are another robot, and a beta after the last joint.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> import rpim_opt as ro
-    >>> robot = ro.robot.read_ur_kinematics("kinematics.yaml").robot
-    >>> mdh = robot.mdh.copy()
-    >>> mdh[2, 1] -= 0.0005  # as if identified: the upper arm is half a millimetre longer
-    >>> ro.robot.write_ur_kinematics("kinematics.yaml", replace(robot, mdh=mdh), "identified.yaml")
-    >>> (1e3 * (ro.robot.read_ur_kinematics("identified.yaml").robot.mdh - robot.mdh)[2:4, 1]).round(6) + 0.0  # [mm]
-    array([-0.5,  0. ])
     """
     path = Path(source)
     data = read_bytes(path)

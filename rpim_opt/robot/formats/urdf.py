@@ -126,33 +126,13 @@ def write_urdf(
 ) -> None:
     """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
 
-    An origin that does not change stays as it is written. Numbers are written so that they read back exactly.
+    ``source`` is the original, or a file ``.xacro``: then what it expands to is; its `read_urdf` with the same ``base``
+    and ``tip`` has to be the robot whose parameters were identified. ``target`` may be ``source``, unless that is a
+    xacro file. ``robot`` has the identified parameters (`Calibration.robot`, `use.identified`), ``base_frame`` and
+    ``tool_frame`` (6,) are identified base and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's.
 
-    Parameters
-    ----------
-    source
-        The original, or a file ``.xacro``: then what it expands to is. Its `read_urdf` with the same base and tip has
-        to be the robot whose parameters were identified.
-    robot
-        The robot with identified parameters, `Calibration.robot` or `use.identified`.
-    target
-        Where to write; may be ``source``, unless that is a xacro file.
-    base, tip
-        Names of links, as for `read_urdf`.
-    base_frame, tool_frame
-        (6,) identified base and tool, x, y, z [m], roll, pitch, yaw [rad]; those of the original where not given.
-
-    Refused are another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
-
-    Examples
-    --------
-    >>> from dataclasses import replace
-    >>> import rpim_opt as ro
-    >>> robot = ro.read_urdf("arm.urdf").robot
-    >>> longer = replace(robot, mdh=robot.mdh + [0, 0, 0, 0.001, 0])  # as if identified: d1 is 1 mm longer
-    >>> ro.robot.write_urdf("arm.urdf", longer, "identified.urdf")
-    >>> robot.mdh[:, 3], ro.read_urdf("identified.urdf").robot.mdh[:, 3]  # [m]
-    (array([0.3]), array([0.301]))
+    An origin that does not change stays as it is written; numbers are written so that they read back exactly. Refused
+    are another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
     """
     if Path(target).suffix.lower() == XACRO:
         raise InputError("the target", "a xacro file", "a file .urdf, for what it expands to", target)
