@@ -83,8 +83,7 @@ LIBRARY_SETTINGS = {"OPENBLAS_NUM_THREADS": "1", "PYDANTIC_DISABLE_PLUGINS": "__
 """Without what libraries do as they are loaded, and no command uses: threads beside ours, a search for plugins."""
 GARBAGE_THRESHOLD = 200_000
 """Objects after which Python looks for garbage: loading makes half as many, and a calibration leaves a thousand."""
-LONG = ("study", "compare")
-"""Commands that run others' programs, and for long: they and Python are left as they are."""
+LONG = ("study", "compare")  # commands that run others' programs, and for long: they and Python are left as they are
 ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 
@@ -214,8 +213,7 @@ class Tables(NamedTuple):
 TABLES = Tables()
 CODES = {"accepted": 0, "rejected": 1, "undecided": 4}
 """Exit codes of an acceptance test."""
-CODELESS = ("new", "iso9283", "study", "robots")
-"""Commands that read no folder of a calibration, which may name code."""
+CODELESS = ("new", "iso9283", "study", "robots")  # commands that read no folder of a calibration, which may name code
 
 
 def command(function: Callable[..., Answer]) -> Callable[..., Answer]:

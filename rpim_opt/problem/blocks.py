@@ -25,12 +25,9 @@ from rpim_opt.problem.problem import CalibrationProblem, RobotModel
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, frame_of, of_session, session_prefix
 
-ROWS = 4096
-"""Rows that are evaluated, weighed and reduced together."""
-KEPT = 200_000
-"""Equations up to which a calibration keeps its rows, wherever they stand; beyond, only their QR factor."""
-Part = Callable[[], Dataset]
-"""Reads some of the measurements; whole configurations."""
+ROWS = 4096  # rows that are evaluated, weighed and reduced together
+KEPT = 200_000  # equations up to which a calibration keeps its rows, wherever they stand; beyond, only their QR factor
+Part = Callable[[], Dataset]  # reads some of the measurements; whole configurations
 
 
 @one_blas_thread
@@ -64,8 +61,6 @@ class PartitionedProblem(RobotModel):
     InputError for no blocks, as `CalibrationProblem`, and for `data` of all the blocks, which do not stand anywhere;
     when a block is read whose sessions the parameters do not have, where they have others (`starting_parameters`).
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> whole = ro.load("position").problem
     >>> halves = [lambda: whole.data.take(range(20)), lambda: whole.data.take(range(20, 40))]
@@ -228,8 +223,6 @@ def partitions(
     A configuration's rows stand in one file. Parquet is read fastest. Other arguments as for `read_data`; InputError
     for no paths, and when a part is read.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> robot = ro.load("paper_arm").problem.robot
     >>> parts = ro.problem.partitions(["targets.csv"], robot, {"position_mm": 0.03})

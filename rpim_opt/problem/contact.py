@@ -124,10 +124,8 @@ class Thing:
         return Moved(centre, normal, across)
 
 
-CLOSE = 0.05
-"""Touches that spread by less [m] do not show how large a robot is, whatever else is known."""
-ROUNDING = 1e-12
-"""Relative size of a covariance that is none."""
+CLOSE = 0.05  # touches that spread by less [m] do not show how large a robot is, whatever else is known
+ROUNDING = 1e-12  # relative size of a covariance that is none
 Things = Sequence[Thing]
 
 

@@ -23,8 +23,7 @@ from rpim_opt.robot.mdh import Robot
 CRITERIA = ("D", "A", "V")
 ANYWHERE = 1.0
 """Standard deviation of where a touched point is [m]."""
-MOST_STEPS, MOST_PASSES = 4000, 20
-"""Of the relaxation, and of exchanges over all chosen."""
+MOST_STEPS, MOST_PASSES = 4000, 20  # of the relaxation, and of exchanges over all chosen
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -63,8 +62,6 @@ def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator 
     ``seed`` is that of the draws, or a generator to draw from; ``share`` which part of every joint's range is used,
     from 0 to 1. InputError for a joint without limits.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> q = ro.problem.random_candidates(ro.load("position").problem.robot, 1000, share=0.5)
@@ -122,8 +119,6 @@ def choose(
     controller that could be measured, ``measured`` rows that are there already, which M then counts, too. InputError
     for another criterion, a count that the candidates do not allow, or measurements between two points.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
     >>> design = ro.problem.choose(problem, ro.problem.random_candidates(problem.robot, 60), count=30)
@@ -273,8 +268,6 @@ class Observability(Brief):
     ``raw_condition`` |U| |U^-1| of the Jacobian in millimetres and radians, neither whitened nor scaled (paper, Eq.
     24); infinite where it is singular.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> found = ro.problem.observe(ro.load("rank_deficient").problem)
     >>> len(found.names), found.rank, len(found.redundant), found.unidentifiable

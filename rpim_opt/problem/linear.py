@@ -33,8 +33,6 @@ class LinearModel(Brief):
     reduced from by a rotation, None where they are the equations themselves, and ``offset`` what a loss that these
     equations majorize has besides |A z - b|^2.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem

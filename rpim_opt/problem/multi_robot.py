@@ -25,8 +25,7 @@ from rpim_opt.robot.parameters import Parameters, frame_of, known_patterns, of_s
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
 MOST_PARAMETERS = 2000
 """Parameters up to which sessions are identified."""
-MINUTES = 0.26
-"""Time of a default calibration of a thousand parameters; of 274 it takes 0.5 s, of 514 3 s."""
+MINUTES = 0.26  # time of a default calibration of a thousand parameters; of 274 it takes 0.5 s, of 514 3 s
 FAR = 3.0
 """How many scales the nominal values of a shared parameter may differ by: as much as a frame's before it is moved."""
 
@@ -50,8 +49,6 @@ def together(
     that are stated differently, scatter (it is stated of the whole, or learned), data in blocks, and touches of a point
     that is elsewhere for another robot.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
     >>> data = problem.data

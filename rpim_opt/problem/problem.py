@@ -52,8 +52,7 @@ BASE = re.compile(r"base_.*")
 PLACES = re.compile(r"(tool|anchor|length|plane|sphere|camera)_.*")
 POINTS = re.compile(r"(anchor|length|plane|sphere)_.*|tool_(.*_)?[xyz]")
 """Parameters that ``identify = "auto"`` names: places, or of those what a measurement without orientations sees."""
-SHIFTED = ("base_x", "base_y", "base_z")
-"""Parameters that move all of a robot alike."""
+SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move all of a robot alike
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -123,8 +122,6 @@ class RobotModel(Tabled):
         What reads blocks has to read the columns that terms see. InputError for a name that the problem has, a pattern
         that matches none of the new ones, and data without a column that an identified term sees.
 
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> wave = ro.robot.Term(lambda joint, size: size * joint.q**2, {"bow_mrad": 0.1})
         >>> problem = ro.load("position").problem.with_model(ro.Model([wave]), identify=["bow[23]"])
@@ -173,8 +170,6 @@ class CalibrationProblem(RobotModel):
     models anew; ``scatter`` is the robot's repeatability, None for the instrument's noise alone. InputError when
     nothing is identified, or the data do not fit the robot or the parameters.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")

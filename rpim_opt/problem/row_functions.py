@@ -29,8 +29,7 @@ transform = Measurement(
 )
 """The reflector's transform itself, row by row: what a calibrated robot's forward kinematics evaluate."""
 
-MANY = 1024
-"""Functions that are kept, some hundred kB each: of some hundred reflectors each has its own."""
+MANY = 1024  # functions that are kept, some hundred kB each: of some hundred reflectors each has its own
 _READY = frozenset({*READY.values(), transform})
 
 
@@ -187,8 +186,7 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
 
 Stated = Mapping[str, ca.SX]
 """The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
-COLUMN = "column {}"
-"""Name of the symbol of a further column among these."""
+COLUMN = "column {}"  # name of the symbol of a further column among these
 
 
 class Loads(NamedTuple):

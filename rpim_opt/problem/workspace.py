@@ -119,16 +119,11 @@ def in_base(problem: CalibrationProblem, q: Array, marker: str | None = None) ->
     return _there(at_base, q, marker).modelled(np.zeros(len(p.free)))[0]
 
 
-DRAWS = 200
-"""Random configurations that are tried for each row."""
-FIRST, FAR = 10, 1e-3
-"""After so many draws a row is out of reach from which the nearest configuration is further [m]."""
-LONGEST, DIFFERENCE = 0.1, 1e-4
-"""Largest step, and step of the central differences, in ranges of the joints."""
-DAMPING = 1e-9
-"""Square of the slopes [m^2] at which a step is half as long: a stretched arm does not leap."""
-THERE = 1e-11
-"""Largest distance [m] of a configuration from its target; one more step then leaves rounding alone."""
+DRAWS = 200  # random configurations that are tried for each row
+FIRST, FAR = 10, 1e-3  # after so many draws a row is out of reach from which the nearest configuration is further [m]
+LONGEST, DIFFERENCE = 0.1, 1e-4  # largest step, and step of the central differences, in ranges of the joints
+DAMPING = 1e-9  # square of the slopes [m^2] at which a step is half as long: a stretched arm does not leap
+THERE = 1e-11  # largest distance [m] of a configuration from its target; one more step then leaves rounding alone
 
 
 def postures_at(
@@ -146,8 +141,6 @@ def postures_at(
     base frame [m]; ``x`` (n,) deviations of the identified parameters [SI], nominal by default; ``marker`` the tool,
     that of the data's first row by default. InputError for a point that none of `DRAWS` random postures leads to.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -253,12 +246,9 @@ def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Arr
     return min(centres, key=lambda centre: float(np.sum((centre - middle) ** 2)))
 
 
-TIMES = 100
-"""How often configurations are drawn to find some in which the board is in sight."""
-MARGIN = 0.04
-"""Part of the image along its edges in which no point appears."""
-LARGE = 0.15
-"""Least width of a board in the image, as part of the image's."""
+TIMES = 100  # how often configurations are drawn to find some in which the board is in sight
+MARGIN = 0.04  # part of the image along its edges in which no point appears
+LARGE = 0.15  # least width of a board in the image, as part of the image's
 UPRIGHT = 0.5
 """Least cosine between line of sight and the board's normal: corners of a board that leans more are not found."""
 
@@ -278,8 +268,6 @@ def postures_in_sight(
     ``x`` (n,) [SI], nominal by default; ``points`` are (P, 3) of the board [m], ``image`` is width and height [px].
     InputError for a problem without a camera, and a board that is hardly ever in sight.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> points = np.array(list(ro.data.grid_board(7, 5, 0.03).values()))

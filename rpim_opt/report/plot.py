@@ -41,10 +41,8 @@ Axes = Any  # matplotlib's, imported where axes are made
 
 # --- errors ------------------------------------------------------------------------------------------------
 
-MODELS = {"before": "nominal", "after": "identified"}
-"""Model that errors before and after calibration are of."""
-MANY_ROWS = 100
-"""Above it each row is a small point without a name."""
+MODELS = {"before": "nominal", "after": "identified"}  # model that errors before and after calibration are of
+MANY_ROWS = 100  # above it each row is a small point without a name
 
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
@@ -194,10 +192,8 @@ def active_tolerance(result: Calibration) -> Array:
 
 # --- the regularization weight -----------------------------------------------------------------------------
 
-VANISHED = 1e-4
-"""Penalties below this part of the median one are not drawn: a lasso has no deviation left there."""
-FAINT = 1e-4
-"""Coefficients of the data below this many standard deviations are not drawn."""
+VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
+FAINT = 1e-4  # coefficients of the data below this many standard deviations are not drawn
 
 
 def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
@@ -342,8 +338,7 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
 
 # --- uncertainty in the workspace --------------------------------------------------------------------------
 
-CELLS = 24
-"""Cells along the longer side."""
+CELLS = 24  # cells along the longer side
 SHADES = 5
 VIEWS = {"from above": (0, 1), "from the side": (0, 2)}
 """Axes to the right and up."""
@@ -392,8 +387,7 @@ def _cells(points: Array) -> tuple[Array, Array]:
 
 # --- checks over time --------------------------------------------------------------------------------------
 
-TIMES = ((86400.0, "days"), (3600.0, "hours"))
-"""Units of an axis of time [s]."""
+TIMES = ((86400.0, "days"), (3600.0, "hours"))  # units of an axis of time [s]
 
 
 def checks(found: Monitoring, ax: Axes) -> None:
@@ -447,8 +441,7 @@ MANY_DOTS = 1000
 """Dots beyond which they are one picture in a vector graphic."""
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 4.0
 """Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
-LINE_HEIGHT = 1.25
-"""Distance of names over their size."""
+LINE_HEIGHT = 1.25  # distance of names over their size
 
 
 def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:

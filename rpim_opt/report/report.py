@@ -327,8 +327,7 @@ def _transmission(result: Calibration) -> Iterator[Block]:
 
 # --- diagnostics -------------------------------------------------------------------------------------------
 
-MOST_FLAGGED = 200
-"""Flagged rows that are named, the worst first."""
+MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 
 
 def _diagnostics(content: Content) -> Iterator[Block]:
@@ -495,8 +494,7 @@ def _noise(block: Rows) -> str:
 
 # --- appendix: the weight ----------------------------------------------------------------------------------
 
-WHY = {"learned": "maximum of the marginal likelihood"}
-"""Reasons of choices that have no note; others were given."""
+WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
 L_CURVE_HEIGHT = 430.0
 PICARD = (
     "Picard condition at the solution: the penalty damps directions below the line; data coefficients near 1 are noise."

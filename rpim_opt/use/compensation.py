@@ -38,14 +38,10 @@ from rpim_opt.use.export import noted
 from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
 from rpim_opt.use.reading import Targets, read_targets
 
-SMALLEST = 1e-12
-"""Correction [rad or m] below which nothing is corrected."""
-BLOCK = 8192
-"""Rows that are worked on together, so that what they need stays in the processor's cache."""
-REACHED = 1e-7
-"""A target counts as reached when no more than this is left [m, rad]."""
-KNOWN_TOOL = 0.01
-"""Largest scale [m, rad] of a reflector that is known: a wider one states no TCP."""
+SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
+BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
+REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
+KNOWN_TOOL = 0.01  # largest scale [m, rad] of a reflector that is known: a wider one states no TCP
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 BANK = 2000
 TRIALS = 12
@@ -223,8 +219,6 @@ def compensate(
     InputError
         For shapes that do not fit, numbers that are not finite, a reflector that is not known.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)
@@ -276,8 +270,6 @@ def compensate(
 def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
     """Compensate the targets of a table (`read_targets`) and write `Compensation.csv`; ``options`` of `compensate`.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
     >>> found = ro.use.compensate_file(result, "targets.csv", "commands.csv")

@@ -15,8 +15,7 @@ from rpim_opt.robot.kinematics import FRAME, call_rows, chain, placed, product, 
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.terms import motion
 
-NULL_SPACE_WEIGHT = 1e-10
-"""Weight of a correction that moves nothing, relative to the largest squared singular value."""
+NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
 STEP_TOLERANCE = 1e-10
 DECREASE_TOLERANCE = 1e-6
 """A row has converged when its step is shorter [rad or m], or lowers the objective by a smaller part."""

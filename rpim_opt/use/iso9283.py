@@ -17,10 +17,8 @@ from rpim_opt.basics.units import FOREIGN, LARGEST, UNITS, dimension_of, parse_u
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import recognize
 
-CYCLES, POSES = 30, 5
-"""How often the standard has how many poses approached."""
-ANGLES = ("a", "b", "c")
-"""The standard's names of the rotations."""
+CYCLES, POSES = 30, 5  # how often the standard has how many poses approached
+ANGLES = ("a", "b", "c")  # the standard's names of the rotations
 AXES = ("x", "y", "z")
 ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
 """What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
@@ -150,8 +148,6 @@ def iso9283(
     that are called ``names``. Without commands there is no accuracy. InputError for shapes that do not fit, a pose that
     is approached once, or whose command changes.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> reached = 1e-3 * np.array([[0.1, 0, 0], [-0.1, 0, 0], [0, 0.1, 0], [0, -0.1, 0]])
@@ -217,8 +213,6 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     those of columns whose name carries none, ``"deg,mm"``. InputError for columns that are missing or without unit,
     cells that are no numbers, and what `iso9283` refuses.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> columns = {"pose": ["P1", "P1"], "X [mm]": [1.0, 3.0], "Y [mm]": [0.0, 0.0], "Z [mm]": [0.0, 0.0]}
     >>> columns |= {f"Nominal {axis} [mm]": [0.0, 0.0] for axis in "XYZ"}

@@ -31,18 +31,12 @@ from rpim_opt.use.recalibration import (
     with_data,
 )
 
-FALSE_ALARM = 0.01
-"""Probability that a robot that does not drift is said to."""
-TESTS = 3
-"""Each check alone, their sum, and every parameter: each test may err by a third of `FALSE_ALARM`."""
-MOMENTS = 40
-"""Checks before which a change is looked for; of more so many, evenly."""
-SMALLEST = 1e-12
-"""Probabilities are taken as no smaller: 7 standard deviations."""
-ALLOWANCE = 0.5
-"""CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much."""
-CELLS = 150
-"""Steps of a sum's range in the Markov chain of its distribution."""
+FALSE_ALARM = 0.01  # probability that a robot that does not drift is said to
+TESTS = 3  # each check alone, their sum, and every parameter: each test may err by a third of `FALSE_ALARM`
+MOMENTS = 40  # checks before which a change is looked for; of more so many, evenly
+SMALLEST = 1e-12  # probabilities are taken as no smaller: 7 standard deviations
+ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much
+CELLS = 150  # steps of a sum's range in the Markov chain of its distribution
 HIGHEST_LIMIT = 50.0
 
 
@@ -184,8 +178,6 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     in the order of ``when`` (N,) [s] if that is stated; ``times`` are N texts that say so.
     InputError for times that are not one a check, and a result that has no covariance (lasso).
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> found = ro.use.monitor(ro.calibrate(instance.problem), instance.validation)

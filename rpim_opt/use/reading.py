@@ -56,8 +56,6 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     names to cells; the robot's joints decide the joint columns. InputError names the file, the row or column, what was
     found and what is accepted.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> robot = ro.load("paper_arm").problem.robot
     >>> targets = ro.use.read_targets({"label": ["P1"], "x_mm": [400], "y_mm": [0], "z_mm": [500]}, robot)
@@ -138,8 +136,6 @@ def read_measurements(
     ``measurement`` which of the calibration's measurement types, where it has several. ``options`` are what is stated
     of the tables; what is not, is as it was for the calibration's own.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
     >>> table = {"date": ["2026-03-01", "2026-04-01"], **{f"joint_{i}": [0.0, 10.0] for i in range(1, 7)}}

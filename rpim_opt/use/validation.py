@@ -135,8 +135,6 @@ def validate(result: Calibration, data: Dataset) -> Validation:
 
     ``data`` are in the same instrument's frame, by reflectors of the calibration, which may be one of `load_result`.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> found = ro.use.validate(ro.calibrate(instance.problem, ro.tikhonov, ro.l_curve), instance.validation)

@@ -17,14 +17,10 @@ from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
 
-FEWEST = {True: 4, False: 6}
-"""Points that a view of a plane, and of points in space, has to show."""
-FLAT = 1e-6
-"""Third singular value of a board's points over the first, below which they are in a plane."""
-LEAST_VIEWS = 3
-"""Views that show focal lengths and centre."""
-UNCERTAIN = 3.0
-"""By how much a view's pose is less certain than its points would be alone."""
+FEWEST = {True: 4, False: 6}  # points that a view of a plane, and of points in space, has to show
+FLAT = 1e-6  # third singular value of a board's points over the first, below which they are in a plane
+LEAST_VIEWS = 3  # views that show focal lengths and centre
+UNCERTAIN = 3.0  # by how much a view's pose is less certain than its points would be alone
 
 
 def camera_blocks(data: Dataset) -> list[Block]:

@@ -16,29 +16,20 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, proper, rigid
 from rpim_opt.problem.registration.relaxation import Smallest, lifted, smallest
 
-GAP = 1e-3
-"""What cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer."""
-UNKNOWN = 0.1
-"""Standard deviation of a rotation [rad] from which it is not determined."""
-FAR = 0.5
-"""Angle [rad] within which all starts have to be that fit as well, for there to be one."""
-AS_WELL = 1e-4
-"""Probability that the truth fits worse than what counts as fitting as well."""
+GAP = 1e-3  # what cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer
+UNKNOWN = 0.1  # standard deviation of a rotation [rad] from which it is not determined
+FAR = 0.5  # angle [rad] within which all starts have to be that fit as well, for there to be one
+AS_WELL = 1e-4  # probability that the truth fits worse than what counts as fitting as well
 RIDGE = 1e-6
 """How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
 LOSSES = ("squares", "truncated")
 QUANTILE = 0.99
 """Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
-FEWEST = 3
-"""Measurements that have to have a weight."""
-MOST_PAIRED = 2000
-"""Measurements up to which all pairs are compared."""
-TRIED, FEW = 40, 10
-"""Measurements, evenly spread, whose compatible sets are tried, and the most sets that are."""
-SURPRISE = 1e-4
-"""Probability that a good measurement is off by more than counts as good."""
-LINEAR = 6
-"""Unknowns that are eliminated exactly: the translations t of the tool and u of the base."""
+FEWEST = 3  # measurements that have to have a weight
+MOST_PAIRED = 2000  # measurements up to which all pairs are compared
+TRIED, FEW = 40, 10  # measurements, evenly spread, whose compatible sets are tried, and the most sets that are
+SURPRISE = 1e-4  # probability that a good measurement is off by more than counts as good
+LINEAR = 6  # unknowns that are eliminated exactly: the translations t of the tool and u of the base
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,8 +88,6 @@ def certified_hand_eye(
     "squares", or "truncated", which leaves outliers out. InputError for fewer than three measurements, and what is no
     transform.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> arm = ro.load("paper_arm").problem

@@ -10,8 +10,7 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 
-Place = Sequence[float] | Array
-"""A frame's six numbers, or a point's three."""
+Place = Sequence[float] | Array  # A frame's six numbers, or a point's three
 NOMINAL_ERROR, TOOL_ERROR = 5e-3, 0.1
 """What a nominal robot (also in angle, at a metre) and a roughly measured reflector may be wrong by [m, rad]."""
 

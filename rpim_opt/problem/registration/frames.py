@@ -37,8 +37,7 @@ from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, model_parameters, tool_prefix
 
-ENOUGH = 2000
-"""Rows of a measurement that register frames, where there are more."""
+ENOUGH = 2000  # rows of a measurement that register frames, where there are more
 FREE = 0.1
 """Standard deviation of a rotation [rad] from which closed forms are tried: they refuse what is not determined."""
 
@@ -167,8 +166,7 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
     return found
 
 
-MISPLACED = 3.0
-"""How many scales a frame may be from where it is stated before the statement counts as a mistake."""
+MISPLACED = 3.0  # how many scales a frame may be from where it is stated before the statement counts as a mistake
 
 
 def problem_from(
@@ -187,8 +185,6 @@ def problem_from(
     joint's modified-DH row, by default that of the URDF's tip, or zero; one that the data contradict is replaced by its
     registration. InputError for data that do not determine where the base is, or a pattern that matches no parameter.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.load("position").problem
     >>> problem = ro.problem_from(arm.robot, arm.data, tool=[0.02, 0, 0.06, 0, 0, 0])
@@ -234,8 +230,6 @@ def starting_parameters(
     state temperatures; their mean by default. ``sessions`` are not among the data, where these are the first of several
     parts.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
     >>> tools = {"": [0.02, 0, 0.06, 0, 0, 0]}
@@ -373,8 +367,6 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
     robot. Returned are the problem of the frames (all other parameters nominal; frames that were stated far off are
     counted from where the data put them) and the deviations (f,) [SI]; one without frames comes back as it is.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> fitted, x = ro.problem.fitted_frames(instance.problem)

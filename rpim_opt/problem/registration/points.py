@@ -20,17 +20,14 @@ from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
-MOST_ROWS = 300
-"""Rows that are tried, evenly spread where there are more."""
+MOST_ROWS = 300  # rows that are tried, evenly spread where there are more
 FEWEST_ROWS = 6
 LONGEST = 3.0
 """A reflector farther from the flange [m] is none."""
-LEVER = 0.3
-"""Length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions."""
+LEVER = 0.3  # length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions
 TRUSTED = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
-LARGEST_BATCH = 4_000_000
-"""Entries of the Jacobians in memory at once."""
+LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 
 
 @dataclass(frozen=True, eq=False)

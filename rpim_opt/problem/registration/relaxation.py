@@ -19,8 +19,7 @@ TOLERANCE, FINE = 1e-8, 1e-12
 where moments are those of several rotations."""
 SPREAD = 1e-3
 """Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
-CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))
-"""The matrices of the cross products e_a x."""
+CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))  # the matrices of the cross products e_a x
 
 
 @lru_cache
