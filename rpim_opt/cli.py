@@ -114,23 +114,19 @@ Text = str | None
 Number = float | None
 File = Path | None
 Choice = bool | None
-Problem = Annotated[
-    str,
-    Argument(help="A problem folder, or the name of a shipped one.", autocompletion=_completed(_shipped)),
-]
+SHIPPED = _completed(_shipped)
 FORMULATIONS = _completed(lambda: import_module("rpim_opt.convex.formulation").FORMULATIONS)
 SELECTORS = _completed(lambda: ["learned", *import_module("rpim_opt.convex.select").SELECTORS])
 ROBOTS = _completed(lambda: import_module("rpim_opt.robot.library").robots())
 MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
+Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
 RULES = "learned (prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
 Selector = Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)]
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
 Formulation = Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)]
-Noise = Annotated[
-    Text,
-    Option(help="Variance components to estimate: robot, free, level, declared (none).", autocompletion=COMPONENTS),
-]
+PARTS = "Variance components to estimate: robot, free, level, declared (none)."
+Noise = Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)]
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or the folder it lies in.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
@@ -252,13 +248,7 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
 @command
 def new(
     folder: Annotated[Path, Argument(help="The problem folder to make; it must not exist.")],
-    robot: Annotated[
-        str,
-        Option(
-            help="A ready robot (rpim-opt robots), or a file .urdf, .xacro, .toml, .json, .csv.",
-            autocompletion=ROBOTS,
-        ),
-    ],
+    robot: Annotated[str, Option(help="A ready one (see robots), or a file that describes it.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     units: Units = "",
     dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
@@ -269,15 +259,11 @@ def new(
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
     rotation: Annotated[str, Option(help="Meaning of rx, ry, rz: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
-    constants: Annotated[
-        str, Option(help="Joints that did not move and have no column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")
-    ] = "",
+    constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = "",
     encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = "",
     separator: Annotated[str, Option(help="comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
-    measurement: Annotated[
-        Text, Option(help="position, pose, cable, distance, plane, sphere, eye_in_hand, ...; guessed from columns.")
-    ] = None,
+    measurement: Annotated[Text, Option(help="position, pose, cable, distance, ...; guessed from columns.")] = None,
     validation: Annotated[File, Option(help="A table for validation.")] = None,
     hold_out: Annotated[
         Number, Option(help="Fraction of the configurations to hold out instead, such as 0.25.")
@@ -515,9 +501,7 @@ def iso9283(
 @command
 def update(
     result: Result,
-    data: Annotated[
-        list[Path], Argument(help=f"New measurements of the same robot, in the same instrument's frame; {Several}")
-    ],
+    data: Annotated[list[Path], Argument(help=f"New measurements, in the same instrument's frame; {Several}")],
     tables: Tables = TABLES,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
@@ -543,9 +527,7 @@ def update(
 @command
 def monitor(
     result: Result,
-    checks: Annotated[
-        list[Path], Argument(help=f"Check readings; a column time, timestamp or date orders them; {Several}")
-    ],
+    checks: Annotated[list[Path], Argument(help=f"Readings; a column time, timestamp or date orders them; {Several}")],
     tables: Tables = TABLES,
     out: Annotated[File, Option(help="Control chart over time as .html, or its points as .csv.")] = None,
 ) -> Answer:

@@ -10,6 +10,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
@@ -59,7 +60,10 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     """
     ax = _axes(ax)
     data = data or result.problem.data
-    lengths, labels = _lengths(result, data)
+    after = 1e3 * result.errors(data)
+    finite = np.isfinite(after)  # rows that measure a length
+    lengths = {"before": 1e3 * result.nominal_errors(data)[finite], "after": after[finite]}
+    labels = [data.label[i] for i in np.flatnonzero(finite)]
     every = np.concatenate(list(lengths.values()))
     low = max(0.5 * float(every.min()), 1e-4 * float(every.max()), 1e-7)
     drawn = {when: np.maximum(each, low) for when, each in lengths.items()}
@@ -70,9 +74,7 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     for when, each in lengths.items():
         hints = [f"{label}, {MODELS[when]}: {mm(e)} mm" for label, e in zip(labels, each, strict=True) if few]
         _dots(ax, place, drawn[when], when, MODELS[when], hints, ms=5.0 if few else 2.0)
-    flagged: set[str] = set()
-    if data is result.problem.data:
-        flagged = {flag.label for flag in result.flagged}
+    flagged = {flag.label for flag in result.flagged} if data is result.problem.data else set()
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
         _dots(ax, place[at], drawn["after"][at], "mark", "flagged", [f"{labels[i]}: flagged" for i in at])
@@ -112,15 +114,6 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
     ax.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", aspect="equal")
     ax.set_title(f"{MODELS[when]} errors, enlarged {times:,.0f} times", fontsize=9)
     return ax
-
-
-def _lengths(result: Calibration, data: Dataset) -> tuple[dict[str, Array], list[str]]:
-    """Return the errors [mm] before and after calibration, and the labels, of rows that measure a length."""
-    before = 1e3 * result.nominal_errors(data)
-    after = 1e3 * result.errors(data)
-    finite = np.isfinite(after)
-    labels = [data.label[i] for i in np.flatnonzero(finite)]
-    return {"before": before[finite], "after": after[finite]}, labels
 
 
 # --- parameters --------------------------------------------------------------------------------------------
@@ -211,7 +204,7 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     'residual norm [standard deviations of the noise]'
     >>> ax.figure.savefig("l_curve.pdf")
     """
-    program = _program(of)
+    program = of.program if isinstance(of, Calibration) else of
     marked = {name: choice.weight for name, choice in (selections or {}).items()}
     own = ""
     if isinstance(of, Calibration):
@@ -248,10 +241,6 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     return _with_legend(ax)
 
 
-def _program(of: Program | Calibration) -> Program:
-    return of.program if isinstance(of, Calibration) else of
-
-
 def selection(selection: Selection, ax: Axes = None) -> Axes:
     """Draw a selector's score over the weights, and its choice, dashed where it is at an edge.
 
@@ -281,19 +270,16 @@ def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | N
     >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
     ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
     """
-    chosen = compare(_program(of)) if selections is None else selections
+    chosen = selections or compare(of.program if isinstance(of, Calibration) else of)
     ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
     ax = _axes(ax, len(ordered))
     weight = np.array([each.weight for _, each in ordered])
     interior = np.array([each.interior for _, each in ordered])
-    styles: tuple[tuple[Any, str, dict[str, Any]], ...] = (
-        (interior, "", {}),
-        (~interior, "at an edge", {"mfc": "none"}),
-    )
-    for which, label, style in styles:
-        at = np.flatnonzero(which)
-        if len(at):
-            _dots(ax, weight[at], at + 1.0, "after", label, **style)
+    place = np.arange(1.0, len(ordered) + 1)
+    if interior.any():
+        _dots(ax, weight[interior], place[interior], "after")
+    if not interior.all():
+        _dots(ax, weight[~interior], place[~interior], "after", "at an edge", mfc="none")
     ax.set_xlabel("weight")
     _logarithmic(ax, "x")
     _name(ax, "y", [name for name, _ in ordered])
@@ -314,9 +300,10 @@ def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> A
     ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'square root of the weight']
     """
     ax = _axes(ax)
-    if isinstance(of, Calibration):
-        weight = weight or of.weight
-    beta, s, _ = _program(of).model.svd
+    program = of.program if isinstance(of, Calibration) else of
+    if isinstance(of, Calibration) and not weight:
+        weight = of.weight
+    beta, s, _ = program.model.svd
     k = np.flatnonzero(s > 0)
     data = np.abs(beta[k])
     solution = data / s[k]
@@ -354,11 +341,12 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
     decimals = 10.0 ** (int(np.ceil(-np.log10(max(high - low, 1e-3 * high)))) + 1)
     levels = np.asarray(np.ceil(levels * decimals) / decimals, dtype=float)
     across, up = VIEWS[view]
-    plane = at[:, [across, up]]
-    corner, size = _cells(plane)
-    corners, cell = np.unique(corner, axis=0, return_inverse=True)
-    worst = np.zeros(len(corners))
-    np.maximum.at(worst, cell.ravel(), bound)
+    plane = at[:, [across, up]].T
+    extent = np.ptp(plane, axis=1)
+    count = np.maximum(np.ceil(extent / (extent.max() / CELLS) - 1e-9), 1).astype(int)
+    grid, x, y, _ = scipy.stats.binned_statistic_2d(*plane, bound, "max", bins=count.tolist())
+    column, row = np.nonzero(np.isfinite(grid))
+    worst = grid[column, row]
     shade = np.minimum(np.searchsorted(levels, worst), SHADES - 1)
     above = worst > (np.inf if limit is None else limit)
     for k, over in sorted(set(zip(shade.tolist(), above.tolist(), strict=True))):
@@ -366,23 +354,14 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
         level = float(levels[k])
         text = f"to {mm(level)} mm, above the limit" if over else f"to {mm(min(level, limit or np.inf))} mm"
         style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "label": text}
-        left, bottom = corners[which].T
+        i, j = column[which], row[which]
         hints = [f"{mm(value)} mm" for value in worst[which]]
-        _boxes(ax, left, left + size[0], bottom, bottom + size[1], hints, **style)
+        _boxes(ax, x[i], x[i + 1], y[j], y[j + 1], hints, **style)
     if box is not None:
         (a, b), (c, d) = box[across], box[up]
         ax.plot([a, b, b, a, a], [c, c, d, d, c], color=COLORS["ink"])
     ax.set(xlabel=f"{'xyz'[across]} [mm]", ylabel=f"{'xyz'[up]} [mm]", aspect="equal")
     _with_legend(ax)
-
-
-def _cells(points: Array) -> tuple[Array, Array]:
-    """Return the lower corners (N, 2) of the points' cells, and the cells' common size (2,)."""
-    extent = np.ptp(points, axis=0)
-    count = np.maximum(np.ceil(extent / (extent.max() / CELLS) - 1e-9), 1)
-    size = np.maximum(extent / count, 1e-9)
-    low = points.min(axis=0)
-    return low + np.minimum((points - low) // size, count - 1) * size, size
 
 
 # --- checks over time --------------------------------------------------------------------------------------
@@ -394,15 +373,13 @@ def checks(found: Monitoring, ax: Axes) -> None:
     """Draw every check against its limit."""
     place = _times(found, ax)
     ax.plot(place, found.allowed, color=COLORS["mark"], lw=1.5, label="limit, checks beyond it")
-    hints = [
-        f"{label}: {sigmas:.1f} standard deviations, {mm(1e3 * error)} mm"
-        for label, sigmas, error in zip(found.label, found.sigmas, found.error, strict=True)
-    ]
-    beyond = np.isin(np.arange(len(place)), found.beyond)
-    for which, role, label in ((~beyond, "after", "check"), (beyond, "mark", "")):
-        at = np.flatnonzero(which)
-        if len(at):
-            _dots(ax, place[at], found.sigmas[at], role, label, [hints[i] for i in at])
+    beyond = list(found.beyond)
+    within = np.setdiff1d(np.arange(len(place)), beyond).tolist()
+    for at, role, label in ((within, "after", "check"), (beyond, "mark", "")):
+        figures = zip([found.label[i] for i in at], found.sigmas[at], found.error[at], strict=True)
+        hints = [f"{name}: {sigmas:.1f} standard deviations, {mm(1e3 * e)} mm" for name, sigmas, e in figures]
+        if at:
+            _dots(ax, place[at], found.sigmas[at], role, label, hints)
     ax.set(ylabel="residual [standard deviations]")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
