@@ -11,9 +11,9 @@ from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rpim_opt as ro
+from rpim_opt.problem.registration.certified import lifted, relax, rotation_constraints, smallest
 from rpim_opt.problem.registration.closed_forms import transforms
 from rpim_opt.problem.registration.frames import locate
-from rpim_opt.problem.registration.relaxation import lifted, relax, rotation_constraints, smallest
 from rpim_opt.study.studies import find_study, load_study
 from tests import SHARED
 
