@@ -414,7 +414,7 @@ class CalibrationProblem(RobotModel):
         count = np.zeros(len(self.data), dtype=int)
         residual = self.residual(x)
         for block, index, L in zip(self.data.blocks, equation_numbers(self.data), self._whitening, strict=True):
-            norms[block.row] = np.linalg.norm(_times(L, residual[index][:, :, None])[:, :, 0], axis=1)
+            norms[block.row] = np.linalg.norm((L @ residual[index][:, :, None])[:, :, 0], axis=1)
             count[block.row] = index.shape[1]
         return norms, count
 
@@ -425,29 +425,17 @@ class CalibrationProblem(RobotModel):
 
     def whitened_residual(self, x: Array) -> Array:
         """Return the residual at x (n,) [SI] in units of its noise, (m,), in the order of `linearize`'s equations."""
-        if self._shares_noise:
-            return self._whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
-        both = zip(self.data.blocks, self._whitening, strict=True)
-        return np.concatenate([_times(L, self._values(block, "residual", x)[:, :, None]).ravel() for block, L in both])
+        return self._whitened(self.contrasts(self.residual(x)[:, None]))[:, 0]
 
     # Linearization
 
     def linearize(self, x: Array, reweigh: Reweigh | None = None) -> LinearModel:
         """Return the whitened, scaled linear model around x (n,) [SI], its equations weighed by ``reweigh``, if any."""
-        z = x / self.parameters.free.scale
-        scale = np.append(self.parameters.free.scale, 1.0)
-        if self._shares_noise:
-            residual, jacobian = self.slopes(x)
-            both = self._whitened(self.contrasts(np.column_stack([jacobian, residual]) * scale))
-            A = np.ascontiguousarray(both[:, :-1])
-        else:
-            parts = []
-            for block, L in zip(self.data.blocks, self._whitening, strict=True):
-                residual, jacobian = self._evaluated(block, "jacobian", x)
-                rows = np.concatenate([jacobian, residual.transpose(0, 2, 1)], axis=2)
-                parts.append(_times(L, rows, scale).reshape(-1, len(scale)))
-            both = np.asfortranarray(np.concatenate(parts))
-            A = both[:, :-1]
+        scale = self.parameters.free.scale
+        residual, jacobian = self.slopes(x)
+        both = np.asfortranarray(self._whitened(self.contrasts(np.column_stack([jacobian * scale, residual]))))
+        A = both[:, :-1]
+        z = x / scale
         kinds = [block.measurement for block in self.data.blocks]
         constrained = any(not kind.columns and not kind.touching for kind in kinds)
         model = LinearModel(A, both[:, -1] + A @ z, self.groups, self.identified, constrained)
@@ -510,11 +498,6 @@ class CalibrationProblem(RobotModel):
 
     # Noise
 
-    @property
-    def _shares_noise(self) -> bool:
-        """Whether the noise of a configuration's equations is correlated from row to row."""
-        return self.scatter is not None or self.touches is not None
-
     @cached_property
     def _whitening(self) -> list[Array]:
         """L^-1 with a row's covariance = L L', for every block."""
@@ -523,18 +506,20 @@ class CalibrationProblem(RobotModel):
         return [_inverse_root(covariance) for covariance in self.covariances()]
 
     def _whitened(self, values: Array) -> Array:
-        """Return values (m, c) of the equations in units of their noise, configuration by configuration."""
+        """Return values (m, c) of the equations in units of their noise."""
         found = np.empty_like(values)
-        for stack, inverse in self._inverses:
-            found[stack.index] = inverse @ values[stack.index]
+        for index, inverse in self._inverses:
+            found[index] = inverse @ values[index]
         return found
 
     @cached_property
-    def _inverses(self) -> list[tuple[Stack, Array]]:
-        """L^-1 of the covariances L L' of whole configurations."""
+    def _inverses(self) -> list[tuple[np.ndarray, Array]]:
+        """The numbers (N, k) of equations that share noise, and L^-1 (N or 1, k, k) of its covariances L L'."""
         scatter = self.scatter or Scatter()
+        if self.scatter is None and self.touches is None:  # every row by itself
+            return list(zip(equation_numbers(self.data), self._whitening, strict=True))
         stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
-        return [(stack, _inverse_root(stack.covariance(scatter))) for stack in stacks]
+        return [(stack.index, _inverse_root(stack.covariance(scatter))) for stack in stacks]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with what divides their noise.
@@ -641,13 +626,6 @@ def _inverse_root(covariance: Array) -> Array:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=float)
     except np.linalg.LinAlgError:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
-
-
-def _times(L: Array, values: Array, scale: float | Array = 1.0) -> Array:
-    """Return L (N or 1, k, k) times values (N, k, c) times scales (c,)."""
-    if len(L) == 1 and np.count_nonzero(L) == L.shape[1]:  # most instruments: a multiplication each
-        return np.asarray(values * (np.diagonal(L[0])[:, None] * scale))
-    return np.asarray(L @ (values * scale))
 
 
 def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
