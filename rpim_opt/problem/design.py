@@ -378,16 +378,12 @@ def observe(problem: Source) -> Observability:
         added = {free.names[k]: float(v) for k, v in zip(rest, sums, strict=True) if abs(v) > FAINT}
         base.append({free.names[pivot[i]]: 1.0} | added)
     return Observability(
-        names=free.names,
-        singular_values=s,
-        rank=rank,
-        configurations=configurations,
+        names=free.names, singular_values=s, rank=rank, configurations=configurations,
         unidentifiable=tuple(n for n, b in zip(free.names, blind, strict=True) if b),
         redundant=tuple({free.names[k]: float(null[k]) for k in np.flatnonzero(null)} for null in nulls),
-        base=tuple(base),
-        condition=float(s[0] / s[rank - 1]),
+        base=tuple(base), condition=float(s[0] / s[rank - 1]),
         raw_condition=float(raw[0] / raw[-1]) if model.equations >= len(x) and raw[-1] > tiny else float("inf"),
-    )
+    )  # fmt: skip
 
 
 def combination(terms: dict[str, float]) -> str:

@@ -134,12 +134,10 @@ def _concatenated(tables: Sequence[Parameters]) -> Parameters:
         return list(chain.from_iterable(getattr(table, what) for table in tables))
 
     return Parameters(
-        names=tuple(listed("names")),
-        dimensions=tuple(listed("dimensions")),
-        own_frames=tuple(dict.fromkeys(listed("own_frames"))),
-        terms=tuple(dict.fromkeys(listed("terms"))),
+        names=tuple(listed("names")), dimensions=tuple(listed("dimensions")),
+        own_frames=tuple(dict.fromkeys(listed("own_frames"))), terms=tuple(dict.fromkeys(listed("terms"))),
         **{what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")},
-    )
+    )  # fmt: skip
 
 
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:

@@ -250,13 +250,10 @@ def loads_of(robot: Robot, needs: Dependencies, data: Dataset, block: Block) -> 
     """Return the joint loads stated in the rows of a block, and those to compute from gravity."""
     weighs = needs.torques and not measured_torques(data, block.robot)
     return Loads(
-        torques=block.torque is not None,
-        payload=block.payload is not None,
-        approach=block.approach is not None,
-        gravity=robot.gravity if weighs or needs.gravity or needs.moments else None,
-        weighs=weighs,
+        torques=block.torque is not None, payload=block.payload is not None, approach=block.approach is not None,
+        gravity=robot.gravity if weighs or needs.gravity or needs.moments else None, weighs=weighs,
         columns=tuple(block.columns),
-    )
+    )  # fmt: skip
 
 
 def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool) -> Loads:

@@ -28,15 +28,7 @@ from rpim_opt.report.summary import mm
 if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
 
-__all__ = [
-    "error_vectors",
-    "errors",
-    "l_curve",
-    "parameters",
-    "picard",
-    "selection",
-    "selectors",
-]
+__all__ = ["error_vectors", "errors", "l_curve", "parameters", "picard", "selection", "selectors"]
 
 Axes = Any  # matplotlib's, imported where axes are made
 

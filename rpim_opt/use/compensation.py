@@ -426,18 +426,10 @@ class _Cell(NamedTuple):
         loads = loads_on(robot, p, problem.data, torques)
         prefix = tool_prefix(tooled.marker)
         return cls(
-            robot,
-            kind,
-            Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
-            Arm.of(robot, identified, nominal, prefix, moved, kind, loads),
-            loads,
-            problem,
-            tooled.x[p.identified],
-            tooled.covariance,
-            tooled.marker,
-            position_noise(measured),
-            result.variance_factor,
-        )
+            robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
+            Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, tooled.x[p.identified],
+            tooled.covariance, tooled.marker, position_noise(measured), result.variance_factor,
+        )  # fmt: skip
 
     def compensated(self, targets: Targets, largest: float) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some targets."""

@@ -202,9 +202,6 @@ def _rows(values: Array, N: int, what: str) -> Array:
     return array
 
 
-# --- tables ------------------------------------------------------------------------------------------------
-
-
 def read_approaches(source: Any, units: str = "") -> Performance:
     """Return pose accuracy and repeatability of a table of repeated approaches (`iso9283`).
 
@@ -265,10 +262,6 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
         return np.column_stack([si * numbers(columns[name], name) for name, si in (of[stem] for stem in stems)])
 
     return iso9283(
-        texts(columns[pose], pose),
-        beside(attained, AXES),
-        beside(commanded, AXES),
-        beside(attained, angles),
-        beside(commanded, angles),
-        angles or ROTATIONS[0],
-    )
+        texts(columns[pose], pose), beside(attained, AXES), beside(commanded, AXES), beside(attained, angles),
+        beside(commanded, angles), angles or ROTATIONS[0],
+    )  # fmt: skip

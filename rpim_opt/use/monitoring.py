@@ -207,20 +207,10 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     level = FALSE_ALARM / TESTS
     sigmas, deviate = _innovations(result, problem, level / count)
     return Monitoring(
-        label=data.label,
-        times=times,
-        when=when,
-        error=result.errors(data),
-        sigmas=sigmas,
-        allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)),
-        sums=cusum(deviate),
-        limit=cusum_limit(count, level),
-        drift=_drift(result, problem, level),
-        mistake=misread(result, data),
-    )
-
-
-# --- each check --------------------------------------------------------------------------------------------
+        label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
+        allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
+        limit=cusum_limit(count, level), drift=_drift(result, problem, level), mistake=misread(result, data),
+    )  # fmt: skip
 
 
 def _innovations(result: Calibration, problem: CalibrationProblem, level: float) -> tuple[Array, Array]:
@@ -269,9 +259,6 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     return sigmas, -np.asarray(ndtri(np.clip(p_values, SMALLEST, 1 - SMALLEST)))
 
 
-# --- their cumulative sum ----------------------------------------------------------------------------------
-
-
 def cusum(deviate: Array) -> Array:
     """Return Page's sums (N,), S_t = max(0, S_(t-1) + u_t - `ALLOWANCE`)."""
     total = np.cumsum(deviate - ALLOWANCE)
@@ -297,9 +284,6 @@ def cusum_limit(count: int, level: float) -> float:
         else:
             high = middle
     return high
-
-
-# --- every parameter ---------------------------------------------------------------------------------------
 
 
 def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Drift | None:

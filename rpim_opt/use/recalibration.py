@@ -254,24 +254,14 @@ def update(
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = result.record
     last = Earlier(
-        record.title or robots,
-        record.made,
-        record.digest or content(result)["digest"],
-        len(result.problem.labels),
-        {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
-        prior_inflation,
-        released,
-        left_out,
-    )
+        record.title or robots, record.made, record.digest or content(result)["digest"], len(result.problem.labels),
+        {robot: ranges.tolist() for robot, ranges in result.ranges.items()}, prior_inflation, released, left_out,
+    )  # fmt: skip
     excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
     record = Record(
-        record.title,
-        record.source,
-        excluded=excluded,
-        simulated=record.simulated,
-        earlier=(*record.earlier, last),
+        record.title, record.source, excluded=excluded, simulated=record.simulated, earlier=(*record.earlier, last),
         terms=record.terms,
-    )
+    )  # fmt: skip
     return Update(replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data))
 
 

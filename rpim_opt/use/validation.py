@@ -151,14 +151,6 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     if touched:
         remarks += [*contact_remarks(problem), *known_points(problem, data)]
     return Validation(
-        data.label,
-        nominal,
-        error,
-        result.error_vectors(data),
-        result.errors(data, "angle"),
-        *judged(result, data),
-        outside=result.outside(data),
-        touched=touched,
-        remarks=tuple(remarks),
-        mistake=misread(result, data),
-    )
+        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *judged(result, data),
+        outside=result.outside(data), touched=touched, remarks=tuple(remarks), mistake=misread(result, data),
+    )  # fmt: skip

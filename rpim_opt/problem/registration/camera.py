@@ -209,14 +209,9 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
             quaternion = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_quat()
             rows = block.row[index]
             seen = replace(
-                block.take(index, index),
-                measurement=pose,
-                y=np.hstack([T[:, :3, 3], quaternion[:, [3, 0, 1, 2]]]),
-                covariance=sigma[:, :, None] ** 2 * np.eye(6),
-                fixture="",
-                point=None,
-                columns={},
-            )
+                block.take(index, index), measurement=pose, y=np.hstack([T[:, :3, 3], quaternion[:, [3, 0, 1, 2]]]),
+                covariance=sigma[:, :, None] ** 2 * np.eye(6), fixture="", point=None, columns={},
+            )  # fmt: skip
         blocks.append(replace(seen, row=len(labels) + np.arange(len(rows))))
         labels += [data.label[i] for i in rows]
         configuration += data.configuration[rows].tolist()

@@ -144,18 +144,11 @@ def certified_hand_eye(
     }
     cause = next((text for text, true in causes.items() if true), "")
     return CertifiedStart(
-        base=rigid(first, first @ u),
-        tool=rigid(last[0].T if last else np.eye(3), t),
-        cost=solved.cost,
-        bound=solved.cost - excess,
-        gap=gap,
-        rank_ratio=best.rank_ratio,
-        uncertainty=uncertainty,
-        radius=radius,
-        weights=solved.weights,
-        certified=not cause,
+        base=rigid(first, first @ u), tool=rigid(last[0].T if last else np.eye(3), t), cost=solved.cost,
+        bound=solved.cost - excess, gap=gap, rank_ratio=best.rank_ratio, uncertainty=uncertainty, radius=radius,
+        weights=solved.weights, certified=not cause,
         reason=cause or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
-    )
+    )  # fmt: skip
 
 
 def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, np.ndarray]:
@@ -309,9 +302,6 @@ def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
         found += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
     least = min(each.cost for each in found)
     return next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
-
-
-# --- which measurements can agree ---------------------------------------------------------------------------------
 
 
 def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:

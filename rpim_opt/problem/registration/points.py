@@ -84,15 +84,11 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
         turns = np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
     number = {label: i for i, label in enumerate(problem.data.label)}
     whole = Points(
-        q=np.concatenate([block.q[:, 0] for block in blocks]),
-        y=np.concatenate([block.y[:, :3] for block in blocks]),
+        q=np.concatenate([block.q[:, 0] for block in blocks]), y=np.concatenate([block.y[:, :3] for block in blocks]),
         marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
-        tools=tools,
-        turns=turns,
-        row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
-        seen=data is not problem.data,
-        names=tuple(markers),
-    )
+        tools=tools, turns=turns, row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
+        seen=data is not problem.data, names=tuple(markers),
+    )  # fmt: skip
     return whole.take(np.argsort(whole.row, kind="stable")).evenly(most)
 
 
