@@ -658,7 +658,9 @@ def design(
 ) -> Answer:
     """Choose the next configurations to measure by optimal design."""
     with console.progress() as say:
-        from rpim_opt.basics.tables import csv_text, read_columns
+        import numpy as np
+
+        from rpim_opt.basics.tables import columns_csv, read_columns
         from rpim_opt.calibration.diagnosis import measured_ranges
         from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
         from rpim_opt.problem.workspace import postures_at, touched_place
@@ -670,7 +672,8 @@ def design(
         if table is not None:
             q = read_candidates(table, posed.robot)
         elif posed.data.blocks[0].measurement.touching:
-            q = postures_at(posed, touched_place(posed, point)[None].repeat(candidates, 0), seed)
+            place = console.touched_point(point) or touched_place(posed)
+            q = postures_at(posed, np.tile(place, (candidates, 1)), seed)
         else:
             limits = posed.robot.limits
             if augment:
@@ -683,9 +686,8 @@ def design(
         label = read_columns(table).get("label")
         if label is not None:
             columns["label"] = [str(label[k]) for k in found.chosen]
-    text = csv_text(columns, zip(*columns.values(), strict=True))
     document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap}
-    return _with_table(f"{found}{where}", text, out, {**document, "configurations": columns})
+    return _with_table(f"{found}{where}", columns_csv(columns), out, {**document, "configurations": columns})
 
 
 @command

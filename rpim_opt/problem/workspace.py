@@ -228,16 +228,8 @@ class Target(NamedTuple):
         return step * np.minimum(1.0, LONGEST / np.maximum(length, LONGEST))[:, None] * span
 
 
-def touched_place(problem: CalibrationProblem, stated: str | None = None) -> Array:
-    """Return a point (3,) [m] in the base frame: as stated, ``"400,0,200"`` [mm], or the middle of the data's."""
-    if stated is not None:
-        try:
-            numbers = [float(part) for part in stated.split(",")]
-        except ValueError:
-            numbers = []
-        if len(numbers) != 3 or not np.isfinite(numbers).all():
-            raise InputError("--point", f"'{stated}'", "x,y,z [mm] in the robot's base frame")
-        return np.array(numbers) / 1e3
+def touched_place(problem: CalibrationProblem) -> Array:
+    """Return a point (3,) [m] in the base frame that the data's rows touched, near the middle of all such."""
     centres = [thing.centre for thing in problem.touched]
     if not centres:
         raise InputError("the data", "no touch of a point", 'rows of measurement = "revisit"')

@@ -127,6 +127,13 @@ def tool_frame(text: str | None) -> list[float] | None:
     return [*(1e-3 * v for v in values[:3]), *(radians(v) for v in values[3:])]
 
 
+def touched_point(text: str | None) -> list[float] | None:
+    """Return the point [m] of ``--point``."""
+    if text is None:
+        return None
+    return [1e-3 * v for v in _numbers("--point", text, (3,), "x,y,z [mm] in the robot's base frame")]
+
+
 def carried(text: str | None) -> tuple[float | None, list[float] | None]:
     """Return mass [kg] and centre of mass [m], or None, of ``--payload``."""
     if text is None:

@@ -182,9 +182,22 @@ def _checks(found: Monitoring) -> Table:
     columns: dict[str, Sequence[str]] = {"check": found.label}
     if found.times:
         columns["time"] = found.times
-    errors = [mm(1e3 * error) for error in found.error]
-    columns |= {"error [mm]": errors, "standard deviations": sigmas, "cumulative sum": sums}
-    return Table("In the order of time", list(columns), list(zip(*columns.values(), strict=True)))
+    columns["error [mm]"] = [mm(1e3 * error) for error in found.error]
+    columns |= {"standard deviations": sigmas, "cumulative sum": sums}
+    table = Table("In the order of time", list(columns), list(zip(*columns.values(), strict=True)))
+    heading = title or "Checks"
+    sum_title = "Cumulative sum of the checks and its limit"
+    charts = [
+        figure(partial(plot.checks, found), "Residual of every check and its limit", "Each check on its own."),
+        figure(partial(plot.cumulative_sum, found), sum_title, "All together (CUSUM)."),
+    ]
+    sections: list[tuple[str, list[Block]]] = [
+        ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
+        ("Over time", [("figures", charts)]),
+        ("Every check", [("table", table)]),
+    ]
+    text = render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections)
+    write_text(Path(path), text)
 
 
 def written_checks(found: Monitoring, out: Path | None, title: str) -> list[Path]:

@@ -186,38 +186,25 @@ def compensate(
     scales ascribe to the base stays. With ``base=True`` targets hold in the base as stated, and the robot corrects for
     its place, too (``base = "auto"`` states none: then it is where registration puts it).
 
-    Parameters
-    ----------
-    q, poses
-        (N, dof) commands of the nominal controller [rad or m]; and/or targets in the base, (N, 7) x, y, z [m] and unit
-        quaternion, w first, or (N, 3) positions. ``q`` is then where to look for those; without it every target is
-        looked for from several configurations within the limits that come near.
-    orientation
-        Whether orientations count.
-    tool
-        (6,) a tool in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the robot has
-        exactly there. By default the reflector of the calibration (``marker`` of several): the controller's robot has
-        it at its nominal place (as stated, or where registration puts it), the real one as identified; a nominal place
-        that the identified one contradicts is no TCP, and both have it as identified. The flange frame is that of the
-        DH table, after the last joint.
-    torque, payload, payload_centre
-        What joints bear, which are in the middle of their backlash. (N, dof) torques [Nm]: required, and zero if need
-        be, where compliances were identified from measured ones. Mass at the flange [kg], one or (N,), and its place
-        (3,) in the flange frame [m], where they were identified without; by default what the problem states.
-    largest, limit
-        Largest correction of a joint [rad or m], and position error left by the model above which a command counts as
-        one that misses its target [m].
-    label
-        N row labels; numbers from 1 by default.
-    robot
-        Which of several robots.
-    despite_verdict
-        Use a robot that is not delivered, too; otherwise it raises NotDelivered.
+    **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
+    x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;
+    without ``q`` every pose is looked for from several configurations within the limits that come near. ``orientation``
+    says whether orientations count, ``label`` names the rows, ``robot`` is which of several.
 
-    Raises
-    ------
-    InputError
-        For shapes that do not fit, numbers that are not finite, a reflector that is not known.
+    **Tool.** ``tool`` (6,) is in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the
+    robot has exactly there. By default it is the reflector of the calibration (``marker`` of several): the controller's
+    robot has it at its nominal place (as stated, or where registration puts it), the real one as identified; a nominal
+    place that the identified one contradicts is no TCP, and both have it as identified. The flange frame is that of the
+    DH table, after the last joint.
+
+    **Loads.** Joints are in the middle of their backlash. ``torque`` (N, dof) [Nm] is required, and zero if need be,
+    where compliances were identified from measured ones; ``payload`` [kg], one or (N,), and ``payload_centre`` (3,) in
+    the flange frame [m] where they were identified without, by default as the problem states them.
+
+    ``largest`` is the largest correction of a joint [rad or m], ``limit`` the position error left by the model above
+    which a command counts as one that misses its target [m]. A calibration that is not delivered raises NotDelivered
+    unless ``despite_verdict``; InputError for shapes that do not fit, numbers that are not finite, a reflector that is
+    not known.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")

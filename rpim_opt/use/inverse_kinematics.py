@@ -55,7 +55,14 @@ class Arm(NamedTuple):
         flange = chain(robot.joint_types, posture, value, terms)
         T = product([ca.SX(ca.DM(before)), *flange, *placed([value(tool + c) for c in FRAME])])
         joints = list(enumerate(robot.joint_types, start=1))
-        twists = [_twist(moves, after[i - 1], T, value(f"beta{i}")) for i, moves in joints]
+        twists = []  # how point and orientation of T move with a joint
+        for (i, moves), link in zip(joints, after, strict=False):
+            beta = value(f"beta{i}")
+            axis = link[:3, :3] @ ca.vertcat(
+                -np.sin(beta), 0, np.cos(beta)
+            )  # z before Rot(y, beta), through the origin
+            turn = ca.vertcat(ca.cross(axis, T[:3, 3] - link[:3, 3]), axis)
+            twists.append(ca.vertcat(axis, 0, 0, 0) if moves == "prismatic" else turn)
         moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, _ in joints))
         # gravity bends a joint by the values of all of them
         J = (ca.horzcat(*twists) @ ca.jacobian(moved, command["q"]))[: len(kind.components), :]
@@ -67,14 +74,6 @@ class Arm(NamedTuple):
         """Return the pose (N, c), its error (N, k) from y, and the Jacobian (N, k, dof) of the pose."""
         modelled, error, J = call_rows(self.function, [], np.hstack([q @ self.joint_map.T, load, y]))
         return modelled[:, 0], error[:, 0], J @ self.joint_map
-
-
-def _twist(moves: str, joint: ca.SX, T: ca.SX, beta: float) -> ca.SX:
-    """Return how point and orientation of T move with a joint (6, 1), after whose link the frame ``joint`` is."""
-    axis = joint[:3, :3] @ ca.vertcat(-np.sin(beta), 0, np.cos(beta))  # z before Rot(y, beta), through the origin
-    if moves == "prismatic":
-        return ca.vertcat(axis, 0, 0, 0)
-    return ca.vertcat(ca.cross(axis, T[:3, 3] - joint[:3, 3]), axis)
 
 
 def nearest(

@@ -19,6 +19,7 @@ from rpim_opt.problem.blocks import partitions
 from rpim_opt.problem.registration.camera import posed, starting_camera
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.problem.workspace import postures_at, touched_place, within
+from rpim_opt.report.console import touched_point
 from tests.problem.test_camera import BOARD, LENS, SIGMA, world
 from tests.simulate import ARM
 
@@ -92,8 +93,8 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a point out of reach": (
         lambda: postures_at(ro.load("position").problem, np.array([[9.0, 0, 0]])), "(9000, 0, 0) mm, out of reach"
     ),
-    "a point that is a word": (lambda: touched_place(problem(), "here"), "--point: found 'here'"),
-    "a point of two numbers": (lambda: touched_place(problem(), "1,2"), "x,y,z [mm]"),
+    "a point that is a word": (lambda: touched_point("here"), "--point: found 'here'"),
+    "a point of two numbers": (lambda: touched_point("1,2"), "x,y,z [mm]"),
     "the middle of what nobody touched": (lambda: touched_place(problem()), "no touch of a point"),
     "a camera without a focal length": (
         lambda: posed(few_views(3), own(fx=0.0)), "a focal length of 0 px, accepted: one greater than zero"
