@@ -195,11 +195,11 @@ def headline(result: Calibration) -> str:
     }[name]
     what = "position error" if _of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
-    falls = f"falls from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
-    times = f", by a factor of {ratio:.1f}" if ratio < 10 else f", by a factor of {ratio:.0f}"
-    if ratio <= 1:
-        falls, times = falls.replace("falls", "rises"), ""
-    sentence = f"{where} the mean {what} {falls}{times}."
+    change = f"rises from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
+    if ratio > 1:
+        factor = f"{ratio:.1f}" if ratio < 10 else f"{ratio:.0f}"
+        change = f"{change.replace('rises', 'falls')}, by a factor of {factor}"
+    sentence = f"{where} the mean {what} {change}."
     if not result.verdict.delivered:
         return f"Not delivered: this robot should not be used. {sentence}"
     held = result.record.held_out
