@@ -137,9 +137,7 @@ Several = "several files are stacked, or joined as by new."
 Type = Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")]
 Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
 Largest = Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")]
-Box = Annotated[
-    Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base frame; default: the measured joint ranges.")
-]
+Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
@@ -148,10 +146,7 @@ Scheduler = Annotated[Text, Option(help="Address of a Dask scheduler to compute 
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
 Folder = Annotated[File, Option(help="Folder in which to write result.json.")]
-Despite = Annotated[
-    bool,
-    Option("--despite-verdict", help="Write the file although the robot is not delivered, with a note in the file."),
-]
+Despite = Annotated[bool, Option("--despite-verdict", help="Write a robot that is not delivered, with a note in it.")]
 Json = Annotated[bool, Option("--json", help="One JSON document on stdout, errors as JSON on stderr.")]
 
 
@@ -265,9 +260,7 @@ def new(
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
     measurement: Annotated[Text, Option(help="position, pose, cable, distance, ...; guessed from columns.")] = None,
     validation: Annotated[File, Option(help="A table for validation.")] = None,
-    hold_out: Annotated[
-        Number, Option(help="Fraction of the configurations to hold out instead, such as 0.25.")
-    ] = None,
+    hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead: 0.25.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
@@ -344,13 +337,7 @@ def calibrate(
     formulation: Formulation = None,
     noise: Noise = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
-    use_validation: Annotated[
-        bool | None,
-        Option(
-            "--use-validation/--no-use-validation",
-            help="After validation, calibrate from all rows; default: if --hold-out drew the validation set.",
-        ),
-    ] = None,
+    use_validation: Annotated[Choice, Option(help="Once validated, use all rows; default: those held out.")] = None,
     limit: Tolerance = None,
     box: Box = None,
     out: Folder = None,

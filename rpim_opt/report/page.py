@@ -149,26 +149,6 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     >>> ro.report.write_checks(ro.use.monitor(ro.calibrate(instance.problem), instance.validation), "checks.html")
     """
     verdict, *details = str(found).splitlines()
-    heading = title or "Checks"
-    charts = [
-        figure(partial(plot.checks, found), "Residual of every check and its limit", "Individual checks."),
-        figure(
-            partial(plot.cumulative_sum, found),
-            "Cumulative sum of the checks and its limit",
-            "Cumulative sum of the checks (CUSUM).",
-        ),
-    ]
-    sections: list[tuple[str, list[Block]]] = [
-        ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
-        ("Over time", [("figures", charts)]),
-        ("Every check", [("table", _checks(found))]),
-    ]
-    text = render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections)
-    write_text(Path(path), text)
-
-
-def _checks(found: Monitoring) -> Table:
-    """Return every check; values beyond their limits are marked."""
     sigmas = [f"{value:.1f}" for value in found.sigmas]
     for i in found.beyond:
         sigmas[i] = f"above {sigmas[i]}"
@@ -181,19 +161,18 @@ def _checks(found: Monitoring) -> Table:
     columns["error [mm]"] = [mm(1e3 * error) for error in found.error]
     columns |= {"standard deviations": sigmas, "cumulative sum": sums}
     table = Table("In the order of time", list(columns), list(zip(*columns.values(), strict=True)))
-    heading = title or "Checks"
-    sum_title = "Cumulative sum of the checks and its limit"
+    title_of_sum = "Cumulative sum of the checks and its limit"
     charts = [
-        figure(partial(plot.checks, found), "Residual of every check and its limit", "Each check on its own."),
-        figure(partial(plot.cumulative_sum, found), sum_title, "All together (CUSUM)."),
+        figure(partial(plot.checks, found), "Residual of every check and its limit", "Individual checks."),
+        figure(partial(plot.cumulative_sum, found), title_of_sum, "Cumulative sum of the checks (CUSUM)."),
     ]
     sections: list[tuple[str, list[Block]]] = [
         ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
         ("Over time", [("figures", charts)]),
         ("Every check", [("table", table)]),
     ]
-    text = render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections)
-    write_text(Path(path), text)
+    heading = title or "Checks"
+    write_text(Path(path), render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections))
 
 
 def written_checks(found: Monitoring, out: Path | None, title: str) -> list[Path]:
