@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -11,7 +12,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
@@ -48,10 +49,9 @@ Labelled = TypeVar("Labelled", bound=Any)
 
 def each_once(where: str, labelled: Sequence[Labelled], what: str) -> tuple[Labelled, ...]:
     """Return things with labels as a tuple; InputError for a label that occurs twice."""
-    labels = [each.label for each in labelled]
-    for label in labels:
-        if labels.count(label) > 1:
-            raise InputError(where, f"'{label}' twice", f"a unique name for each: {{'a name': {what}}}")
+    twice = [label for label, count in Counter(each.label for each in labelled).items() if count > 1]
+    if twice:
+        raise InputError(where, f"'{twice[0]}' twice", f"a unique name for each: {{'a name': {what}}}")
     return tuple(labelled)
 
 
@@ -152,21 +152,21 @@ class Split:
 
 def splits_of(stated: Any) -> tuple[Split, ...]:
     """Return the splits: ``"folder"``, a fraction (0.25), a number of folds (5), or several of them."""
-    if isinstance(stated, Sequence) and not isinstance(stated, str) and stated:
-        return tuple(dict.fromkeys(_split(each) for each in stated))
-    return (_split(stated),)
-
-
-def _split(stated: Any) -> Split:
-    number = isinstance(stated, int | float) and not isinstance(stated, bool)
-    if stated == FOLDER:
-        return Split(FOLDER)
-    if number and 0 < stated < 1:
-        return Split(f"{stated:g} held out", part=float(stated))
-    if number and 2 <= stated <= MOST_FOLDS and stated == int(stated):
-        return Split(f"{int(stated)} folds", folds=int(stated))
-    accepted = f"'folder', a fraction of the configurations between 0 and 1, or a number of folds, 2 to {MOST_FOLDS}"
-    raise InputError("splits", f"{stated!r}", accepted)
+    several = isinstance(stated, Sequence) and not isinstance(stated, str) and stated
+    parts: list[Any] = list(stated) if several else [stated]
+    splits = []
+    for each in parts:
+        number = isinstance(each, int | float) and not isinstance(each, bool)
+        if each == FOLDER:
+            splits.append(Split(FOLDER))
+        elif number and 0 < each < 1:
+            splits.append(Split(f"{each:g} held out", part=float(each)))
+        elif number and 2 <= each <= MOST_FOLDS and each == int(each):
+            splits.append(Split(f"{int(each)} folds", folds=int(each)))
+        else:
+            accepted = f"'folder', a fraction of the configurations between 0 and 1, or folds, 2 to {MOST_FOLDS}"
+            raise InputError("splits", f"{each!r}", accepted)
+    return tuple(dict.fromkeys(splits))
 
 
 def divide(instance: Instance, split: Split, fold: int, count: int | None, noise: float, seed: int) -> Instance:
@@ -295,7 +295,7 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
             methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
     for label, each in _listed(functions):
         name, function = _named(label, each, BASELINES, "methods", "the problem")
-        methods.append(Method(name, partial(_on_problem, function)))
+        methods.append(Method(name, lambda instance, function=function: function(instance.problem)))
     if not methods:
         raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
     return each_once("methods", methods, "...")
@@ -321,10 +321,6 @@ def _named(label: str, each: Any, ready: Mapping[str, Any], where: str, argument
 
 def _name(function: Any) -> str:
     return getattr(function, "__name__", type(function).__name__)
-
-
-def _on_problem(function: Callable[[CalibrationProblem], Any], instance: Instance) -> Any:
-    return function(instance.problem)
 
 
 def _selector(label: str, each: Any) -> tuple[str, Any]:
@@ -378,14 +374,10 @@ class Fitted:
         return self.answer.errors(self.problem.data, "length")
 
 
-def _rms(errors: Array) -> float:
-    return float(np.sqrt(np.mean(errors**2)))
-
-
-def _milli(errors: Array, figure: Callable[[Array], Any]) -> float | None:
-    """Return 1000 times a figure of the errors that are numbers, which makes mm of m; None where there are none."""
+def _p95(fitted: Fitted) -> float | None:
+    errors = fitted.errors()
     known = errors[np.isfinite(errors)]
-    return 1e3 * float(figure(known)) if len(known) else None
+    return 1e3 * float(np.percentile(known, 95)) if len(known) else None
 
 
 def _coverage(fitted: Fitted) -> float | None:
@@ -395,12 +387,12 @@ def _coverage(fitted: Fitted) -> float | None:
 
 
 METRICS: dict[str, Callable[[Fitted], float | None]] = {
-    "rms_mm": lambda fitted: _milli(fitted.errors(), _rms),
-    "mean_mm": lambda fitted: _milli(fitted.errors(), np.mean),
-    "p95_mm": lambda fitted: _milli(fitted.errors(), lambda errors: np.percentile(errors, 95)),
-    "max_mm": lambda fitted: _milli(fitted.errors(), np.max),
-    "rms_mrad": lambda fitted: _milli(fitted.errors("angle"), _rms),
-    "fit_rms_mm": lambda fitted: _milli(fitted.fit_errors(), _rms),
+    "rms_mm": lambda fitted: statistics(fitted.errors())["rms_mm"],
+    "mean_mm": lambda fitted: statistics(fitted.errors())["mean_mm"],
+    "p95_mm": _p95,
+    "max_mm": lambda fitted: statistics(fitted.errors())["max_mm"],
+    "rms_mrad": lambda fitted: statistics(fitted.errors("angle"), "mrad")["rms_mrad"],
+    "fit_rms_mm": lambda fitted: statistics(fitted.fit_errors())["rms_mm"],
     "covered_percent": _coverage,
     "seconds": lambda fitted: fitted.seconds,
 }

@@ -24,7 +24,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, RpimError
 from rpim_opt.basics.files import LARGEST_DATA, parse_json, refused, require_file
-from rpim_opt.basics.text import version_of
+from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
 from rpim_opt.store.problem_file import problems_folder
 
@@ -32,8 +32,6 @@ Row = dict[str, Any]
 """A case with its figures."""
 Work = Callable[[], Row]
 """Computation of a replicate; it travels to wherever it is computed."""
-Progress = Callable[[int, int], None]
-"""Called with how many replicates of how many are done."""
 PACKAGE = Path(__file__).resolve().parents[1]
 LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
 """Where Python files lie that the versions of packages stand for."""

@@ -19,8 +19,9 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import LARGEST_DATA, json_text, read_json, refused, require_file, write_files
+from rpim_opt.basics.text import Progress
 from rpim_opt.study import replicates
-from rpim_opt.study.replicates import Progress, Row, commit, require_package, run_cases
+from rpim_opt.study.replicates import Row, commit, require_package, run_cases
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 """What a study has: a text, a `Metric` for each figure that is held, and three functions."""
