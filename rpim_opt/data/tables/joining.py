@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from datetime import UTC, datetime
@@ -69,7 +70,7 @@ def together(
         how, used, keys, others = _keys(moving, seen, joints, values, key)
         place = {name: i for i, name in enumerate(keys)}
         if len(place) < len(keys):
-            twice = next(name for name in keys if keys.count(name) > 1)
+            twice = next(name for name, count in Counter(keys).items() if count > 1)
             raise InputError(f"the key {how}", f"'{twice}' twice in {moving[0].file}", "unique keys")
         right = [i for i, name in enumerate(others) if name in place]
         if not right:
@@ -86,12 +87,9 @@ def together(
     else:
         if not (np.isfinite(within) and within >= 0):
             raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
-        clocks = [_clocks(side, key) for side in (moving, seen)]
-        used = [name.lower() for names in clocks for name in names]
-        there, then = (
-            np.concatenate([seconds(name, table.raw[name]) for name, table in zip(names, side, strict=True)])
-            for names, side in zip(clocks, (moving, seen), strict=True)
-        )
+        clocks, there = _times(moving, key)
+        other_clocks, then = _times(seen, key)
+        used = [*clocks, *other_clocks]
         rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
         at, of, apart = partners(there, then, within + rounding)
         if not len(at):
@@ -263,8 +261,9 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     return partner[kept], kept, apart[kept]
 
 
-def _clocks(tables: Sequence[Understood], key: str) -> list[str]:
-    """Return the columns of times of some tables."""
+def _times(tables: Sequence[Understood], key: str) -> tuple[list[str], Array]:
+    """Return the columns of times of some tables, in lower case, and the times [s] of all rows."""
+    clocks = []
     found = []
     for table in tables:
         name = time_column(table.raw)
@@ -274,8 +273,9 @@ def _clocks(tables: Sequence[Understood], key: str) -> list[str]:
             lacks = f"no column '{key}'" if key else "no column of times"
             where = f"--time-tolerance, {table.file}"
             raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
-        found.append(name)
-    return found
+        clocks.append(name.lower())
+        found.append(seconds(name, table.raw[name]))
+    return clocks, np.concatenate(found)
 
 
 def time_column(names: Iterable[str]) -> str | None:
