@@ -36,8 +36,6 @@ class LaserTracker:
     (1e-6 for 1 ppm) [1] and ``angle`` [rad] how they grow; ``x``, ``y``, ``z`` the tracker's place in the instrument's
     frame [m], its origin by default.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> tracker = ro.data.LaserTracker(range=10e-6, range_ppm=1e-6, transverse=15e-6, angle=6e-6)

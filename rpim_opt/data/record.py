@@ -32,8 +32,6 @@ class Requirement:
     or the first, by default. InputError for a limit or a confidence that nothing can keep, and sides that are not
     (low, high).
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> print(ro.data.Requirement(1e-4, box=((0.3, 0.8), (-0.2, 0.2), (0.0, 0.5))).where)
     the box x 300 to 800, y -200 to 200, z 0 to 500 mm of the base frame, joints within the measured ranges

@@ -193,12 +193,7 @@ class StatedTarget:
 
 
 def stated_target(text: str) -> StatedTarget:
-    """Return the board of ``--target``: a table, or columns, rows and spacing of a grid; empty without one.
-
-    >>> from rpim_opt.store.new_folder import stated_target
-    >>> stated_target("7x5,30mm").stated
-    'target = { columns = 7, rows = 5, spacing_mm = 30 }'
-    """
+    """Return the board of ``--target``: a table, or columns, rows and spacing of a grid; empty without one."""
     if not text:
         return StatedTarget({}, "", {})
     match = GRID.fullmatch(text.strip())

@@ -62,22 +62,11 @@ FUNCTIONS: dict[str, Callable[..., Any]] = {
 
 
 def save_result(result: Calibration, path: str | Path) -> None:
-    """Write a calibration to one JSON file, which `load_result` reads; the file is written completely or not at all.
+    """Write a calibration to one JSON file, or ``result.json`` in a folder, which `load_result` reads.
 
-    Parameters
-    ----------
-    result
-        The calibration; its record has title, validation data and input files.
-    path
-        The file, or a folder for ``result.json``.
+    The file is written completely or not at all. The calibration's record has title, validation data and input files.
+    InputError for a `PartitionedProblem`, whose measurements the file cannot repeat.
 
-    Raises
-    ------
-    InputError
-        For a `PartitionedProblem`, whose measurements the file cannot repeat.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.load("paper_arm").calibrate(weight=1e-3)
     >>> ro.store.save_result(result, "result.json")

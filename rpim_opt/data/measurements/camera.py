@@ -175,8 +175,6 @@ def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: 
     [px], or the covariance of u and v, (2, 2) or (V, P, 2, 2) [px^2]; ``measurement`` is ``"eye_to_hand"`` where the
     robot carries the board. InputError for shapes that do not fit together, and a measurement that is no camera's.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> board = ro.data.grid_board(4, 3, 0.03)

@@ -211,8 +211,6 @@ def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool =
     Rows with the same one of N names touched the same ``point``, or the same plane if ``planes``; ``sigma`` is the
     standard deviation of a touch [m], or covariances (3, 3) or (N, 3, 3) [m^2].
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> data = ro.data.touches(np.linspace(0, 1, 24).reshape(4, 6), ["A", "B", "A", "B"], sigma=1e-4)

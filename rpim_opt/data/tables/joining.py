@@ -242,12 +242,6 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
 
     Each of the fewer belongs to the nearest of the others; of several whose nearest is the same one, the nearest alone
     (of equal times, all).
-
-    >>> import numpy as np
-    >>> from rpim_opt.data.tables.joining import partners
-    >>> left, right, apart = partners(np.arange(0.0, 1.0, 0.01), np.array([0.104, 0.501, 7.0]), within=0.005)
-    >>> left.tolist(), right.tolist(), apart.round(3).tolist()
-    ([10, 50], [0, 1], [0.004, 0.001])
     """
     if len(left) < len(right):
         others, own, apart = partners(right, left, within)
@@ -288,10 +282,6 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
 
     Numbers without a unit are seconds, or, where that would be after the year 5000, what since 1970 is in our time.
     Dates without a zone are UTC.
-
-    >>> from rpim_opt.data.tables.joining import seconds
-    >>> seconds("time_ms", ["0", "250"]).tolist(), seconds("date", ["1970-01-01T00:01", "1970-01-02"]).tolist()
-    ([0.0, 0.25], [60.0, 86400.0])
     """
     texts = [str(cell).strip() for cell in cells]
     times = np.array([numeral(text) for text in texts])

@@ -82,23 +82,11 @@ def understand(
     joints: Sequence[str] = (),
     targets: bool = False,
 ) -> Understood:
-    r"""Interpret a raw table for a robot and a measurement type, with the names that `read_data` takes.
+    """Interpret a raw table for a robot and a measurement type, with the names that `read_data` takes.
 
     Names that it takes already stay; others are recognized where they can mean one thing only (`names`). What is not
     recognized is left out, and so are rows without any measured or any joint value. ``joints`` are the names that the
     robot's file has. Of ``targets`` what was commanded counts, and rows may lack either values.
-
-    >>> import numpy as np
-    >>> from rpim_opt.basics.layout import RawTable
-    >>> from rpim_opt.data.measurements.position import position
-    >>> from rpim_opt.data.tables.understanding import understand
-    >>> from rpim_opt.robot import Robot
-    >>> arm = Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
-    >>> cells = {"Point": ["P1", "P2"], "J1 [deg]": ["1.5", "3"], "J2 [deg]": ["2", "4"]}
-    >>> cells |= {f"{axis} [mm]": ["1", "-"] for axis in "XYZ"}
-    >>> found = understand(RawTable(cells), arm, position)
-    >>> found.columns["q1_deg"], found.meant[1].meaning, found.notes[-1]
-    (['1.5'], 'joint 1', 'rows without measured values are left out: P2.')
     """
     options = options or TableOptions()
     stated = options.units

@@ -38,14 +38,7 @@ def formats() -> list[TableFormat]:
 
 
 def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
-    """Return the table of a file of any format.
-
-    >>> from pathlib import Path
-    >>> from rpim_opt.data.tables.formats.registry import read_raw
-    >>> _ = Path("points.jsonl").write_text('{"id": "P1", "xyz": [1.5, 2, 3]}')
-    >>> list(read_raw(Path("points.jsonl")).columns)
-    ['id', 'xyz x', 'xyz y', 'xyz z']
-    """
+    """Return the table of a file of any format."""
     ending = path.suffix.lower()
     every = formats()
     fitting = [each for each in every if ending in each.endings]
