@@ -242,7 +242,7 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
 
 @command
 def new(
-    folder: Annotated[Path, Argument(help="The problem folder to make; it must not exist.")],
+    folder: Annotated[Path, Argument(help="The problem folder to make; with --chain one that is there gets one more.")],
     robot: Annotated[str, Option(help="A ready one (see robots), or a file that describes it.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     units: Units = "",
@@ -264,6 +264,9 @@ def new(
     seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
+    chain: Annotated[
+        str, Option(help="Name of the chain: makes a problem on the origins of a URDF's joints, or adds a chain to it.")
+    ] = "",
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: Json = False,
@@ -286,7 +289,7 @@ def new(
         with refused(folder):
             made = new_problem(
                 folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
-                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, target=target, dh=dh,
+                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
             )  # fmt: skip
     document = {"written": [made.folder], "rows": made.rows, **made.understood.content(), "notes": made.notes}
@@ -539,9 +542,6 @@ def export(
     ur_kinematics: Annotated[
         File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")
     ] = None,
-    ur_calibration: Annotated[
-        File, Option(help="calibration.conf copied from a Universal Robot's controller; corrected file to --out.")
-    ] = None,
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
     mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
@@ -551,10 +551,6 @@ def export(
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
-    base: Annotated[
-        bool | None, Option(help="Make the URDF root the instrument's frame; default: if they nearly coincide.")
-    ] = None,
-    tool: Annotated[Choice, Option(help="Make the URDF tip the reflector; default: if they nearly coincide.")] = None,
     marker: Marker = None,
     despite_verdict: Despite = False,
 ) -> Answer:
@@ -566,9 +562,9 @@ def export(
         from rpim_opt.use.export import export_files
 
         written, notes = export_files(
-            loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration,
-            camera_info=camera_info, mdh=mdh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
-            base=base, tool=tool, marker=marker, despite_verdict=despite_verdict,
+            loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, camera_info=camera_info,
+            mdh=mdh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
+            marker=marker, despite_verdict=despite_verdict,
         )  # fmt: skip
     return Answer("\n".join(notes), {"notes": notes}, written=written)
 

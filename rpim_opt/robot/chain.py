@@ -14,7 +14,16 @@ import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame, frame_numbers, numeric_frame, numeric_link
+from rpim_opt.robot.kinematics import (
+    FRAME,
+    forward_kinematics,
+    frame,
+    frame_numbers,
+    numeric_frame,
+    numeric_link,
+    rotation_z,
+    translation,
+)
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.terms import Entry, Joint, Symbol, Term
 
@@ -22,8 +31,8 @@ NEAR_PARALLEL = 0.1
 """Axes nearer to parallel than this [rad] get Hayati's beta, as `identified.near_parallel` proposes."""
 ANOTHER_ARM = 0.1
 """A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
-ORIGIN, MOUNT = "origin_", "mount_"
-"""Prefixes of the parameters of joints that move, and of fixed joints at the ends of a chain."""
+ORIGIN, MOUNT, MIMIC = OF_JOINTS = "origin_", "mount_", "mimic_"
+"""Prefixes of the parameters of joints that move, of fixed joints at the ends of a chain, and of mimic joints."""
 ORIGIN_SCALES = {ORIGIN: 1.0, MOUNT: 10.0}
 """Prior standard deviations of their deviations [mm and mrad]."""
 SAME_PLACE = (0.01, 0.1)
@@ -244,11 +253,21 @@ class Origin(NamedTuple):
     up: bool  # whether the chain goes up through the joint
 
 
+class Mimic(NamedTuple):
+    """A row's joint that follows another: deviations of its multiplier and offset are parameters."""
+
+    prefix: str  # of its parameters, mimic_finger_joint_
+    multiplier: float
+    kind: str  # revolute or prismatic
+    frame: Array  # (4, 4) of the joint's axis z in the frame behind the row
+
+
 class Carried(NamedTuple):
-    """The origins after a row (from 1) of a robot's table, in order."""
+    """The origins after a row (from 1) of a robot's table, in order, and how its joint follows another."""
 
     row: int
     origins: tuple[Origin, ...]
+    mimics: tuple[Mimic, ...] = ()  # one, or none
 
 
 @dataclass(frozen=True, eq=False)
@@ -269,11 +288,15 @@ class Displaced(Term):
 def displaced(carried: Carried) -> Displaced:
     """Return the term of the origins after a row of the table, which displace the following frames in order.
 
-    With F the parent link's frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed
-    up by F D^-1 F^-1; D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx) is zero's identity.
+    A joint at m q + o moves further by the deviations of m, times q, and of o before them. With F the parent link's
+    frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed up by F D^-1 F^-1;
+    D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx) is zero's identity.
     """
     units = dict(zip(FRAME, ("mm",) * 3 + ("mrad",) * 3, strict=True))
     scales = {}
+    for mimic in carried.mimics:
+        unit = "mrad" if mimic.kind == "revolute" else "mm"
+        scales |= {f"{mimic.prefix}multiplier_ppm": 1000.0, f"{mimic.prefix}offset_{unit}": 1.0}
     for origin in carried.origins:
         scale = ORIGIN_SCALES[ORIGIN if origin.prefix.startswith(ORIGIN) else MOUNT]
         scales |= {f"{origin.prefix}{axis}_{unit}": scale for axis, unit in units.items()}
@@ -283,6 +306,10 @@ def displaced(carried: Carried) -> Displaced:
 def _moves(carried: Carried, link: Joint, *sizes: Symbol) -> Symbol:
     """Return the product of the displacements as six numbers."""
     T = ca.SX.eye(4)
+    for _, multiplier, kind, F in carried.mimics:
+        further = sizes[0] * link.q / multiplier + sizes[1]
+        T = F @ (rotation_z(further) if kind == "revolute" else translation(0, 0, further)) @ np.linalg.inv(F)
+    sizes = sizes[2 * len(carried.mimics) :]
     for k, (_, F, up) in enumerate(carried.origins):
         six = sizes[6 * k : 6 * k + 6]
         if not all(ca.SX(size).is_zero() for size in six):

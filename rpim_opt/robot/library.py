@@ -59,6 +59,8 @@ def read_arm(
         from rpim_opt.robot.formats.urdf import read_urdf
 
         return read_urdf(file, urdf_base, urdf_tip, origins)
+    if origins:
+        raise InputError("chain", f"a robot {file.name}", "a robot in a file .urdf")
     if file.suffix == ".csv":
         return read_sheet(file, convention)
     if convention:

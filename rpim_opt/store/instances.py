@@ -33,7 +33,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import together
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import starting_parameters
-from rpim_opt.robot.chain import MOUNT, ORIGIN
+from rpim_opt.robot.chain import OF_JOINTS
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store.problem_file import (
@@ -145,7 +145,7 @@ def load(
     (16, 9, 'Tikhonov')
     """
     stated = read_problem(name, variant, measurements, model, chain)
-    if stated.chains and chain is None:
+    if len(stated.chains) > 1 and chain is None:
         return _of_chains(stated, {each: load(name, variant, measurements, model, each) for each in stated.chains})
     table = stated.table
     path = stated.path
@@ -207,7 +207,7 @@ def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
     """Return the problem of several chains of one URDF: formulation, prior and record are the first one's."""
     count = Counter(name for part in parts.values() for name in part.problem.parameters.terms)
     several = tuple(name for name in count if count[name] > 1)
-    shared = [f"{prefix}*" for prefix in (ORIGIN, MOUNT) if any(name.startswith(prefix) for name in several)]
+    shared = [f"{prefix}*" for prefix in OF_JOINTS if any(name.startswith(prefix) for name in several)]
     more = stated.table.shared
     if isinstance(more, list):
         more = dict.fromkeys(parts, more)

@@ -7,13 +7,23 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, in_file
-from rpim_opt.basics.files import make_folder, read_text, scratch_folder, undoing, write_text
+from rpim_opt.basics.files import (
+    make_folder,
+    read_bytes,
+    read_text,
+    read_toml,
+    scratch_folder,
+    undoing,
+    write_bytes,
+    write_files,
+    write_text,
+)
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.units import UNITS
@@ -21,18 +31,26 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
+from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
-from rpim_opt.robot.chain import Described, placed, same_place
+from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, placed, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
+from rpim_opt.robot.formats.urdf import branching_tip, urdf_text
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import find_source, read_arm
 from rpim_opt.robot.mdh import MDH
+from rpim_opt.robot.parameters import frame_of
 from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
 
 IDENTIFICATION, VALIDATION, TARGET = "identification.csv", "validation.csv", "target.csv"
+ROBOT_OF_CHAINS = "robot.urdf"
 """Files of a new folder."""
+SHARED = (
+    "Chains share the joints that they have in common. What else is one and the same, `shared` in problem.toml says: "
+    '["base_*"] where one instrument measured several chains from one link, by chain { left = ["base_*"], ... }.'
+)
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 FARTHEST = 50.0
@@ -69,6 +87,7 @@ def new_problem(
     seed: int = 0,
     urdf_base: str | None = None,
     urdf_tip: str | None = None,
+    chain: str = "",
     target: str = "",
     dh: str = "",
     understood: Callable[[Understanding], None] | None = None,
@@ -78,13 +97,16 @@ def new_problem(
     Parameters
     ----------
     folder
-        A new one.
+        A new one; or one whose problem file has chains of the same URDF, for one more.
     robot, data, measurement, options, urdf_base, urdf_tip, dh
         As for `understand_tables`.
     validation
         A table of measurements for validation.
     hold_out, seed
         Instead of that, which part of the configurations to hold out, drawn at random.
+    chain
+        What to call the chain in a problem on the origins of a URDF's joints, ``[chain.NAME]``. One that goes up the
+        tree through joints that move and down again is such a problem, and called as its tip where nothing is stated.
     target
         What a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``.
     understood
@@ -104,33 +126,34 @@ def new_problem(
     {'identification.csv': 7, 'validation.csv': 2}
     """
     folder = Path(folder)
-    if folder.exists() or folder.is_symlink():
-        raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
+    source = find_source(robot)
+    before = _with_chains(folder, source.file, chain)
+    chain = chain or branching_tip(source.file, urdf_base, urdf_tip)
     options = options or TableOptions()
     if validation is not None and hold_out is not None:
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
-    source = find_source(robot)
-    arm = read_arm(source.file, urdf_base, urdf_tip, dh)
+    arm = read_arm(source.file, urdf_base, urdf_tip, dh, origins=bool(chain))
     paths = [data] if isinstance(data, str | Path) else data
     found = understand_of(arm, paths, measurement, options)
     if understood is not None:
         understood(found)
-    board = stated_target(target)
+    names = {name: f"{chain}_{name}" if chain else name for name in (IDENTIFICATION, VALIDATION, TARGET)}
+    board = stated_target(target, names[TARGET])
     kind, how = _kind(arm, found, board, measurement)
     noise = usual_noise(kind)
     notes = list(found.sentences)
-    rows = rows_of(found, board.under(found.columns), arm, kind)
+    rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
     columns = found.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
-    tables = {IDENTIFICATION: columns}
-    said = f'# validation = "{VALIDATION}"   # a table that is used for no choice; none was given'
+    tables = {names[IDENTIFICATION]: columns}
+    said = f'# validation = "{names[VALIDATION]}"   # a table that is used for no choice; none was given'
     if validation is not None:
         other = understand_of(arm, [validation], kind.name, found.options)
-        rows_of(other, board.under(other.columns), arm, kind)
-        tables[VALIDATION] = other.columns
+        rows_of(other, on_board(other.columns, board.board), arm, kind)
+        tables[names[VALIDATION]] = other.columns
         notes += other.sentences
-        said = f'validation = "{VALIDATION}"\n# from {Path(validation).name}; used for no choice'
+        said = f'validation = "{names[VALIDATION]}"\n# from {Path(validation).name}; used for no choice'
     elif hold_out is not None:
         known = len(np.unique(rows.configuration))
         if not 0 < hold_out < 1 or known < 2:
@@ -138,14 +161,22 @@ def new_problem(
             raise InputError("--hold-out", part, "a fraction between 0 and 1 of two or more configurations")
         drawn = rows.configurations(min(max(round(hold_out * known), 1), known - 1), seed)
         held = np.isin(rows.configuration, drawn.configuration)
-        tables = {IDENTIFICATION: _rows(columns, ~held), VALIDATION: _rows(columns, held)}
+        tables = {names[IDENTIFICATION]: _rows(columns, ~held), names[VALIDATION]: _rows(columns, held)}
         rows = rows.take(np.flatnonzero(~held))
-        said = f'validation = "{VALIDATION}"\nheld_out = true  # drawn with seed {seed}; used once they have validated'
+        said = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
     if board.table:
-        tables[TARGET] = board.table
+        tables[names[TARGET]] = board.table
+    links = [("urdf_base", urdf_base), ("urdf_tip", urdf_tip)]
+    followers = [f"{i}" for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading]
     context = {
+        "chain": chain,
+        "followers": ", ".join(followers),
+        "first": not before,
+        "links": [(key, toml(link)) for key, link in links if chain and link is not None],
+        "robot": ROBOT_OF_CHAINS if chain else "robot.toml",
+        "identification": names[IDENTIFICATION],
         "target": board.stated,
-        "drawing": source.origin,
+        "drawing": f"a copy of {source.file.name}" if chain else source.origin,
         "columns": how,
         "data": Path(found.file).name,
         "count": len(rows),
@@ -155,21 +186,47 @@ def new_problem(
     }
     with in_file(found.file):
         text, guessed = _problem_text(arm, kind, rows, noise, context)
-    # beside its place, and moved there when it is whole
-    with undoing() as parents, ExitStack() as stack:
-        make_folder(folder.parent, parents)
-        made = stack.enter_context(scratch_folder(folder)) / folder.name
-        write_text(made / "problem.toml", text)
-        for name, each in tables.items():
-            write_text(made / name, csv_text(each, zip(*each.values(), strict=True)))
-        if source.file.suffix == ".toml":
-            write_text(made / "robot.toml", read_text(source.file))  # with its comments
-        else:
-            write_robot(arm.robot, made / "robot.toml")
-        made.rename(folder)
+    contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
+    contents["problem.toml"] = before + text.encode()
+    with ExitStack() as stack:
+        if before:
+            write_files({folder / name: content for name, content in contents.items()})
+        else:  # beside its place, and moved there when it is whole
+            make_folder(folder.parent, stack.enter_context(undoing()))
+            made = stack.enter_context(scratch_folder(folder)) / folder.name
+            write_files({made / name: content for name, content in contents.items()})
+            if chain:
+                write_bytes(made / ROBOT_OF_CHAINS, urdf_text(source.file))
+            elif source.file.suffix == ".toml":
+                write_text(made / "robot.toml", read_text(source.file))  # with its comments
+            else:
+                write_robot(arm.robot, made / "robot.toml")
+            made.rename(folder)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     notes += [f"Measurement {kind.name}: {how}.", guessed]
+    if before:
+        notes.append(SHARED)
+    elif chain:
+        notes.append(
+            f"Chain '{chain}' identifies the URDF's own origins; {folder} takes another chain by --chain NAME."
+        )
     return Started(folder, counts, tuple(notes), replace(found, kind=kind))
+
+
+def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
+    """Return the problem file of a folder for one more chain; nothing where the folder is to be made."""
+    if chain and not NAME.fullmatch(chain):
+        raise InputError("--chain", f"'{chain}'", "a name of letters, digits and _")
+    if not folder.exists() and not folder.is_symlink():
+        return b""
+    known = read_toml(folder / "problem.toml").get("chain", {}) if chain and (folder / "problem.toml").is_file() else {}
+    if not known:
+        raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
+    if chain in known:
+        raise InputError("--chain", f"'{chain}', which is there", "a name of its own for every chain", folder)
+    if read_bytes(folder / ROBOT_OF_CHAINS) != urdf_text(robot):
+        raise InputError("the robot", f"another one than {ROBOT_OF_CHAINS}", "the same URDF for all chains", robot)
+    return read_bytes(folder / "problem.toml")
 
 
 def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
@@ -179,21 +236,16 @@ def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
 # --- what was measured, and the board that a camera sees ---------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class StatedTarget:
+class StatedTarget(NamedTuple):
     """A board: its points, the value of ``target`` in a problem file, and the table to write, if any."""
 
     board: Board
     stated: str
     table: Columns
 
-    def under(self, columns: Columns) -> Columns:
-        """Return the columns of a table of corners with the coordinates of their points; unchanged without a board."""
-        return on_board(columns, self.board) if self.board else columns
 
-
-def stated_target(text: str) -> StatedTarget:
-    """Return the board of ``--target``: a table, or columns, rows and spacing of a grid; empty without one."""
+def stated_target(text: str, file: str = TARGET) -> StatedTarget:
+    """Return the board of ``--target``: a table, called ``file`` in the folder, or a grid; empty without one."""
     if not text:
         return StatedTarget({}, "", {})
     match = GRID.fullmatch(text.strip())
@@ -207,7 +259,7 @@ def stated_target(text: str) -> StatedTarget:
     places = np.array(list(board.values())) * 1e3
     table = {"point": list(board)}
     table |= {f"{axis}_mm": [repr(float(v)) for v in column] for axis, column in zip("xyz", places.T, strict=True)}
-    return StatedTarget(board, f'target = "{TARGET}"', table)
+    return StatedTarget(board, f'target = "{file}"', table)
 
 
 def _kind(
@@ -224,7 +276,7 @@ def _kind(
     if measurement is not None:
         return kind, "as stated"
     if kind.by_camera:
-        return _camera(arm, target.under(found.columns))
+        return _camera(arm, on_board(found.columns, target.board))
     if not kind.touching:
         return kind, f"guessed from the columns {', '.join(kind.columns)}"
     column = next(name for name in kind.names if name in found.columns)
@@ -267,6 +319,8 @@ def _problem_text(
     base, how = _base(arm, rows, tools, kind)
     parameters = starting_parameters(arm.robot, rows, base, tools)
     names = list(identifiable("auto", arm.robot, parameters, rows))
+    if context["chain"] and markers == [""]:
+        names = _at_links(names, carried_by(arm.robot.model.terms), base is not None)
     lenses = starting_cameras(rows, {})
     cameras = []
     for fixture in sorted({block.fixture for block in camera_blocks(rows)}):
@@ -296,6 +350,22 @@ def _problem_text(
     return text, how
 
 
+def _at_links(names: Sequence[str], carried: Sequence[Carried], at_base: bool) -> list[str]:
+    """Return parameters of a chain with those of fixed joints at its ends, which a URDF holds, for base and tool.
+
+    A base that is the chain's first link is no parameter where no fixed joint holds it: the next origin is the same.
+    """
+    mounts = {
+        origin.up: origin.prefix for part in carried for origin in part.origins if origin.prefix.startswith(MOUNT)
+    }
+    instead = {"tool_": mounts.get(False, "tool_")}
+    if at_base:
+        instead["base_"] = mounts.get(True, "")
+    found = [(frame_of(name), name.rpartition("_")[2], name) for name in names]
+    moved = [(instead.get(frame, frame), axis, name) for frame, axis, name in found]
+    return [name if frame == frame_of(name) else frame + axis for frame, axis, name in moved if frame]
+
+
 def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
     rows = posed(rows, starting_cameras(rows, {}))
@@ -313,9 +383,9 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:
     """Return names with those of one column of all joints, of a whole frame, of a frame's place as patterns."""
-    groups: dict[str, list[str]] = {}
+    groups: dict[str, list[str]] = {f"{ORIGIN}*": [name for name in names if name.startswith(ORIGIN)]}
     if dof < 10:  # a question mark stands for one digit
-        groups = {f"{column}?": [f"{column}{i}" for i in range(1, dof + 1)] for column in MDH}
+        groups |= {f"{column}?": [f"{column}{i}" for i in range(1, dof + 1)] for column in MDH}
     for prefix in dict.fromkeys(name[: name.rindex("_") + 1] for name in names if "_" in name):
         groups[f"{prefix}*"] = [prefix + c for c in FRAME]
         groups[f"{prefix}[xyz]"] = [prefix + c for c in FRAME[:3]]
@@ -323,7 +393,7 @@ def _patterns(names: Sequence[str], dof: int) -> list[str]:
     left = list(names)
     patterns = []
     for pattern, members in groups.items():
-        if set(members) <= set(left):
+        if members and set(members) <= set(left):
             left = [name for name in left if name not in members]
             patterns.append(pattern)
     return [*patterns, *left]

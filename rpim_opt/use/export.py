@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -29,12 +29,12 @@ from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.record import Requirement
-from rpim_opt.robot.chain import MOUNT, ORIGIN, Described, placed, same_place
+from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
-from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
+from rpim_opt.robot.formats.universal_robots import write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
-from rpim_opt.robot.parameters import frame_of, of_term, own_name, reflectors, tool_prefix
+from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
@@ -65,6 +65,9 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     """
     p = result.problem.parameters
     of = dict(zip(p.names, parameter_values(result.problem, result.x), strict=True))
+    joint_map = result.robot.joint_map.copy()
+    for i in set(range(len(joint_map))) - set(result.robot.leading):  # of joints that follow others the multipliers
+        joint_map[i] *= 1 + of.pop(f"ratio{i + 1}")
     extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
     if extras:
         accepted = "MDH parameters, base and tool: files support nothing else; use `compensate` for other parameters"
@@ -74,7 +77,7 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
     base = np.array([of["base_" + c] for c in FRAME])
     tool = np.array([of[prefix + c] for c in FRAME])
-    return Described(result.robot, base, tool)
+    return Described(replace(result.robot, joint_map=joint_map), base, tool)
 
 
 def export_files(
@@ -83,7 +86,6 @@ def export_files(
     *,
     urdf: Path | None = None,
     ur_kinematics: Path | None = None,
-    ur_calibration: Path | None = None,
     camera_info: Path | None = None,
     mdh: Path | None = None,
     robodk: Path | None = None,
@@ -102,9 +104,9 @@ def export_files(
         The calibration.
     out
         Where to write what corrects a file; of several the folder.
-    urdf, ur_kinematics, ur_calibration, camera_info
-        Files of the nominal robot to correct: a URDF, ``kinematics.yaml`` of ROS and ``calibration.conf`` of a
-        Universal Robot, a camera's YAML of ROS (``camera_info_url``).
+    urdf, ur_kinematics, camera_info
+        Files of the nominal robot to correct: a URDF, ``kinematics.yaml`` of ROS for a Universal Robot, a camera's YAML
+        of ROS (``camera_info_url``).
     mdh, robodk
         Files to write: MDH parameters (.csv, .json, .toml), RoboDK's four numbers a joint (.csv).
     corrections
@@ -116,7 +118,7 @@ def export_files(
     despite_verdict
         Write a robot that is not delivered, too, with a note in every file.
     frames
-        ``root``, ``tip``, ``base`` and ``tool`` of `export_urdf`.
+        ``root`` and ``tip`` of `export_urdf`.
 
     Returns
     -------
@@ -136,7 +138,6 @@ def export_files(
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
         (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, marker).robot, target)),
-        (ur_calibration, lambda source, target: export_ur_calibration(result, source, target)),
         (camera_info, partial(export_camera, result)),
     ]
     sources = [(source, write) for source, write in corrected if source]
@@ -157,9 +158,7 @@ def export_files(
     ]
     writers += [(target, write) for target, write in plain if target]
     if not writers:
-        accepted = (
-            "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections, one or several"
-        )
+        accepted = "--urdf, --ur-kinematics, --camera-info, --mdh, --robodk, --corrections, one or several"
         raise InputError("export", "nothing to write", accepted)
     said = write_all(writers, note)
     requirement = whole.record.requirement
@@ -238,8 +237,6 @@ def export_urdf(
     target: str | Path,
     root: str | None = None,
     tip: str | None = None,
-    base: bool | None = None,
-    tool: bool | None = None,
     marker: str | None = None,
     despite_verdict: bool = False,
 ) -> list[str]:
@@ -258,8 +255,6 @@ def export_urdf(
         The original, and where to write.
     root, tip
         Names of the links between which the robot is, as for `read_urdf`.
-    base, tool
-        Whether to write the base and the tool, instead of that rule.
     marker
         The reflector that is the tip. Of several none is, unless it is named.
     despite_verdict
@@ -280,28 +275,24 @@ def export_urdf(
     np.float64(0.001)
     """
     note = result.verdict.require(despite_verdict)
-    names = map(own_name, result.problem.parameters.free.names)
-    of = {name: x for name, x in zip(names, result.x, strict=True) if name.startswith((ORIGIN, MOUNT))}
-    if of:
-        prefixes = {frame_of(name) for name in of}
-        origins = {prefix: np.array([of.get(prefix + axis, 0.0) for axis in FRAME]) for prefix in prefixes}
-        return write_all([(Path(target), lambda path: write_origins(source, origins, path))], note)
+    of = {own_name(name): x for name, x in zip(result.problem.parameters.free.names, result.x, strict=True)}
+    if any(name.startswith(OF_JOINTS) for name in of):
+        return write_all([(Path(target), partial(_write_tree, result, of, source))], note)
     arm = identified(result, marker)
     own = read_urdf(source, root, tip)
-    names = result.problem.parameters.names
-    if marker is None and tool is None and len(reflectors(names)) > 1:
-        tool = False
+    p = result.problem.parameters
+    no_tip = marker is None and len(reflectors(p.names)) > 1
     root_at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
     reflector_at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
     written: list[Array | None] = []
     notes = []
-    for name, link, stated, where, there in (
-        ("base", "root", base, "the instrument's frame", f"the instrument's frame it is at {root_at}"),
-        ("tool", "tip", tool, "the DH table's flange frame", f"its frame the reflector is at {reflector_at}"),
+    for name, link, where, there in (
+        ("base", "root", "the instrument's frame", f"the instrument's frame it is at {root_at}"),
+        ("tool", "tip", "the DH table's flange frame", f"its frame the reflector is at {reflector_at}"),
     ):
         place = getattr(arm, name)
-        free = any(each.startswith(f"{name}_") for each in result.problem.parameters.free.names)
-        moves = (free and same_place(place, getattr(own, name))) if stated is None else stated
+        free = any(each.startswith(f"{name}_") for each in p.free.names)
+        moves = free and same_place(place, getattr(own, name)) and not (no_tip and name == "tool")
         written.append(place if moves else None)
         if moves:
             notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)} in {where}.")
@@ -315,24 +306,22 @@ def export_urdf(
     return write_all([(Path(target), write)], note)
 
 
-def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
-    """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
-    robot = identified(result).robot
-    nominal = result.problem.robot
-    if np.abs(nominal.mdh[0, :2]).max() > 0:
-        raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
-    mdh = robot.mdh.copy()
-    mdh[0, :2] = 0.0
-    write_ur_calibration(source, replace(robot, mdh=mdh), nominal, target)
-    notes = []
-    if b"joint_checksum" in read_bytes(Path(source)):
-        notes.append(
-            "joint_checksum stands as in the source: its algorithm is not published, so a controller may refuse "
-            "the file. Keep the original."
-        )
-    if not np.array_equal(mdh, robot.mdh):
-        notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
-    return notes
+def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path, target: Path) -> list[str]:
+    """Write the origins of the joints of all chains, from deviations by the joints' own names."""
+    p = result.problem.parameters
+    others = [
+        name for name, x in zip(p.free.names, result.x, strict=True) if x and not own_name(name).startswith(OF_JOINTS)
+    ]
+    refused = [name for name in others if of_joint(name) or name in p.terms]
+    if refused:
+        raise InputError("the calibration", listed(refused, 6), "origins and multipliers: a URDF holds nothing else")
+    parts: dict[str, Array] = {}
+    for prefix in {frame_of(name) for name in of if name.startswith(OF_JOINTS)}:
+        parts_of = ("multiplier", "offset") if prefix.startswith(MIMIC) else FRAME
+        parts[prefix] = np.array([of.get(prefix + part, 0.0) for part in parts_of])
+    write_origins(source, parts, target)
+    frames = sorted({own_name(name).partition("_")[0] for name in others})
+    return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []
 
 
 def export_camera(result: Calibration, source: str | Path, target: str | Path) -> list[str]:

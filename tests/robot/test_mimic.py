@@ -105,3 +105,18 @@ def test_a_joint_that_nobody_recorded_is_stated(tmp_path: Path, monkeypatch: pyt
     instance = ro.load("cell")
     assert np.allclose(instance.problem.data.q, q, atol=1e-9)
     assert 'constants = "slide [m]=0.15"' in Path("cell/problem.toml").read_text()
+
+
+def test_a_ready_robots_joint_by_the_name_of_its_driver_is_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Where one of a driver's joints is not there, the others are said to lack it; stated, all of them are known."""
+    monkeypatch.chdir(tmp_path)
+    rows = [",".join([*(f"iiwa_joint_{i} [deg]" for i in (1, 2, 4, 5, 6, 7)), "x_mm", "y_mm", "z_mm"])]
+    rows += [",".join(map(str, row)) for row in np.random.default_rng(0).uniform(-50, 50, (9, 9)).tolist()]
+    Path("table.csv").write_text("\n".join(rows) + "\n")
+    new = ["new", "cell", "--robot", "iiwa7", "--data", "table.csv", "--dry-run"]
+    assert run(monkeypatch, *new) == 2
+    assert "--constants" in capsys.readouterr().err
+    assert run(monkeypatch, *new, "--constants", "iiwa_joint_3 [deg]=20") == 0
+    assert "q3_deg" in capsys.readouterr().out

@@ -13,10 +13,10 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.problem.blocks import PartitionedProblem
 from rpim_opt.problem.noise import Scatter
-from rpim_opt.use.export import export_ur_calibration, export_urdf, write_all
+from rpim_opt.use.export import export_urdf, write_all
 from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.recalibration import Cause, Moved
-from tests.simulate import ARM, simulated
+from tests.simulate import simulated
 
 
 @cache
@@ -197,12 +197,7 @@ def test_approaches_with_other_columns() -> None:
 # --- files ---------------------------------------------------------------------------------------------------------
 
 
-def test_files_of_controllers_are_for_robots_that_have_them(tmp_path: Path) -> None:
-    problem, _ = simulated(("theta[23]",), 5, robot=ro.robot.Robot("bent", np.add(ARM.mdh, [0.1, 0, 0, 0, 0])))
-    with pytest.raises(
-        ro.InputError, match="alpha1 or a1 that are not zero, accepted: a ready robot of Universal Robots"
-    ):
-        export_ur_calibration(ro.calibrate(problem, weight=1.0), tmp_path / "none.conf", tmp_path / "out.conf")
+def test_a_urdf_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match=r"none\.urdf"):
         export_urdf(calibrated(), tmp_path / "none.urdf", tmp_path / "out.urdf")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -57,7 +58,7 @@ def random_tree(seed: int) -> tuple[str, list[str]]:
 
 
 def with_errors(path: Path, target: Path, seed: int) -> None:
-    """Write the file with errors of 1 mm and 1 mrad in the origin of every joint that moves."""
+    """Write the file with errors of 1 mm and 1 mrad in the origin of every joint that moves, and in multipliers."""
     rng = np.random.default_rng([seed, 2])
     tree = ElementTree.parse(path)
     for joint in tree.getroot().findall("joint"):
@@ -68,6 +69,9 @@ def with_errors(path: Path, target: Path, seed: int) -> None:
         six = frame_numbers(numeric_frame(1e-3 * rng.normal(size=6)) @ numeric_frame(place))
         origin.set("xyz", text(six[:3]))
         origin.set("rpy", text(six[3:]))
+        mimic = joint.find("mimic")
+        if mimic is not None:
+            mimic.set("multiplier", repr(float(mimic.get("multiplier")) + 1e-3 * float(rng.normal())))
     tree.write(target)
 
 
@@ -112,6 +116,8 @@ def test_a_tree_is_calibrated_as_a_whole_and_written_into_one_file(
         ]
         Path(f"{name}.csv").write_text("\n".join(rows) + "\n")
         lines += [f"[chain.{name}]", f'urdf_base = "{base}"', f'urdf_tip = "{tip}"', f'identification = "{name}.csv"']
+        if any(term.startswith("mimic_") for term in arm.robot.model.names(arm.robot.joint_types)):
+            lines.append('identify = ["origin_*", "mimic_*"]')
     Path("problem.toml").write_text("\n".join(lines) + "\n")
 
     result = ro.load(".").calibrate()
@@ -254,3 +260,122 @@ def test_joints_whose_parameters_would_have_one_name_are_refused(tmp_path: Path)
     (tmp_path / "arm.urdf").write_text(f'<robot name="arm">{links}{joints}</robot>')
     with pytest.raises(ro.InputError, match=r"the parameters origin_arm_1_\* of joint 'arm-1', too"):
         ro.read_urdf(tmp_path / "arm.urdf", origins=True)
+
+
+JOINT = (
+    '<joint name="{}" type="{}"><parent link="{}"/><child link="{}"/>'
+    '<origin xyz="{}" rpy="{}"/><axis xyz="0 0 1"/>{}</joint>'
+)
+
+
+def two_arms() -> str:
+    """Return two arms on a torso, whose first axes are one line, each with a fourth joint that follows its second."""
+    joints, links = [JOINT.format("torso", "revolute", "base", "chest", "0 0 0.9", "0 0 0", "")], ["base", "chest"]
+    for side, y in (("left", 0.2), ("right", -0.2)):
+        above = "chest"
+        for i, place in enumerate([f"0 {y} 0.3", "0 0 0.1", "0 0.3 0", "0 0 0.05", "0 0.3 0", "0 0 0.15"], start=1):
+            links.append(f"{side}_{i}")
+            kind, tilt = ("fixed", 0) if i == 6 else ("revolute", np.sign(y) * np.pi / 2 * (-1) ** i)
+            follows = f'<mimic joint="{side}_joint_2" multiplier="-0.5" offset="0.1"/>' if i == 4 else ""
+            joints.append(JOINT.format(f"{side}_joint_{i}", kind, above, links[-1], place, f"{tilt} 0 0", follows))
+            above = links[-1]
+    return f'<robot name="two arms">{"".join(f"<link name={n!r}/>" for n in links)}{"".join(joints)}</robot>'
+
+
+def raw_table(name: str, base: str, tip: str, seed: int) -> None:
+    """Write what a person measures of a chain of true.urdf, by the names of the joints [deg], [mm]."""
+    rng = np.random.default_rng(seed)
+    names = ro.read_urdf("arms.urdf", base, tip).names
+    q = rng.uniform(-1.5, 1.5, (60, len(names)))
+    y = between_links(Path("true.urdf"), names, base, tip, q)[:, :3, 3] + SIGMA * rng.normal(size=(60, 3))
+    rows = [",".join(["Point", *(f"{joint} [deg]" for joint in names), "X [mm]", "Y [mm]", "Z [mm]"])]
+    for i, row in enumerate(np.hstack([np.degrees(q), 1e3 * y]).tolist()):
+        rows.append(",".join([f"P{i}", *map(repr, row)]))
+    Path(f"{name}.csv").write_text("\n".join(rows) + "\n")
+
+
+def off(tip: str, base: str, file: str) -> float:
+    """Return the position error of a file [m, RMS], in the frame of the base link."""
+    names = ro.read_urdf("arms.urdf", base, tip).names
+    q = np.random.default_rng(9).uniform(-1.5, 1.5, (300, len(names)))
+    p, true = (between_links(Path(each), names, base, tip, q)[:, :3, 3] for each in (file, "true.urdf"))
+    return float(np.sqrt(np.mean((p - true) ** 2)))
+
+
+def test_new_makes_a_tree_chain_by_chain(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """One arm's hand sees the other's, through axes that are one line; a tracker sees both; one file has it all."""
+    monkeypatch.chdir(tmp_path)
+    Path("arms.urdf").write_text(two_arms())
+    with_errors(Path("arms.urdf"), Path("true.urdf"), 5)
+    arms = ["--robot", "arms.urdf"]
+    raw_table("meet", "left_6", "right_6", 1)
+    made = ["new", "hands", *arms, "--data", "meet.csv", "--urdf-base", "left_6", "--urdf-tip", "right_6"]
+    assert run(monkeypatch, *made, "--hold-out", "0.2") == 0
+    assert "[chain.to_right_6]" in Path("hands/problem.toml").read_text()
+    assert run(monkeypatch, "calibrate", "hands", "--model", "geometry", "--out", "hands") == 0
+    assert run(monkeypatch, "export", "hands", "--urdf", "arms.urdf", "--out", "hands.urdf") == 0
+    assert off("right_6", "left_6", "hands.urdf") < 0.1 * off("right_6", "left_6", "arms.urdf")
+
+    for i, side in enumerate(("left", "right")):
+        raw_table(side, "base", f"{side}_6", i)
+        more = [*arms, "--data", f"{side}.csv", "--urdf-tip", f"{side}_6", "--chain", side]
+        assert run(monkeypatch, "new", "cell", *more) == 0
+        text = Path("cell/problem.toml").read_text()
+        mimic = text.replace('identify = ["origin_*", ', 'identify = ["origin_*", "mimic_*", ')
+        Path("cell/problem.toml").write_text(mimic)
+    Path("cell/problem.toml").write_text(mimic.replace("shared = []", 'shared = ["base_*"]'))
+    assert "shared" in capsys.readouterr().out
+    parameters = ro.load("cell").problem.parameters
+    shown = {"left.mount_left_joint_6_x", "origin_torso_x", "left.mimic_left_joint_4_multiplier"}
+    assert shown <= set(parameters.free.names)
+    assert "base_x" in parameters.names
+    assert run(monkeypatch, "calibrate", "cell", "--model", "geometry", "--out", "cell") == 0
+    assert run(monkeypatch, "export", "cell", "--urdf", "arms.urdf", "--out", "cell.urdf") == 0
+    assert off("left_6", "base", "cell.urdf") < 0.05 * off("left_6", "base", "arms.urdf")
+
+    before = Path("cell/problem.toml").read_bytes()
+    Path("other.urdf").write_text(two_arms().replace("0.9", "0.8"))
+    for options, said in (
+        ([*made[2:], "--chain", "left"], "'left', which is there"),
+        (made[2:], "nothing is overwritten"),
+        ([*made[2:], "--chain", "a.b"], "letters, digits and _"),
+        ([*made[2:4], "--chain", "c", *made[4:], "--robot", "other.urdf"], "the same URDF"),
+        (["--robot", "ur5e", "--data", "meet.csv", "--chain", "c"], "robot.urdf"),
+    ):
+        assert run(monkeypatch, "new", "cell", *options) == 2
+        assert said in capsys.readouterr().err
+    assert run(monkeypatch, "new", "ready", "--robot", "ur5e", "--data", "meet.csv", "--chain", "c") == 2
+    assert Path("cell/problem.toml").read_bytes() == before
+
+
+@pytest.mark.parametrize("chain", [False, True])
+def test_multipliers_of_joints_that_follow_are_identified(
+    chain: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As ratio of the table's row, or by the joint's name: the file's multiplier is what moved the joint."""
+    monkeypatch.chdir(tmp_path)
+    Path("arms.urdf").write_text(two_arms())
+    Path("true.urdf").write_text(two_arms().replace("-0.5", "-0.49"))
+    raw_table("left", "chest", "left_6", 3)
+    options = ["--robot", "arms.urdf", "--data", "left.csv", "--urdf-base", "chest", "--urdf-tip", "left_6"]
+    assert run(monkeypatch, "new", "arm", *options, *(["--chain", "left"] if chain else [])) == 0
+    text = Path("arm/problem.toml").read_text()
+    wanted = '["mimic_*"]' if chain else '["ratio4"]'
+    start = text.rindex("identify = ")
+    Path("arm/problem.toml").write_text(text[:start] + f"identify = {wanted}\n" + text[text.index("\n", start) :])
+    assert chain or "Joints 4 follow others" in text
+    assert run(monkeypatch, "calibrate", "arm", "--model", "geometry", "--out", "arm") == 0
+    assert run(monkeypatch, "export", "arm", "--urdf", "arms.urdf", "--out", "new.urdf", *options[4:]) == 0
+    assert off("left_6", "chest", "new.urdf") < 1e-4 < 1e-3 < off("left_6", "chest", "arms.urdf")
+    multipliers = [float(each.get("multiplier")) for each in ElementTree.parse("new.urdf").getroot().iter("mimic")]
+    assert multipliers == [pytest.approx(-0.49, abs=1e-3), -0.5]
+
+
+def test_what_a_urdf_does_not_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder(monkeypatch, tmp_path, 'identify = ["origin_*", "ratio1"]')
+    result = ro.calibrate(ro.load(".").problem, ro.tikhonov, weight=1.0)
+    moved = replace(result, x=np.full(len(result.x), 1e-6))
+    with pytest.raises(ro.InputError, match=r"found left.ratio1, .*accepted: origins and multipliers"):
+        ro.use.export_urdf(moved, "robot.urdf", "new.urdf", despite_verdict=True)

@@ -201,7 +201,9 @@ def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: 
 
 
 def on_board(table: Columns, board: Board) -> Columns:
-    """Return the columns of a table of corners, including point, and the points of one or several boards."""
+    """Return the columns of a table of corners, including point, and the points of the board, if there is one."""
+    if not board:
+        return table
     own = [name for name in table if split_unit(name)[0] in TARGET]
     if own:
         raise InputError("the header", f"column '{own[0]}' beside a target", "one of them")

@@ -96,9 +96,11 @@ def understand(
         raise InputError("--rotation", f"'{options.rotation}'", accepted)
     known = number_columns(robot, kind)
     read, rotation = _readings(raw, robot, kind, options, joints, targets)
-    if options.constants and any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
-        raw = raw.with_constants(options.constants)  # of several files that with the joints
-        read, rotation = _readings(raw, robot, kind, options, joints, targets)
+    if options.constants:
+        more = raw.with_constants(options.constants)
+        found = _readings(more, robot, kind, options, joints, targets)
+        if any(re.fullmatch(r"q\d+", found[0][name].stem) for name in raw.columns):  # the file with the joints
+            raw, (read, rotation) = more, found
     rotation = options.rotation or rotation
     columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
@@ -260,8 +262,12 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     whole = {}
     for prefix, each in found.items():
         counted = each | _from_one(each, len(wanted))
-        if wanted <= {known.stem for known in counted.values()} and stated.strip(" ._/:-") in ("", prefix):
+        missing = sorted(wanted - {known.stem for known in counted.values()})
+        if not missing and stated.strip(" ._/:-") in ("", prefix):
             whole[prefix] = counted
+        elif len(missing) < len(wanted) / 2:  # is it one that did not move
+            why = f"of {prefix}, which has no {', '.join(missing)}: --constants"
+            read.update({name: Reading("", "", why) for name in each})
     if len(whole) > 1:
         raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix with the one that was measured")
     return next(iter(whole.values()), {})

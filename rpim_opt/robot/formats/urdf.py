@@ -25,6 +25,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import read_bytes, write_bytes
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
+    MIMIC,
     MOUNT,
     ORIGIN,
     ROUNDING,
@@ -33,6 +34,7 @@ from rpim_opt.robot.chain import (
     Chain,
     Described,
     Displaced,
+    Mimic,
     Origin,
     corrected,
     describe,
@@ -115,6 +117,15 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), names)
 
 
+def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
+    """Return a name for the chain between two links that goes up through joints that move; nothing for another one."""
+    if path.suffix not in (".urdf", XACRO):
+        return ""
+    steps = _read(path).steps_between(base, tip)
+    up = any(step.up and step.joint.kind for step in steps)
+    return re.sub(r"\W", "_", f"to_{steps[-1].end}") if up else ""
+
+
 def write_urdf(
     source: str | Path,
     robot: Robot,
@@ -140,12 +151,16 @@ def write_urdf(
     way = _Way(urdf, urdf.steps_between(base, tip))
     table, T_base, T_tool, G = describe(way.chain)
     joints, _, joint_map, offsets = way.followed
+    edits: dict[tuple[int, int], str] = {}
+    for joint, old, new in zip(joints, joint_map, robot.joint_map, strict=False):
+        if joint in urdf.followers().values() and not np.array_equal(old, new):
+            old[old != 0] = new[old != 0]  # the multiplier, and zeros
+            edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
     require_same_arm(robot, table + offsets, tuple(joint.kind for joint in joints), urdf.path, joint_map)
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
     origins, tail = corrected(G, robot.mdh - offsets, T_base, T_tool)
     size = reach(robot.mdh, T_base, T_tool)
-    edits: dict[tuple[int, int], str] = {}
     before = [*way.chain.origins, way.chain.tail]
     for between, old, new in zip(way.parts, before, [*origins, tail], strict=True):
         if between:  # one origin takes the whole correction
@@ -166,18 +181,24 @@ def write_urdf(
 
 
 def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
-    """Write a URDF file with displaced origins, every other byte as in the original.
+    """Write a URDF file with displaced origins and other multipliers, every other byte as in the original.
 
     ``deviations`` are six numbers each [m, rad], by the prefix of the parameters, ``origin_{joint}_``: x, y, z, roll,
-    pitch, yaw in the parent link's frame of what comes before the origin. Prefixes that no joint has are refused.
+    pitch, yaw in the parent link's frame of what comes before the origin; of mimic joints, ``mimic_{joint}_``, two:
+    multiplier and offset. Prefixes that no joint has are refused.
     """
     urdf = _read(Path(source))
     edits: dict[tuple[int, int], str] = {}
-    known = urdf.prefixes()
+    known = {**urdf.prefixes(), **urdf.followers()}
     for prefix, six in deviations.items():
         if prefix not in known:
             raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known), urdf.path)
         joint = known[prefix]
+        if joint.mimic and prefix.startswith(MIMIC):
+            values = np.array(joint.mimic[1:]) + six
+            multiplier, offset = map(repr, values.tolist())
+            edits |= joint.edits(urdf.data, "mimic", {"multiplier": multiplier, "offset": offset})
+            continue
         T = numeric_frame(six) @ joint.origin
         edits |= joint.origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
     write_bytes(Path(target), spliced(urdf.data, edits))
@@ -263,16 +284,22 @@ def _taker(part: Sequence[_Step]) -> int:
 def _displacements(way: _Way, table: Array, G: Array) -> list[Displaced]:
     """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
     terms = []
+    followers = {joint: prefix for prefix, joint in way.urdf.followers().items()}
     for row, part in enumerate(way.parts, start=1):
-        F = numeric_link(beta=-table[row - 1, 4]) @ G[row - 1]
+        axis = numeric_link(beta=-table[row - 1, 4])
+        F = axis @ G[row - 1]
+        joint = way.followed[0][row - 2] if row > 1 else None  # the first row has none
+        mimics = (
+            [Mimic(followers[joint], joint.mimic[1], joint.kind, axis)] if joint in followers and joint.mimic else []
+        )
         taker = _taker(part)
         origins = []
         for i, step in enumerate(part):
             before, F = F, F @ step.constant
             if step.joint.kind or i == taker:
                 origins.append(Origin(step.joint.prefix, F if step.up else before, step.up))
-        if origins:
-            terms.append(displaced(Carried(row, tuple(origins))))
+        if origins or mimics:
+            terms.append(displaced(Carried(row, tuple(origins), tuple(mimics))))
     return terms
 
 
@@ -346,7 +373,7 @@ class _Joint:
     @property
     def prefix(self) -> str:
         """Of the parameters of its origin: ``origin_torso_1_joint_``, of a fixed joint ``mount_..``."""
-        return f"{ORIGIN if self.kind else MOUNT}{re.sub(r'[^0-9A-Za-z]+', '_', self.name)}_"
+        return f"{ORIGIN if self.kind else MOUNT}{_plain(self.name)}_"
 
     @property
     def mimic(self) -> tuple[str, float, float] | None:
@@ -387,22 +414,29 @@ class _Joint:
     def origin_edits(self, data: bytes, T: Array, size: float) -> dict[tuple[int, int], str]:
         """Return what to replace in the file so that the origin becomes T, by first and last byte."""
         texts = zip(("xyz", "rpy"), origin_numbers(T, self.origin, size), strict=True)
-        new = {name: text for name, text in texts if text is not None}
+        return self.edits(data, "origin", {name: text for name, text in texts if text is not None})
+
+    def edits(self, data: bytes, tag: str, new: dict[str, str]) -> dict[tuple[int, int], str]:
+        """Return what to replace in the file so that an element has these attributes; it is put in where it is not."""
         if not new:
             return {}
-        element = self._only("origin")
+        element = self._only(tag)
         if element is None:
             end = _tag_end(data, self.element.start)
-            return {(end, end): f"<origin{_attributes(new)}/>"}
+            return {(end, end): f"<{tag}{_attributes(new)}/>"}
         edits = {}
         for match in ATTRIBUTE.finditer(data, element.start, _tag_end(data, element.start)):
             text = new.pop(match[1].decode(errors="replace"), None)
             if text is not None:
                 edits[match.start(2) + 1, match.end(2) - 1] = text
         if new:
-            after_name = element.start + len("<origin")
+            after_name = element.start + len(f"<{tag}")
             edits[after_name, after_name] = _attributes(new)
         return edits
+
+
+def _plain(name: str) -> str:
+    return re.sub(r"[^0-9A-Za-z]+", "_", name)
 
 
 def _numbers(text: str, count: int, largest: float = LARGEST_NUMBER) -> Array | None:
@@ -442,6 +476,13 @@ class _Urdf:
                 found = f"the parameters {joint.prefix}* of joint '{other.name}', too"
                 raise joint.error("name", found, "names that differ in letters or digits")
         return known
+
+    def followers(self) -> dict[str, _Joint]:
+        """Return the joints that follow one that moves on its own, and that none follows, by their prefixes."""
+        found = {joint.name: joint.element.find("mimic") for joint in self.joints.values()}
+        following = {name: mimic.get("joint", "") for name, mimic in found.items() if mimic is not None}
+        ends = [name for name, led in following.items() if led not in following and name not in following.values()]
+        return {f"{MIMIC}{_plain(name)}_": self.joints[name] for name in ends}
 
     def steps_between(self, base: str | None, tip: str | None) -> list[_Step]:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
@@ -501,7 +542,7 @@ class _Urdf:
 
 def _read(path: Path) -> _Urdf:
     """Return the tree of links and joints of a file."""
-    data = _urdf_text(path)
+    data = urdf_text(path)
     root = _root_element(data, path)
     if root.tag != "robot":
         raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF", path)
@@ -572,7 +613,7 @@ def _root_element(data: bytes, path: Path) -> _Element:
     return top[0]
 
 
-def _urdf_text(path: Path) -> bytes:
+def urdf_text(path: Path) -> bytes:
     """Return the content of a URDF file, or what a xacro file says with its own defaults.
 
     Expressions are carried out and other files included: problem folders, which may be untrusted, name no xacro.
