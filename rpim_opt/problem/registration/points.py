@@ -198,7 +198,7 @@ def fit_arms(
     where ``robust``, otherwise they are one; ``noise`` is the error of a point [m].
     """
     B = len(candidates.y)
-    columns = 3 + 3 * len(candidates.stated) + zeros * robot.dof
+    columns = 3 + 3 * len(candidates.stated) + zeros * len(robot.mdh)
     parts = np.array_split(np.arange(B), 1 + B * candidates.q.shape[1] * 3 * columns // LARGEST_BATCH)
     fits = [_fitted(robot, candidates.take(some), steps, zeros, robust, noise) for some in parts]
     return Fit(*(np.concatenate(each) for each in zip(*fits, strict=True)))
@@ -296,7 +296,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
 
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
-    columns = size + zeros * robot.dof
+    columns = size + zeros * len(robot.mdh)
     quiet = 0
     for k in range(steps):
         if robust and k % 2 == 0:
