@@ -19,14 +19,13 @@ from rpim_opt.problem.diagnosis import (
     exchanged_rows,
     left_out_together,
     mixed_reflectors,
-    moved,
     moved_far,
     odd_columns,
     part_way,
     rounded,
     rows_without_values,
     shared_rows,
-    transmission,
+    shown_by_residuals,
     unrelated_rows,
 )
 from rpim_opt.problem.misreadings import Better, better_reading, lost_row
@@ -133,14 +132,13 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if better is not None:
         return [*rows_without_values(problem), better.sentence]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
-    found = found or list(moved(problem, result.x))
     if not found:
         alone, x = problem, result.x
         if result.learned is not None and result.learned.added:  # curves take up ratios and scales of all kinds
             p = problem.parameters
             alone = problem.identifying(p.identified & ~np.isin(p.names, result.learned.added))
             x = settled(alone)
-        found = list(transmission(alone, x))
+        found = list(shown_by_residuals(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, product
+from itertools import combinations, combinations_with_replacement, product
 from typing import Any
 
 import numpy as np
@@ -28,7 +28,6 @@ from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.points import lengths_of, points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
-from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
@@ -268,7 +267,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     else:
         warnings += exchanged_rows(problem)
         there = np.array([own.get(name, 0.0) for name in names])
-        warnings += list(moved_far(problem)) or moved(whole, there)
+        warnings += list(moved_far(problem)) or shown_by_residuals(whole, there, transmission=False)
     return Inspection(
         problem=problem,
         residual=residual,
@@ -703,58 +702,103 @@ def _added(model: LinearModel, x: Array, columns: Sequence[Array]) -> tuple[int,
     return best, steps[best], float(np.sqrt(left / whole))
 
 
-def transmission(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report residuals at x (n,) due to a gear ratio, a coupling or lag of joints, or to the instrument.
+Say = Callable[[Array], tuple[str, str]]
+"""What coefficients mean: what happened, and what to do; empty where they are too large for a linearization."""
 
-    One column is added to the linearization (`_added`): the slope of a joint's zero times the value of a joint, all of
-    these times the way from the row before, or the slope of the scale or offset of distances, of positions by the
-    base's place along them, along their directions, and along one axis.
+
+def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: bool = True) -> Iterator[str]:
+    """Report what one addition to the linearization at x (n,) explains best (`_added`): what moved, lags or is scaled.
+
+    Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few;
+    if ``transmission``, the slope of a joint's zero times the value of a joint, all of these times the way from the row
+    before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
-    free = problem.parameters.free
-    q = problem.joint_values[problem.owners]
     model = problem.linearize(x)
+    tried = list(_moves(problem, x, model))
+    if transmission:
+        tried += [*_gears(problem, model), *_scales(problem, x, model)]
+    found = _added(model, x, [columns for columns, _ in tried])
+    if found is not None:
+        number, coefficients, rest = found
+        what, remedy = tried[number][1](coefficients)
+        if what:
+            yield f"{what} (that leaves {100 * rest:.0f} % of the residuals): {remedy}."
+
+
+def _moves(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[tuple[Array, Say]]:
+    """Yield the columns (m, c) of a base, fixture, reflector or joint zero that moved."""
+    free, data = problem.parameters.free, problem.data
+    markers = {marker for block in data.blocks for marker in block.markers}
+    parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
+    causes = {"base": "did the instrument or the robot's base move", "reflector": "was the reflector exchanged"}
+    for block in data.blocks:
+        names = list(block.measurement.parameters)
+        if names:
+            what = names[0].split("_")[0]
+            causes[what] = "did it, or the robot's base, move"
+            parts.setdefault(what, set()).update(of_fixture(name, block.fixture) for name in names)
+    placed_by = [what for what in causes if what != "reflector"]
+    for i, kind in enumerate(problem.robot.joint_types, start=1):
+        parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
+    of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
+    if len(data) < 2 * FEWEST or not any(of[what] for what in placed_by):
+        return
+    equations = Equations.of(data)
+
+    def say(what: str, start: int, end: int, coefficients: Array) -> tuple[str, str]:
+        some = of[what]
+        rows = equations.length & (equations.row >= start) & (equations.row < end)
+        change = problem.jacobian(x)[np.ix_(rows, np.asarray(some))] @ (free.scale[some] * coefficients)
+        far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[rows]))))
+        until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
+        cause = causes.get(what, "did the joint slip, or was it remastered")
+        return (
+            f"from row {data.label[start]} {until} the points are {three_digits(far)} mm from where the others put "
+            f"them, and fit a {what} that moved"
+        ), f"{cause}? Calibrate the two parts separately"
+
+    spans = [(k, len(data)) for k in _places(len(data))] + list(combinations(_places(len(data), SPANS), 2))
+    for (start, end), (what, some) in product(spans, of.items()):
+        if some:
+            inside = (problem.owners >= start) & (problem.owners < end)
+            yield model.A[:, some] * inside[:, None], partial(say, what, start, end)
+
+
+def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[tuple[Array, Say]]:
+    """Yield the column (m, 1) of every gear ratio and coupling, and of a lag of all joints."""
+    robot, free = problem.robot, problem.parameters.free
     slopes = model.A / free.scale
-    zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(problem.robot.joint_types, 1)]
+    q = problem.joint_values
+    zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, 1)]
     of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(zeros) if name in free.names}
-    tried: list[tuple[Array, Callable[[float], str]]] = []  # columns (m,), and what is said of their coefficients
+
+    def gear(i: int, j: int, coefficients: Array) -> tuple[str, str]:
+        factor = coefficients[0]
+        to_model = robot.joint_map.copy()
+        to_model[i] += factor * robot.joint_map[j]
+        what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
+        if i != j:
+            sign = signs(robot.joint_map)
+            part = sign[i] * factor * sign[j]
+            what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
+        return what * bool(abs(factor) <= SMALL), coupling(to_model)
+
     for i, j in product(of_zero, range(q.shape[1])):
         if q[:, j].any():
-            tried.append((of_zero[i] * q[:, j], partial(_gear, problem.robot, i, j)))
-    if len(of_zero) == problem.robot.dof:
-        way = np.diff(problem.joint_values, axis=0, prepend=problem.joint_values[:1])[problem.owners]
-        lag = np.sum([of_zero[i] * each for i, each in enumerate((way @ problem.robot.joint_map.T).T)], axis=0)
-        remedy = "wait until the arm stands still before both are read"
-        tried.append((lag, lambda part: f"joint values lag behind by {100 * part:.2g} % of the way: {remedy}"))
-    for column, what in zip(_of_instrument(problem, x, model, slopes), SCALES, strict=False):
-        tried.append((column, what))
-    found = _added(model, x, [column[:, None] for column, _ in tried])
-    if found is not None and abs(found[1][0]) <= SMALL:
-        number, (factor,), rest = found
-        yield f"{tried[number][1](factor)} (that leaves {100 * rest:.0f} % of the residuals)."
+            yield (of_zero[i] * q[problem.owners, j])[:, None], partial(gear, i, j)
+    if len(of_zero) == robot.dof:
+        way = np.diff(q, axis=0, prepend=q[:1])[problem.owners] @ robot.joint_map.T
+        lag = np.sum([of_zero[i] * way[:, i] for i in range(robot.dof)], axis=0)
+        remedy = "read both when the arm stands still"
+        yield lag[:, None], lambda c: (f"joint values lag behind by {100 * c[0]:.2g} % of the way", remedy)
 
 
-SCALES: tuple[Callable[[float], str], ...] = (
-    lambda part: f"measured lengths are {100 * part:+.2g} % too long: check the scale of the instrument",
-    lambda part: (
-        f"measured distances are {three_digits(1e3 * part)} mm too long: check the instrument's zero and the "
-        "reflector's radius"
-    ),
-    lambda part: f"column x is {100 * part:+.2g} % too long: check its scale",
-    lambda part: f"column y is {100 * part:+.2g} % too long: check its scale",
-    lambda part: f"column z is {100 * part:+.2g} % too long: check its scale",
-    lambda part: f"column x has {100 * part:+.2g} % of column y in it: are the instrument's axes square?",
-    lambda part: f"column x has {100 * part:+.2g} % of column z in it: are the instrument's axes square?",
-    lambda part: f"column y has {100 * part:+.2g} % of column z in it: are the instrument's axes square?",
-)
-"""What is said of the coefficients of `_of_instrument`, in its order."""
-
-
-def _of_instrument(problem: CalibrationProblem, x: Array, model: LinearModel, slopes: Array) -> Array:
-    """Return the slopes (c, m) of equations by scale and offset of lengths, of positions by scales and skews too."""
-    names = problem.parameters.free.names
-    base = [names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in names]
+def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[tuple[Array, Say]]:
+    """Yield the column (m, 1) of the scale and offset of lengths, and of the scales and skews of positions."""
+    free = problem.parameters.free
+    base = [free.names.index(f"base_{c}") for c in "xyz" if f"base_{c}" in free.names]
     y = np.zeros((len(problem.data), 3))
     lengths = np.zeros((len(problem.data), 2))
     for block in problem.data.blocks:
@@ -762,74 +806,33 @@ def _of_instrument(problem: CalibrationProblem, x: Array, model: LinearModel, sl
             y[block.row] = block.y[:, :3]
         elif block.measurement.name in ("cable", "distance"):
             lengths[block.row] = np.column_stack([block.y, np.ones(len(block.y))])
-    along = lengths[problem.owners].T
+    along = lengths[problem.owners]
     if lengths.any():  # in units of the equations
-        jacobian = problem.jacobian(x) * problem.parameters.free.scale
-        along = along * (np.linalg.norm(model.A, axis=1) / np.linalg.norm(jacobian, axis=1))
-    if not y.any():
-        return along
-    of_axis, y = slopes[:, base].T, y[problem.owners].T
-    radial = y / np.maximum(np.linalg.norm(y, axis=0), 1e-9)
-    along += np.array([np.sum(of_axis * y, axis=0), np.sum(of_axis * radial, axis=0)])
-    skew = [of_axis[i] * y[j] for i, j in ((0, 1), (0, 2), (1, 2))]
-    return np.concatenate([along, of_axis * y, skew])
+        unit = np.linalg.norm(model.A, axis=1) / np.linalg.norm(problem.jacobian(x) * free.scale, axis=1)
+        along *= unit[:, None]
+    y = y[problem.owners]
+    of_axis = model.A[:, base] / free.scale[base]
+    if y.any():
+        radial = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
+        along += np.column_stack([np.sum(of_axis * y, axis=1), np.sum(of_axis * radial, axis=1)])
 
+    def percent(what: str, remedy: str, c: Array) -> tuple[str, str]:
+        return what.format(f"{100 * c[0]:+.2g} %") * bool(abs(c[0]) <= SMALL), remedy
 
-def _gear(robot: Robot, i: int, j: int, factor: float) -> str:
-    """Say by which part of joint j joint i turns beside what its encoder reads, and what to write."""
-    to_model = robot.joint_map.copy()
-    to_model[i] += factor * robot.joint_map[j]
-    what = f"joint {i + 1} turns {100 * factor:+.2g} % more than its encoder reads (gear ratio)"
-    if i != j:
-        sign = signs(robot.joint_map)
-        part = sign[i] * factor * sign[j]
-        what = f"joint {i + 1} is coupled to joint {j + 1} (q{i + 1} {part:+.4f} q{j + 1})"
-    return f"{what}: {coupling(to_model)}"
-
-
-def moved(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report the rows in which residuals at x (n,) show a moved base, fixture, reflector or joint zero.
-
-    Its columns for the rows from one on, or between two of a few, are added to the linearization (`_added`).
-    """
-    free = problem.parameters.free
-    data = problem.data
-    markers = {marker for block in data.blocks for marker in block.markers}
-    parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
-    fixtures = set()
-    for block in data.blocks:
-        names = list(block.measurement.parameters)
-        if names:
-            what = names[0].split("_")[0]
-            fixtures.add(what)
-            parts.setdefault(what, set()).update(of_fixture(name, block.fixture) for name in names)
-    for i, kind in enumerate(problem.robot.joint_types, start=1):
-        parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
-    of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
-    unfit = len(data) < 2 * FEWEST or len(problem.owners) > MOST_EQUATIONS
-    if unfit or not any(of[what] for what in ("base", *fixtures)):
-        return
-    spans = [(k, len(data)) for k in _places(len(data))] + list(combinations(_places(len(data), SPANS), 2))
-    tried = [(span, what) for span in spans for what, some in of.items() if some]
-    model = problem.linearize(x)
-    rows = problem.owners
-    found = _added(model, x, [model.A[:, of[what]] * ((rows >= a) & (rows < b))[:, None] for (a, b), what in tried])
-    if found is not None:
-        number, coefficients, rest = found
-        (place, end), what = tried[number]
-        some = of[what]
-        equations = Equations.of(data)
-        after = equations.length & (equations.row >= place) & (equations.row < end)
-        until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
-        change = problem.jacobian(x)[np.ix_(after, np.asarray(some))] @ (free.scale[some] * coefficients)
-        far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[after]))))
-        causes = {"base": "did the instrument or the robot's base move", "reflector": "was the reflector exchanged"}
-        causes |= dict.fromkeys(fixtures, "did it, or the robot's base, move")
-        yield (
-            f"from row {data.label[place]} {until} the points are {three_digits(far)} mm from where the others put "
-            f"them, and fit a {what} that moved (that leaves {100 * rest:.0f} % of the residuals): "
-            f"{causes.get(what, 'did the joint slip, or was it remastered')}? Calibrate the two parts separately."
+    def offset(c: Array) -> tuple[str, str]:
+        return (
+            f"measured distances are {three_digits(1e3 * c[0])} mm too long" * bool(abs(c[0]) <= SMALL),
+            "check the instrument's zero and the reflector's radius",
         )
+
+    yield along[:, [0]], partial(percent, "measured lengths are {} too long", "check the scale of the instrument")
+    yield along[:, [1]], offset
+    for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
+        what, remedy = f"column {'xyz'[i]} is {{}} too long", "check its scale"
+        if i != j:
+            what = f"column {'xyz'[i]} has {{}} of column {'xyz'[j]} in it"
+            remedy = "check whether the instrument's axes are square"
+        yield (of_axis[:, i] * y[:, j])[:, None], partial(percent, what, remedy)
 
 
 # What touches say
