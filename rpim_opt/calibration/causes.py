@@ -28,7 +28,7 @@ from rpim_opt.problem.diagnosis import (
     shown_by_residuals,
     unrelated_rows,
 )
-from rpim_opt.problem.misreadings import Better, better_reading, lost_row
+from rpim_opt.problem.misreadings import Better, better_reading
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
 
@@ -128,9 +128,10 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(_of_rows(problem))
     ordered = _in_table_order(result, problem)
-    better = better_reading(ordered) or lost_row(ordered)
-    if better is not None:
-        return [*rows_without_values(problem), better.sentence]
+    better = better_reading(ordered)
+    found = list(part_way(ordered)) if better is None else [better.sentence]
+    if found:
+        return [*rows_without_values(problem), *found]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
     if not found:
         alone, x = problem, result.x
@@ -143,7 +144,7 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be
         return found
-    return list(part_way(ordered)) or list(odd_columns(problem)) or list(unrelated_rows(problem, error))
+    return list(odd_columns(problem)) or list(unrelated_rows(problem, error))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

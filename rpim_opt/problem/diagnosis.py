@@ -657,9 +657,11 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     fitting = [k for k in _places(len(rows)) if misfit(problem.robot, points.take(rows[:k])) < FITS * whole]
     if not fitting:
         return
-    better = better_reading(problem.on(problem.data.take(points.row[max(fitting) :])))
+    error = placed(problem.robot, points.take(rows[: max(fitting)])).error
+    start = int(np.flatnonzero(error <= FAR * np.median(error)).max()) + 1
+    better = better_reading(problem.on(problem.data.take(points.row[start:])))
     if better is not None:
-        yield f"from about row {problem.data.label[points.row[max(fitting)]]} on {better.sentence}"
+        yield f"from about row {problem.data.label[points.row[start]]} on {better.sentence}"
 
 
 def _places(count: int, most: int = 40) -> list[int]:

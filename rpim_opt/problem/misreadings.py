@@ -90,9 +90,6 @@ MISTAKES = {False: 3, True: 1}
 """Mistakes that are looked for at once; one alone of a camera's views, whose lens is not known yet and blurs others."""
 COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
 """How much of another joint a joint may count, of a neighbour and of others."""
-LEAST_ROWS, SOME_ROWS, STARTS, ROW_WRONG = 12, 60, 17, 10.0
-"""Of a lost reading: rows below which none is sought, rows of a try, places that are tried, and the error over the
-median of a row that has a neighbour's value."""
 LENGTHS = {
     1e3: ("a thousand times larger", "name the columns x_m, y_m, z_m"),
     1e-3: ("a thousand times smaller", "name the columns x_mm, y_mm, z_mm"),
@@ -381,43 +378,6 @@ def _other_robots(robot: Robot, points: Points) -> Iterator[Reading]:
 
 
 # Which of these fits
-
-
-def lost_row(problem: CalibrationProblem) -> Better | None:
-    """Return the row from which on measured values are shifted by one row against the joint values, or None."""
-    points = points_of(problem, len(problem.data))
-    if points is None or points.seen or len(points.row) < LEAST_ROWS:
-        return None
-    robot = problem.robot
-    points = points.take(np.argsort(points.row))
-    stated = float(misfits(robot, [points.evenly(SOME_ROWS)])[0])
-    if stated <= WRONG:
-        return None
-    rows = np.arange(len(points.row))
-
-    def moved(start: int, by: int) -> Points:
-        joints = np.where(rows < start, rows, rows + by)
-        values = np.flatnonzero(joints < len(rows))
-        return replace(points.take(values), q=points.q[joints[values]])
-
-    starts = np.unique(np.linspace(2, len(rows) - 2, STARTS).round().astype(int)).tolist()
-    tries = [(start, by) for by in (1, -1) for start in starts]
-    size = misfits(robot, [moved(*each).evenly(SOME_ROWS) for each in tries])
-    start, by = tries[int(np.argmin(size))]
-    if not size.min() < BETTER * stated:
-        return None
-    error = placed(robot, moved(start, by), zeros=True).error
-    wrong = np.append(error > ROW_WRONG * np.median(error), False)
-    first = start
-    while wrong[start]:  # rows before the right start fit as they stand
-        start += 1
-    while start == first > 0 and wrong[first - 1]:
-        first -= 1
-        start = first
-    label = problem.labels[points.row[min(start, len(rows) - 1)]]
-    way, remedy = ("down", "a reading was lost there") if by > 0 else ("up", "there is a reading too many there")
-    what = f"the measured values from row {label} on moved {way} by one row"
-    return Better(what, remedy, stated * points.extent, float(size.min()) * points.extent)
 
 
 def better_reading(problem: CalibrationProblem) -> Better | None:
