@@ -76,10 +76,11 @@ class LeftOut(NamedTuple):
 
 
 class Transmitted(NamedTuple):
-    """Standard deviation and length scale [rad] of the joints' transmission errors, and the decrease of -2 ln L."""
+    """Standard deviation and length scale of ripple, that of ``waves`` [rad], and the decrease of -2 ln L."""
 
     size: Size
     length: Size
+    waves: Size
     gain: float
 
 
@@ -287,10 +288,15 @@ class Estimator:
 
 def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
     """Return prior variances of curve coefficients, which are the last of the (n,) deviations in these units [SI]."""
-    cycles = [np.tile(2 * np.pi / curve.period * np.arange(1, curve.harmonics + 1), 2) for curve in curves]
-    periods = np.concatenate([np.full(2 * curve.harmonics, curve.period) for curve in curves])
-    w = np.asarray(np.concatenate(cycles), dtype=float)
-    return Spectrum(w**2, periods * unit[len(unit) - len(periods) :] ** 2)
+    w, share = [], []
+    for curve in curves:
+        step = 2 * np.pi / curve.period
+        own = np.append(np.arange(1, curve.waves + 1), step * np.arange(1, curve.harmonics + 1))
+        between = np.concatenate([[own[0] / 2], (own[1:] + own[:-1]) / 2, [own[-1] + step / 2]])
+        w += [own, own]
+        share += [np.diff(between) / (2 * np.pi)] * 2  # a coefficient stands for the frequencies nearest to its own
+    frequencies = np.concatenate(w)
+    return Spectrum(frequencies**2, unit[len(unit) - len(frequencies) :] ** 2 / np.concatenate(share))
 
 
 def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
@@ -301,16 +307,16 @@ def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
 
 def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
     """Return the problem with all configurations in memory, or a random sample of them from every block."""
+
+    def drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
+        few = len(np.unique(problem.data.configuration)) <= most
+        return problem if few else problem.on(problem.data.configurations(most, seed=0))
+
     if isinstance(problem, CalibrationProblem):
-        return _drawn(problem, most).frozen()
+        return drawn(problem, most).frozen()
     count = sum(1 for _ in problem.rows())
-    parts = [_drawn(part, max(most // count, 1)).data for part in problem.rows()]
+    parts = [drawn(part, max(most // count, 1)).data for part in problem.rows()]
     return problem.on(Dataset.together(parts, [str(i) for i in range(len(parts))])).frozen()
-
-
-def _drawn(problem: CalibrationProblem, most: int) -> CalibrationProblem:
-    few = len(np.unique(problem.data.configuration)) <= most
-    return problem if few else problem.on(problem.data.configurations(most, seed=0))
 
 
 def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
@@ -385,6 +391,6 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         stated=fit.problem.parameters.free.scale,
         drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, widening]),
         notes=tuple(notes),
-        curves=None if prior.spectrum is None else Transmitted(values[sizes], values[sizes + 1], gain),
+        curves=None if prior.spectrum is None else Transmitted(*values[sizes:noise], gain=gain),
         **more,
     )

@@ -22,11 +22,8 @@ from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
 FIXED = -1
 """The group of a parameter whose prior scale is not estimated: of frames, but for the base."""
-
 JOINT_OFFSET, FRAMES = 3.0, 10.0
 """Factors on the scales of joint offsets, which are set at assembly, and of frames."""
-
-
 FAR = 100.0
 """Prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
 
@@ -47,26 +44,10 @@ class Stated:
 
         z_j ~ centre_j + tau_g scale_j t_nu     (heavy)        z_j ~ N(centre_j, (tau_g scale_j)^2)     (others)
 
-    (tau is 1 without a group), and together rows z - values ~ N(0, I).
-
-    Parameters
-    ----------
-    parameters
-        The identified ones.
-    centre, scale
-        (n,) prior means and standard deviations, the latter times ``parameters.scale``.
-    rows, values
-        (k, n) and (k,) of the statements.
-    replaced
-        (n,) which parameters have a statement in the place of a prior of their own.
-    group
-        (n,) the number of the group whose scale a parameter has; -1 without one.
-    heavy
-        (n,) which have Student's t.
-    names
-        Of the groups, in the order of their numbers.
-    tails
-        Degrees of freedom of Student's t.
+    (tau is 1 without a group), and together rows z - values ~ N(0, I), rows (k, n) and values (k,) of the statements.
+    Prior means ``centre`` (n,) and standard deviations ``scale`` (n,) are times ``parameters.scale``, ``parameters``
+    the identified ones. ``replaced`` (n,) are those with a statement in the place of a prior of their own, ``heavy``
+    (n,) those with Student's t of ``tails`` degrees of freedom; ``names[group]`` (n,) are the groups, -1 is none.
 
     Examples
     --------
@@ -194,21 +175,11 @@ class _Penalty(Ready):
 
 @dataclass(frozen=True)
 class Statement:
-    """Rows (v - reference) ~ N(values, I), where v are values of parameters, or their deviations.
+    """Rows (v - reference) ~ N(values, I), where v are values of parameters; without a reference, their deviations.
 
-    Parameters
-    ----------
-    names, dimensions
-        (p) parameters that it is about, and what they are.
-    rows, values
-        (k, p) [1 / SI] and (k,), whitened.
-    reference
-        (p,) [SI] from which the parameters' values count; None: from nominal, whatever that is.
-    whole
-        Whether it stands in the place of the parameters' own scales, and is marginal where some of them are not
-        identified. Otherwise those are nominal.
-    text
-        As a person wrote it.
+    Of p parameters, ``names`` and ``dimensions``: rows (k, p) [1 / SI] and values (k,), whitened, reference (p,) [SI].
+    A ``whole`` one stands in the place of the parameters' own scales, and is marginal where some of them are not
+    identified; otherwise those are nominal. ``text`` is as a person wrote it.
     """
 
     names: tuple[str, ...]

@@ -1,7 +1,7 @@
 """Transmission errors of joints: a model extension with a Gaussian process of each joint's angle.
 
-f(q) = sum_k c_k cos(w_k q) + s_k sin(w_k q), w_k = 2 pi k / period, stands for a process with Matern's covariance (3/2)
-where the coefficients have the variances of `Spectrum`.
+f(q) = sum_k c_k cos(w_k q) + s_k sin(w_k q) stands for two processes with Matern covariance (3/2), ripple and waves,
+where coefficients have the variances of `Spectrum`; w_k are multiples of 2 pi / period, and of 1 below these.
 """
 
 from __future__ import annotations
@@ -55,10 +55,13 @@ def possible(problem: CalibrationProblem) -> bool:
 def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
     """Return the columns (m, c) of all coefficients, from joint values and derivatives by them (m, dof)."""
     found = [np.zeros((len(q), 0))]
-    for joint, centre, period, count in curves:
-        u = 2 * np.pi / period * np.clip(q[:, joint - 1] - centre, -period / 2, period / 2)
-        angles = np.outer(u, np.arange(1, count + 1))
-        found.append(slopes[:, [joint - 1]] * np.hstack([np.cos(angles), np.sin(angles)]))
+    for curve in curves:
+        joint, half = curve.joint - 1, curve.period / 2
+        moved = q[:, joint] - curve.centre
+        waves = np.outer(moved, np.arange(1, curve.waves + 1))
+        repeated = np.outer(np.pi / half * np.clip(moved, -half, half), np.arange(1, curve.harmonics + 1))
+        angles = np.hstack([waves, repeated])
+        found.append(slopes[:, [joint]] * np.hstack([np.cos(angles), np.sin(angles)]))
     return np.hstack(found)
 
 
@@ -67,7 +70,8 @@ def admitted(
 ) -> tuple[Fit, tuple[Trial, ...], float] | None:
     """Return the fit with transmission errors, the models compared, and the decrease of -2 ln L; None if too small.
 
-    Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model.
+    Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model;
+    gravity stays if it was selected without them: waves can imitate it where joints were measured, but not elsewhere.
     ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of
     the parameters that were to be identified.
     """
@@ -86,11 +90,14 @@ def admitted(
             return None
         point, curves, columns = found
         geometry = _integrated(models.columns, columns, point)
+        kept = {"gravity"}.intersection(trials[0].families)
 
         def price(families: tuple[str, ...]) -> Candidate:
             model = geometry.restricted(models.members(families))
             best = model.optima(model.starts()[:1])[0]
             price = FAMILY_GAIN * questions(families) + (MOMENTS_GAIN - FAMILY_GAIN) * (MOMENTS in families)
+            if not kept.issubset(families):
+                price = np.inf
             return Candidate(best.value + price, families, best)
 
         compared = sorted(models.compared(price), key=lambda each: each.price)
@@ -134,8 +141,8 @@ def _most_likely(
     for stack in data.stacks if by_joints else problem.stacks():  # other noise needs no slopes by joints
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]
-    size = np.log(CURVES["transmission size"][0])
-    starts = [np.array([size, np.log(length), *plain.logs]) for length in STARTS]
+    size, _, waves = np.log([median for median, _ in CURVES.values()])
+    starts = [np.array([size, np.log(length), waves, *plain.logs]) for length in STARTS]
     margin = BEYOND
     centre, travel = (q.min(axis=0) + q.max(axis=0)) / 2, np.ptp(q, axis=0)
     joints = [j for j, kind in enumerate(problem.robot.joint_types) if kind == "revolute" and travel[j] > SHORTEST]

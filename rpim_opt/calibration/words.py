@@ -223,9 +223,8 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
             groups.append(f"{name} {_figure(size, 1.0, 'x' if groups else 'x the stated one')}")
     curves = []
     if learned.curves is not None:
-        curves.append(
-            f"{_figure(learned.curves.size, 1e3, 'mrad')}, length scale {learned.curves.length.value:.2g} rad"
-        )
+        ripple, waves = (_figure(size, 1e3, "mrad") for size in (learned.curves.size, learned.curves.waves))
+        curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad; waves {waves}")
     robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
     largest = max((size.value for size in robot.values()), default=0.0)
     parts = []

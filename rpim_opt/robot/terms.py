@@ -283,6 +283,11 @@ class Curve(NamedTuple):
     period: float  # [rad]
     harmonics: int
 
+    @property
+    def waves(self) -> int:
+        """Number of harmonics of a turn that are longer than the period."""
+        return max(math.ceil(math.tau / self.period - 1e-9) - 1, 0)
+
 
 @dataclass(frozen=True, eq=False)
 class Transmission(Term):
@@ -298,34 +303,39 @@ def transmission(curve: Curve) -> Transmission:
 
     ::
 
-        f(q) = sum_k c_k cos(k u) + s_k sin(k u),    u = 2 pi clip(q - centre, -period / 2, period / 2) / period
+        f(q) = sum_k c_k cos(u_k) + s_k sin(u_k)
+        u_k = k (q - centre)                                                                for k <= waves
+        u_k = (k - waves) 2 pi clip(q - centre, -period / 2, period / 2) / period           for harmonics more
 
     Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period is longer than the range that was measured, so
-    that f is constant beyond it.
+    that only waves, which are longer still, go on beyond it.
 
     Examples
     --------
     >>> import math
     >>> import rpim_opt as ro
     >>> term = ro.robot.transmission(ro.robot.Curve(joint=2, centre=0.0, period=math.pi, harmonics=2))
-    >>> term.names(2)
-    ('transmission2_c1', 'transmission2_c2', 'transmission2_s1', 'transmission2_s2')
-    >>> float(term.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, 0.1])), 0, 0, 0, 1e-3))  # sin(4 q)
+    >>> term.names(2)[:3]
+    ('transmission2_c1', 'transmission2_c2', 'transmission2_c3')
+    >>> float(term.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, 0.1])), 0, 0, 0, 0, 0, 1e-3))  # sin(4 q)
     0.00038941834...
     """
-    keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.harmonics + 1)]
+    keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.waves + curve.harmonics + 1)]
     return Transmission(partial(_series, curve), dict.fromkeys(keys, EXPECTED_WAVE), joints=(curve.joint,), curve=curve)
 
 
 def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
     half = curve.period / 2
-    u = math.pi / half * ca.fmin(ca.fmax(joint.q - curve.centre, -half), half)
-    cosine, sine = ca.cos(u), ca.sin(u)
-    c, s = 1.0, 0.0
+    moved = joint.q - curve.centre
+    repeated = math.pi / half * ca.fmin(ca.fmax(moved, -half), half)
+    pairs = list(zip(sizes[: len(sizes) // 2], sizes[len(sizes) // 2 :], strict=True))
     total = 0.0
-    for a, b in zip(sizes[: curve.harmonics], sizes[curve.harmonics :], strict=True):
-        c, s = c * cosine - s * sine, s * cosine + c * sine
-        total = total + a * c + b * s
+    for u, own in ((moved, pairs[: curve.waves]), (repeated, pairs[curve.waves :])):
+        cosine, sine = ca.cos(u), ca.sin(u)
+        c, s = 1.0, 0.0
+        for a, b in own:
+            c, s = c * cosine - s * sine, s * cosine + c * sine
+            total = total + a * c + b * s
     return total
 
 

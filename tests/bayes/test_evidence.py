@@ -133,8 +133,8 @@ def test_derivatives_beside_a_spectrum_are_differences() -> None:
     plain = hierarchy([0, 0, 0, -1, -1, -1], [True, True, False, False, False, False], ("a",))
     spectrum = Spectrum(np.array([1.0, 30.0, 900.0]), np.full(3, 2e-8))
     evidence = Evidence(linearized(1, 6, 6), replace(plain, spectrum=spectrum), NOISE)
-    logs = evidence.centre + 0.4 * np.random.default_rng(1).normal(size=6)
-    sides = [(evidence.at(logs + s), evidence.at(logs - s)) for s in 1e-5 * np.eye(6)]
+    logs = evidence.centre + 0.4 * np.random.default_rng(1).normal(size=7)
+    sides = [(evidence.at(logs + s), evidence.at(logs - s)) for s in 1e-5 * np.eye(7)]
     found = evidence.at(logs)
     gradient = np.array([after.value - before.value for after, before in sides]) / 2e-5
     curvature = np.array([after.gradient - before.gradient for after, before in sides]) / 2e-5

@@ -6,11 +6,13 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.bayes.evidence import Hierarchy
+from rpim_opt.bayes.hyperparameters import spectrum_of
 from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration import words
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.report import report
-from rpim_opt.robot.terms import Curve
+from rpim_opt.robot.terms import Curve, transmission
 from tests.simulate import ARM
 
 ROBOT = dataclasses.replace(
@@ -59,7 +61,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     floor = np.sqrt(3) * NOISE
     assert rms(result.errors(others)) < 1.4 * floor < rms(ro.calibrate(result.stated).errors(others)) / 2
     assert 0.90 < ro.use.validate(result, others).coverage <= 0.99
-    assert "Transmission error of joints (1 sigma)" in str(result)
+    assert "Transmission error of joints (1 sigma): ripple" in str(result)
     text = words.parameter_table(result)
     assert "transmission2_c1" not in text
     assert text.count("joint 2") == 1
@@ -79,13 +81,42 @@ def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
 
 
 def test_a_curve_stays_at_its_ends_beyond_its_period() -> None:
+    """Waves go on: multiples of a turn below pi, which is one cycle in a period of 2 rad."""
     curve = Curve(1, 0.3, 2.0, 3)
+    assert curve.waves == 3
+    assert Curve(1, 0.3, 2 * np.pi, 3).waves == 0
     q = 0.3 + np.array([-5.0, -1.0, -0.9, 0.9, 1.0, 5.0])[:, None]
-    below, low, inside, within, high, above = series([curve], q, np.ones((6, 1)))
+    columns = series([curve], q, np.ones((6, 1)))
+    below, low, inside, within, high, above = columns[:, [3, 4, 5, 9, 10, 11]]
     np.testing.assert_allclose([below, above], [low, high])
     angles = np.pi * 0.9 * np.arange(1, 4)
     np.testing.assert_allclose(within, [*np.cos(angles), *np.sin(angles)])
     np.testing.assert_allclose(inside, [*np.cos(angles), *-np.sin(angles)])
+    np.testing.assert_allclose(columns[5, [0, 1, 2, 6]], [*np.cos([5, 10, 15]), np.sin(5)])
+    symbolic = transmission(curve).moves
+    for at, row in zip(q[:, 0], columns, strict=True):
+        joint = ro.robot.Joint(1, ro.robot.Posture(q=[at]))
+        np.testing.assert_allclose([float(symbolic(joint, *unit)) for unit in np.eye(12)], row, atol=1e-12)
+
+
+@pytest.mark.parametrize("travel", [0.5, 2.0, 7.0])
+def test_coefficients_stand_for_ripple_and_waves(travel):
+    """By the mean square of differences, which no constant enters; coarse frequencies leave 5 % of it."""
+    curve = Curve(1, 0.0, min(travel + 0.6, 2 * np.pi), 200)
+    count = 2 * (curve.waves + curve.harmonics)
+    free = np.zeros(count, dtype=bool)
+    nothing = np.zeros((0, count))
+    spectrum = spectrum_of([curve], np.ones(count))
+    prior = Hierarchy(np.full(count, -1), free, (), np.zeros((0, 0)), 3.0, free, nothing, np.zeros(0), spectrum)
+    variances = prior.variances(np.log([3e-4, 0.05, 2e-4]))[0]
+    apart = np.array([0.02, 0.1, 0.3])
+    columns = series([curve], np.append(0.0, apart)[:, None], np.ones((4, 1)))
+    found = (columns[1:] - columns[0]) ** 2 @ variances
+    expected = 0.0
+    for size, length in ((3e-4, 0.05), (2e-4, 1.0)):
+        r = np.sqrt(3) * apart / length
+        expected = expected + 2 * size**2 * (1 - (1 + r) * np.exp(-r))
+    np.testing.assert_allclose(found, expected, rtol=0.05)
 
 
 def test_a_file_holds_the_curves(rippled, tmp_path):
