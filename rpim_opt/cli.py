@@ -334,9 +334,7 @@ def calibrate(
     problem: Problem,
     variant: Variant = None,
     selector: Selector = None,
-    model: Annotated[
-        Text, Option(help="auto: select model extensions by evidence; geometry: none.", autocompletion=MODELS)
-    ] = None,
+    model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.", autocompletion=MODELS)] = None,
     formulation: Formulation = None,
     noise: Noise = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
@@ -441,10 +439,7 @@ def accept(
     result: Result,
     limit: Tolerance = None,
     box: Box = None,
-    data: Annotated[
-        list[Path] | None,
-        Option(help=f"New held-out measurements for the test, instead of those of the result; {Several}"),
-    ] = None,
+    data: Annotated[list[Path] | None, Option(help=f"New measurements, instead of the result's; {Several}")] = None,
     tables: Tables = TABLES,
 ) -> Answer:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
@@ -466,9 +461,7 @@ def iso9283(
     table: Annotated[Path, Argument(help="Repeated approaches: pose, x_mm, y_mm, z_mm; command_x_mm, ...")],
     units: Units = "",
     limit: Annotated[Number, Option(help="Largest permitted pose accuracy AP_p [mm]; exit code 1 if exceeded.")] = None,
-    repeatability: Annotated[
-        Number, Option(help="Largest permitted repeatability RP_l [mm]; exit code 1 if exceeded.")
-    ] = None,
+    repeatability: Annotated[Number, Option(help="Largest permitted RP_l [mm]; exit code 1 if exceeded.")] = None,
     out: Table = None,
 ) -> Answer:
     """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
@@ -545,9 +538,7 @@ def export(
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
     mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
-    corrections: Annotated[
-        File, Option(help="CSV file for the joints' transmission errors: subtract from commands.")
-    ] = None,
+    corrections: Annotated[File, Option(help="CSV file for transmission errors, to subtract from commands.")] = None,
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
@@ -575,9 +566,7 @@ def compensate(
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
     units: Units = "",
     position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
-    tool: Annotated[
-        Text, Option(help="TCP in the flange frame, x,y,z [mm], roll,pitch,yaw [deg]; default: the reflector.")
-    ] = None,
+    tool: Annotated[Text, Option(help="TCP at the flange [mm, deg]: x,y,z,roll,pitch,yaw; default: reflector.")] = None,
     marker: Marker = None,
     base: Annotated[bool, Option("--base", help="Correct for deviations of the base as well.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
@@ -630,13 +619,9 @@ def design(
     criterion: Annotated[str, Option(help="V (predicted positions), D or A.")] = "V",
     candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within limits.")] = 1000,
     table: Annotated[File, Option(help="Table of candidates to use instead: q1_deg, ...")] = None,
-    point: Annotated[
-        Text, Option(help="For touch measurements: the point x,y,z [mm] in the robot's base frame.")
-    ] = None,
+    point: Annotated[Text, Option(help="For touches: the point x,y,z [mm] in the robot's base frame.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
-    augment: Annotated[
-        bool, Option("--augment", help="Augment the measured configurations, within their joint ranges.")
-    ] = False,
+    augment: Annotated[bool, Option("--augment", help="Add to the measured ones, in their joint ranges.")] = False,
     out: Table = None,
 ) -> Answer:
     """Choose the next configurations to measure by optimal design."""
@@ -711,9 +696,7 @@ def compare(
     formulations: Annotated[str, Option(help="tikhonov,robust,...; folder: each its own.")] = "tikhonov",
     selector: Annotated[str, Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
-    splits: Annotated[
-        str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds (5).")
-    ] = "folder",
+    splits: Annotated[str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds.")] = "folder",
     counts: Annotated[str, Option(help="Numbers of configurations to identify from: 10,25; default: all.")] = "",
     noise: Annotated[str, Option(help="Factors on the noise of the identification data: 1,3.")] = "1",
     seeds: Annotated[int, Option(min=1, help="Number of random draws.")] = 1,
