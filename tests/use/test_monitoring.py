@@ -137,7 +137,7 @@ def test_the_command(monkeypatch, capsys, tmp_path) -> None:
     text = page.read_text(encoding="utf-8")
     assert "days since the first check" in text
     assert text.count("<svg") == 2
-    assert text.count("<td>beyond ") == len(document["beyond"])
+    assert text.count("<td>above ") == len(document["beyond"])
     assert text.count("<td>alarm ") == 1
     assert run(monkeypatch, "monitor", str(tmp_path), str(file), "--out", str(tmp_path / "checks.csv.txt")) == 2
     assert "ends in .html or .csv" in capsys.readouterr().err
