@@ -45,7 +45,7 @@ from rpim_opt.robot.parameters import (
     tool_prefix,
     with_terms,
 )
-from rpim_opt.robot.terms import Curve, Model, Transmission, transmission
+from rpim_opt.robot.terms import Curve, Model, transmission
 
 GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")
 BASE = re.compile(r"base_.*")
@@ -138,7 +138,7 @@ class RobotModel(Tabled):
 
     def with_transmission(self, curves: Sequence[Curve]) -> Self:
         """Return the same problem with transmission errors, one a joint or none, and no repeatability of before."""
-        own = [term for term in self.robot.model.terms if not isinstance(term, Transmission)]
+        own = [term for term in self.robot.model.terms if not isinstance(term.made_of, Curve)]
         former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
         p = self.parameters.take(np.array([i for i, name in enumerate(self.parameters.names) if name not in former]))
         p = replace(p, terms=tuple(name for name in p.terms if name not in former))

@@ -25,5 +25,4 @@ from .terms import Joint as Joint
 from .terms import Model as Model
 from .terms import Posture as Posture
 from .terms import Term as Term
-from .terms import Transmission as Transmission
 from .terms import transmission as transmission

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -25,7 +25,7 @@ from rpim_opt.robot.kinematics import (
     translation,
 )
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import Entry, Joint, Symbol, Term
+from rpim_opt.robot.terms import Joint, Symbol, Term
 
 NEAR_PARALLEL = 0.1
 """Axes nearer to parallel than this [rad] get Hayati's beta, as `identified.near_parallel` proposes."""
@@ -270,22 +270,7 @@ class Carried(NamedTuple):
     mimics: tuple[Mimic, ...] = ()  # one, or none
 
 
-@dataclass(frozen=True, eq=False)
-class Displaced(Term):
-    """The term of `displaced`, with its origins."""
-
-    carried: Carried = field(default_factory=lambda: Carried(1, ()))
-    ready = True
-
-    def __post_init__(self) -> None:
-        """Check nothing: the names are those of frames."""
-
-    def named(self, i: int) -> list[Entry]:
-        """Return the parameters, whose names are the joints' and not the row's."""
-        return list(self.entries)
-
-
-def displaced(carried: Carried) -> Displaced:
+def displaced(carried: Carried) -> Term:
     """Return the term of the origins after a row of the table, which displace the following frames in order.
 
     A joint at m q + o moves further by the deviations of m, times q, and of o before them. With F the parent link's
@@ -300,7 +285,7 @@ def displaced(carried: Carried) -> Displaced:
     for origin in carried.origins:
         scale = ORIGIN_SCALES[ORIGIN if origin.prefix.startswith(ORIGIN) else MOUNT]
         scales |= {f"{origin.prefix}{axis}_{unit}": scale for axis, unit in units.items()}
-    return Displaced(partial(_moves, carried), scales, at="link", joints=(carried.row,), carried=carried)
+    return Term(partial(_moves, carried), scales, at="link", joints=(carried.row,), made_of=carried)
 
 
 def _moves(carried: Carried, link: Joint, *sizes: Symbol) -> Symbol:
@@ -326,4 +311,4 @@ def _inverse(T: ca.SX) -> ca.SX:
 
 def carried_by(terms: Sequence[Term]) -> tuple[Carried, ...]:
     """Return the origins among a robot's terms."""
-    return tuple(term.carried for term in terms if isinstance(term, Displaced))
+    return tuple(term.made_of for term in terms if isinstance(term.made_of, Carried))

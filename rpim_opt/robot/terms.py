@@ -8,7 +8,7 @@ import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, lru_cache, partial
-from typing import Any, ClassVar, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import casadi as ca
 
@@ -162,6 +162,8 @@ class Term:
         column ``temperature_K``, ``{"hours": ""}`` for one without unit.
     nominal
         Nominal values of the parameters, keys as in ``scales``; zero by default.
+    made_of
+        Of the terms of this package that follow from numbers alone, which a file holds: a `Curve` or `chain.Carried`.
 
     A term whose parameters are all zero must not move anything; it is not evaluated then.
 
@@ -185,13 +187,13 @@ class Term:
     joints: Sequence[str | int] = ()
     columns: Mapping[str, str] = field(default_factory=dict)
     nominal: Mapping[str, float] = field(default_factory=dict)
-    ready: ClassVar[bool] = False  # whether it follows from numbers alone, which a file holds
+    made_of: Any = None
 
     def __post_init__(self) -> None:
         if self.at not in SIZES:
             raise InputError("term, at", repr(self.at), ", ".join(map(repr, SIZES)))
         require_columns(self.columns, "term")
-        for entry in self.entries:
+        for entry in () if self.ready else self.entries:
             where = f"term, scales, parameter '{entry.name}'"
             if not _STEM.fullmatch(entry.name) or _FRAME.fullmatch(entry.name):
                 accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx of frames"
@@ -204,6 +206,11 @@ class Term:
                 raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
         if len({entry.name for entry in self.entries}) < len(self.entries):
             raise InputError("term, scales", "one name in two units", "one of them")
+
+    @property
+    def ready(self) -> bool:
+        """Whether it follows from numbers alone."""
+        return self.made_of is not None
 
     @cached_property
     def entries(self) -> tuple[Entry, ...]:
@@ -237,7 +244,7 @@ class Term:
         """Return the parameters of joint or link i with their names."""
         if self.at in ENDS:
             return list(self.entries)
-        stems = [entry.name if "{}" in entry.name else entry.name + "{}" for entry in self.entries]
+        stems = [entry.name if "{}" in entry.name or self.ready else entry.name + "{}" for entry in self.entries]
         return [entry._replace(name=stem.format(i)) for entry, stem in zip(self.entries, stems, strict=True)]
 
     def places(self, joint_types: Sequence[str]) -> tuple[int, ...]:
@@ -289,16 +296,8 @@ class Curve(NamedTuple):
         return max(math.ceil(math.tau / self.period - 1e-9) - 1, 0)
 
 
-@dataclass(frozen=True, eq=False)
-class Transmission(Term):
-    """The term of `transmission`, with the numbers that it is made of."""
-
-    curve: Curve = field(default_factory=lambda: Curve(1, 0.0, math.tau, 1))
-    ready = True
-
-
 @lru_cache(256)
-def transmission(curve: Curve) -> Transmission:
+def transmission(curve: Curve) -> Term:
     """Return the transmission error of a joint, its additional rotation [rad] as a function of its angle q.
 
     ::
@@ -321,7 +320,7 @@ def transmission(curve: Curve) -> Transmission:
     0.00038941834...
     """
     keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.waves + curve.harmonics + 1)]
-    return Transmission(partial(_series, curve), dict.fromkeys(keys, EXPECTED_WAVE), joints=(curve.joint,), curve=curve)
+    return Term(partial(_series, curve), dict.fromkeys(keys, EXPECTED_WAVE), joints=(curve.joint,), made_of=curve)
 
 
 def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
@@ -372,7 +371,7 @@ class Model:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "terms", tuple(self.terms))
-        own = [term for term in self.terms if not isinstance(term, Transmission)]  # those are one a joint
+        own = [term for term in self.terms if not isinstance(term.made_of, Curve)]  # those are one a joint
         stems = [entry.name for term in own for entry in term.entries]
         for stem in stems:
             if stems.count(stem) > 1:
@@ -389,7 +388,7 @@ class Model:
     @property
     def curves(self) -> tuple[Curve, ...]:
         """The transmission errors of joints among its terms."""
-        return tuple(term.curve for term in self.terms if isinstance(term, Transmission))
+        return tuple(term.made_of for term in self.terms if isinstance(term.made_of, Curve))
 
     def names(self, joint_types: Sequence[str]) -> tuple[str, ...]:
         """Return the names of all its parameters on an arm with these joints."""
@@ -419,7 +418,7 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
         columns = {name: ca.SX.sym(name) for name in model.columns}
         moves = ca.SX(0, 1)
         for term in model.terms:
-            if isinstance(term, Transmission):
+            if isinstance(term.made_of, Curve):
                 continue  # of its own joint's angle, and long to write down
             seen = {name: columns[name] for name in term.columns}
             posture = Posture(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), gravity, seen)

@@ -76,7 +76,7 @@ def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
     result, _ = rippled
     inside, outside = (result.predict([[0.0, angle, 0.0]], of="mean").standard.max() for angle in (0.3, 1.6))
     assert outside > 3 * inside
-    curve = next(term.curve for term in result.problem.robot.model.terms if term.curve.joint == 2)
+    curve = next(curve for curve in result.problem.robot.model.curves if curve.joint == 2)
     assert curve.period > 2.5  # 2 rad were measured
 
 

@@ -337,7 +337,9 @@ def _content(robot: Robot) -> dict[str, Any]:
         words = {direction: word for word, direction in MOUNTINGS.items()}
         content["mounting"] = words.get(gravity.direction, list(gravity.direction))
     if gravity.payload or any(gravity.payload_centre):
-        content["payload"] = {"mass_kg": gravity.payload} | _centre_keys(gravity.payload_centre, "")
+        content["payload"] = {"mass_kg": gravity.payload}
+        for axis, value in zip("xyz", gravity.payload_centre, strict=True):
+            content["payload"] |= _quantity(axis, "length", value)
     return content | {"joint": joints}
 
 
@@ -350,30 +352,27 @@ def _in_si(robot: Robot) -> bool:
 def _keys(robot: Robot, i: int, in_si: bool) -> dict[str, Any]:
     """Return the keys of a ``[[joint]]``, but for its sign; all in SI if wanted."""
     joint: dict[str, Any] = {}
-    for column, value in zip(MDH, robot.mdh[i], strict=True):
-        if value:
-            unit, (number,) = exact(MDH_DIMENSION[column], [value], in_si)
-            joint[f"{column}_{unit}"] = number
+    for (column, dimension), value in zip(MDH_DIMENSION.items(), robot.mdh[i], strict=True):
+        joint |= _quantity(column, dimension, value, in_si)
     if robot.joint_types[i] != "revolute":
         joint["type"] = robot.joint_types[i]
     for j, limits in zip(robot.leading, robot.limits, strict=True):
         if j == i and np.isfinite(limits).any():
-            dimension = "angle" if robot.joint_types[i] == "revolute" else "length"
-            unit, pair = exact(dimension, limits, in_si)
+            unit, pair = exact("angle" if robot.joint_types[i] == "revolute" else "length", limits, in_si)
             joint[f"limits_{unit}"] = pair
     if robot.gravity.masses:
         joint["mass_kg"] = robot.gravity.masses[i]
-        joint |= _centre_keys(robot.gravity.centres[i], "centre_", in_si)
+        for axis, value in zip("xyz", robot.gravity.centres[i], strict=True):
+            joint |= _quantity(f"centre_{axis}", "length", value, in_si)
     return joint
 
 
-def _centre_keys(centre: tuple[float, ...], prefix: str, in_si: bool = False) -> dict[str, float]:
-    keys = {}
-    for axis, value in zip("xyz", centre, strict=True):
-        if value:
-            unit, (number,) = exact("length", [value], in_si)
-            keys[f"{prefix}{axis}_{unit}"] = number
-    return keys
+def _quantity(stem: str, dimension: str, value: float, in_si: bool = False) -> dict[str, float]:
+    """Return a quantity under its name with the unit; nothing for zero."""
+    if not value:
+        return {}
+    unit, (number,) = exact(dimension, [value], in_si)
+    return {f"{stem}_{unit}": number}
 
 
 def exact(dimension: str, values: Any, in_si: bool = False) -> tuple[str, list[float]]:

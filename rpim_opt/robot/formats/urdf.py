@@ -33,7 +33,6 @@ from rpim_opt.robot.chain import (
     Carried,
     Chain,
     Described,
-    Displaced,
     Mimic,
     Origin,
     corrected,
@@ -46,7 +45,7 @@ from rpim_opt.robot.chain import (
 )
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Gravity, Robot, Vector
-from rpim_opt.robot.terms import Model
+from rpim_opt.robot.terms import Model, Term
 
 DEEPEST = 100
 """How deep elements may be nested."""
@@ -281,7 +280,7 @@ def _taker(part: Sequence[_Step]) -> int:
     return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
 
 
-def _displacements(way: _Way, table: Array, G: Array) -> list[Displaced]:
+def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
     """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
     terms = []
     followers = {joint: prefix for prefix, joint in way.urdf.followers().items()}
