@@ -362,7 +362,7 @@ def calibrate(
             times = dict(running.rows())
         without: list[str] = []
         if drop_outliers:
-            without = [flag.label for flag in result.flagged if flag.label not in result.kept_together]
+            without = [flag.label for flag in result.flagged if flag.label not in result.clustered]
         if without:
             say("calibrating without outliers")
             result = result.without_flagged()

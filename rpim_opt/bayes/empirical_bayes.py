@@ -21,14 +21,14 @@ from rpim_opt.problem.registration.frames import settled
 ROUNDS = 6
 """Linearizations at which hyperparameters are estimated."""
 ASKED = 6.0
-"""By how much -2 ln L must fall for a doubted prior: a likelihood ratio of twenty, which by Markov's inequality an arm
+"""By how much -2 ln L must fall for a optional prior: a likelihood ratio of twenty, which by Markov's inequality an arm
 of another kind shows once in twenty times at most."""
 LOOKS = 4
 """How often outliers are looked for again without those that were found: they mask each other."""
 
 
 @dataclass(frozen=True, eq=False)
-class Found:
+class Estimated:
     """Estimated hyperparameters, and the problem to fit at weight 1 from x (n,) [SI].
 
     The problem has local scales, noise and model extensions, without outliers; ``stated`` is the prior in its units.
@@ -40,20 +40,20 @@ class Found:
     x: Array
 
 
-def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
+def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Estimated:
     """Estimate hyperparameters, model extensions and outliers, and return them with the problem that has them applied.
 
     ``model`` is ``"geometry"``, or ``"auto"`` for the extensions that the marginal likelihood selects; ``start`` (n,)
     [SI] or None.
     """
     try:
-        return _found(problem, estimator, model, start)
+        return _estimate(problem, estimator, model, start)
     except np.linalg.LinAlgError:
         found = "equations, scales and noise of too different magnitudes to estimate hyperparameters"
         raise InputError("data", found, "correct units, or a weight") from None
 
 
-def _found(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Found:
+def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Estimated:
     every = sampled(problem)
     p = every.parameters
     if start is None:  # frames registered to the data, the robot nominal
@@ -63,8 +63,8 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
             start[p.placed[p.identified]] = settled(every.identifying(frames))
     whole = estimator.fit(every, start, None, ROUNDS)
     notes: tuple[str, ...] = ()
-    if estimator.prior.doubted:  # left out where the marginal likelihood is against it
-        plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, doubted=False))
+    if estimator.prior.optional:  # left out where the marginal likelihood is against it
+        plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, optional=False))
         without = plain.fit(every, start, None, ROUNDS)
         fall = without.point.value - whole.point.value
         if fall < ASKED:
@@ -92,7 +92,7 @@ def _found(problem: Source, estimator: Estimator, model: str, start: Array | Non
         left_out=tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1])),
         added=tuple(name for name in fit.problem.parameters.free.names if name not in stated),
     )
-    return Found(laid, replace(found, notes=(*notes, *found.notes)), fit.inside, fit.x)
+    return Estimated(laid, replace(found, notes=(*notes, *found.notes)), fit.inside, fit.x)
 
 
 def _without_outliers(
@@ -126,7 +126,7 @@ def _without_outliers(
     return fit, trials, outliers
 
 
-def with_extensions(problem: Source, found: Found) -> Source:
+def with_extensions(problem: Source, found: Estimated) -> Source:
     """Return the problem with the selected model extensions, otherwise unchanged."""
     if found.learned.curves is not None:
         robots = {name: robot.model.curves for name, robot in found.problem.arms.items()}

@@ -56,7 +56,7 @@ class Prior:
         Factors on the scales of joint offsets, and of frames (base, reflectors, anchors).
     statements
         Of linear combinations: `known`, `from_result`.
-    doubted
+    optional
         Whether centre and scale are left out where the marginal likelihood is against them: `from_population`.
 
     Raises
@@ -81,7 +81,7 @@ class Prior:
     joint_offset: float = JOINT_OFFSET
     frames: float = FRAMES
     statements: tuple[Statement, ...] = ()
-    doubted: bool = False
+    optional: bool = False
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre", dict(self.centre))
@@ -169,7 +169,7 @@ class Prior:
         """Return a prior for another robot of a type from several calibrated ones: their mean and spread.
 
         By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where
-        the marginal likelihood of another robot's data is against it, this prior is left out (``doubted``).
+        the marginal likelihood of another robot's data is against it, this prior is left out (``optional``).
 
         Parameters
         ----------
@@ -184,7 +184,7 @@ class Prior:
         from rpim_opt.bayes.population import population
 
         centre, width = population(results)
-        return cls(centre=centre, scale=width, doubted=True)
+        return cls(centre=centre, scale=width, optional=True)
 
     def __and__(self, other: Prior) -> Prior:
         """Return both together; InputError where they contradict each other on a key."""

@@ -32,7 +32,7 @@ class Flag(NamedTuple):
     error_mm: float
 
 
-class Held(NamedTuple):
+class ActiveBound(NamedTuple):
     """An active bound of a parameter [SI], its multiplier, and the gain of loosening it by a tenth."""
 
     name: str
@@ -41,7 +41,7 @@ class Held(NamedTuple):
     gain: float
 
 
-class Price(NamedTuple):
+class ShadowPrice(NamedTuple):
     """A constraint that is written as text, at a solution: its shadow price or its slack.
 
     ``slack`` is how far it is from its limit, in ``unit``; ``multiplier`` by how much the misfit (loss + weight
@@ -84,7 +84,7 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     return tuple(Flag(labels[i], float(norms[i] / noise[i]), float(error[i])) for i in worst)
 
 
-def active_bounds(program: Program, z: Array, weight: float) -> tuple[Held, ...]:
+def active_bounds(program: Program, z: Array, weight: float) -> tuple[ActiveBound, ...]:
     """Return the parameters with an active bound at z (n,), the largest multiplier first."""
     box = program.box
     if box is None or not program.formulation.constraints:
@@ -94,16 +94,16 @@ def active_bounds(program: Program, z: Array, weight: float) -> tuple[Held, ...]
     loss = program.value(z)[0]
     rows = program.model.equations
     near = np.minimum(z - box[0], box[1] - z) < ACTIVE * (1 + np.abs(z))
-    found: list[Held] = []
+    found: list[ActiveBound] = []
     for i in np.flatnonzero((multiplier > ACTIVE * loss / rows) & near & (box[0] < box[1])):
         bound = float(min((box[0][i], box[1][i]), key=lambda side: abs(z[i] - side)))
         less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
         gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
-        found.append(Held(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
+        found.append(ActiveBound(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
     return tuple(sorted(found, key=lambda h: -h.gain))
 
 
-def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
+def shadow_prices(program: Program, z: Array, weight: float) -> tuple[ShadowPrice, ...]:
     """Return the shadow prices of a program's textual constraints at its solution z (n,)."""
     constraints = program.formulation.constraints
     if not any(isinstance(constraint, Parsed) for constraint in constraints):
@@ -123,7 +123,9 @@ def prices(program: Program, z: Array, weight: float) -> tuple[Price, ...]:
         if met or multiplier * scale <= ACTIVE * max(misfit, ACTIVE):  # an interior point's multipliers are not zero
             multiplier = 0.0
         gain = min(multiplier * parsed.step, misfit)
-        found.append(Price(parsed.text, unit, max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit))
+        found.append(
+            ShadowPrice(parsed.text, unit, max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit)
+        )
     return tuple(found)
 
 

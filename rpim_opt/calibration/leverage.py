@@ -125,7 +125,7 @@ def influence(result: Outcome) -> Influence:
     if form is not None:
         root = np.sqrt(result.penalty_weight)
         L, c = root * form.matrix, root * form.c
-    at_bound = {each.name for each in result.held}
+    at_bound = {each.name for each in result.active_bounds}
     moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights

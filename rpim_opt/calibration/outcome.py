@@ -28,7 +28,7 @@ from rpim_opt.calibration.covariance import (
     row_freedom,
     scattered,
 )
-from rpim_opt.calibration.diagnosis import Flag, Held, Outside, Price
+from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPrice
 from rpim_opt.calibration.loop import Iteration
 from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.formulation import Formulation
@@ -89,11 +89,11 @@ class Kept(NamedTuple):
     them, and the numbers of those that it left out; what statements of a drawing cost.
     """
 
-    held: tuple[Held, ...]
+    active_bounds: tuple[ActiveBound, ...]
     linear: LinearModel | None
     factor: float = 1.0
     left_out: tuple[int, ...] = ()
-    prices: tuple[Price, ...] = ()
+    shadow_prices: tuple[ShadowPrice, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -432,7 +432,7 @@ class Outcome:
         return tuple(flag for flag, certain in zip(found, sure, strict=True) if certain)
 
     @cached_property
-    def kept_together(self) -> tuple[str, ...]:
+    def clustered(self) -> tuple[str, ...]:
         """Labels of flagged rows whose errors are correlated with those of neighbours in joint space or time.
 
         They are no outliers: the model lacks something there, or the set-up moved. `without_flagged` keeps them.
@@ -446,7 +446,7 @@ class Outcome:
         return tuple(flag.label for flag, kept in zip(self.flagged, together, strict=True) if kept)
 
     @property
-    def doubted(self) -> list[str]:
+    def outliers(self) -> list[str]:
         """Labels of all outliers: excluded before the fit, and flagged after it."""
         before = () if self.learned is None else self.learned.left_out
         return [row.label for row in (*before, *self.flagged)]
@@ -454,16 +454,16 @@ class Outcome:
     def without_flagged(self) -> Self:
         """Return the calibration without the flagged rows, with the same formulation, selector and solver.
 
-        Rows that are `kept_together` stay: without them the robot would be extrapolated where the model fails.
+        Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
         """
-        out = [flag for flag in self.flagged if flag.label not in self.kept_together]
+        out = [flag for flag in self.flagged if flag.label not in self.clustered]
         kept = self.stated.without({flag.label for flag in out})
         reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in out}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.asked(kept), record=record)
 
     @cached_property
-    def held(self) -> tuple[Held, ...]:
+    def active_bounds(self) -> tuple[ActiveBound, ...]:
         """The parameters at an active bound, the largest multiplier first.
 
         ``gain`` is by how much the root of the loss per equation (for a squared loss the whitened RMS) would fall if
@@ -471,21 +471,21 @@ class Outcome:
         drawing that does not describe this robot.
         """
         if self.kept is not None:
-            return self.kept.held
+            return self.kept.active_bounds
         return diagnosis.active_bounds(self.program, self.z, self.weight)
 
     @cached_property
-    def prices(self) -> tuple[Price, ...]:
+    def shadow_prices(self) -> tuple[ShadowPrice, ...]:
         """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none."""
         if self.kept is not None:
-            return self.kept.prices
-        return diagnosis.prices(self.program, self.z, self.weight)
+            return self.kept.shadow_prices
+        return diagnosis.shadow_prices(self.program, self.z, self.weight)
 
     @cached_property
-    def held_back(self) -> tuple[str, ...]:
+    def actively_constrained(self) -> tuple[str, ...]:
         """Names of the parameters at an active bound or in an active textual constraint."""
-        names = [held.name for held in self.held]
-        holding = {price.text for price in self.prices if price.holds}
+        names = [held.name for held in self.active_bounds]
+        holding = {price.text for price in self.shadow_prices if price.holds}
         for constraint in self.formulation.constraints:
             if isinstance(constraint, Parsed) and constraint.text in holding:
                 names += constraint.names(self.program.model.parameters)

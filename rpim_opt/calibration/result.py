@@ -95,7 +95,7 @@ class Calibration(Outcome):
         """Return one of the result's tables as a data frame (pandas, or polars if pandas is not installed).
 
         ``what`` is ``"parameters"``, ``"errors"`` (of every row, before and after), ``"history"`` (iterations),
-        ``"flags"`` (outlying rows), ``"bounds"`` (active ones) or ``"prices"`` (of statements of a drawing).
+        ``"flags"`` (outlying rows), ``"bounds"`` (active ones) or ``"shadow_prices"`` (of statements of a drawing).
         InputError for another name, or where no data frames are installed.
 
         >>> import rpim_opt as ro

@@ -32,7 +32,7 @@ class Uncertainty(Tabled):
     by how much Student's tails are wider than the normals that stand for them (`Learned.drift`).
 
     It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty; other penalties
-    (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.held_back``.
+    (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.actively_constrained``.
 
     ``confidence`` of the intervals is between 0 and 1. InputError for another one, or a penalty without covariance.
 
@@ -42,7 +42,7 @@ class Uncertainty(Tabled):
     >>> print(f"{result.freedom:.1f} degrees of freedom, k = {uncertainty.coverage_factor:.2f}")
     93.5 degrees of freedom, k = 1.99
     >>> list(uncertainty.to_frame().columns)
-    ['parameter', 'unit', 'value', 'u_noise', 'u_prior', 'u', 'U', 'held_back']
+    ['parameter', 'unit', 'value', 'u_noise', 'u_prior', 'u', 'U', 'actively_constrained']
     """
 
     result: Outcome
@@ -91,7 +91,7 @@ class Uncertainty(Tabled):
             row: dict[str, Any] = {"parameter": name, "unit": unit, "value": float(values[i] / si)}
             row |= {"u_noise": float(noise[i] / si), "u_prior": float(prior[i] / si), "u": float(both[i] / si)}
             row["U"] = float(self.coverage_factor * both[i] / si)
-            row["held_back"] = bool(both[i] == 0) or name in self.result.held_back
+            row["actively_constrained"] = bool(both[i] == 0) or name in self.result.actively_constrained
             rows.append(row)
         return rows
 
@@ -100,7 +100,7 @@ class Uncertainty(Tabled):
             self.result.noise_test().verdict,
             f"k = {self.coverage_factor:.2f}; {self.result.freedom:.1f} degrees of freedom.",
         ]
-        if any(row["held_back"] for row in self._frame_rows()):
+        if any(row["actively_constrained"] for row in self._frame_rows()):
             lines.append("At an active bound or constraint: the interval is conditional on it.")
         return lines
 

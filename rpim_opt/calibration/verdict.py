@@ -117,7 +117,7 @@ def kept_rows(result: Outcome) -> np.ndarray:
     if result.learned is not None:
         labels |= {row.label for row in result.learned.left_out}
     if not result.squared_loss:
-        labels |= {flag.label for flag in result.flagged} - set(result.kept_together)
+        labels |= {flag.label for flag in result.flagged} - set(result.clustered)
     return ~np.isin(result.problem.labels, list(labels))
 
 

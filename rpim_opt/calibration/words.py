@@ -166,7 +166,7 @@ def weight_lines(result: Outcome) -> list[str]:
 def remarks(result: Outcome) -> list[str]:
     """Return remarks on outliers, active bounds and convergence."""
     lines = _outlying(result)
-    for held in result.held[:MOST_BOUNDS]:
+    for held in result.active_bounds[:MOST_BOUNDS]:
         unit, si = display(result.problem.parameters.dimension_of(held.name))
         tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
         lines.append(
@@ -179,7 +179,7 @@ def remarks(result: Outcome) -> list[str]:
         lines.append(
             f"Deviations beyond the stated tolerance: {names}. Only the formulation 'bounded' enforces tolerances."
         )
-    lines += [price.sentence() for price in result.prices]
+    lines += [price.sentence() for price in result.shadow_prices]
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result file cannot hold: it cannot be solved again.")
     return [*lines, result.message]
@@ -197,7 +197,7 @@ def _outlying(result: Outcome) -> list[str]:
     if len(flagged) > MOST_ROWS:
         text += f" and {len(flagged) - MOST_ROWS} more"
     lines = [f"{text}."]
-    together = result.kept_together
+    together = result.clustered
     if together:
         lines.append(
             f"Of them {listed(together)} have errors like their neighbours in joint space or time, so they are not"
@@ -311,8 +311,8 @@ FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
     ],
     "history": lambda result: [dict(vars(each)) for each in result.history],
     "flags": lambda result: [flag._asdict() for flag in result.flagged],
-    "bounds": lambda result: [held._asdict() for held in result.held],
-    "prices": lambda result: [price._asdict() for price in result.prices],
+    "bounds": lambda result: [held._asdict() for held in result.active_bounds],
+    "shadow_prices": lambda result: [price._asdict() for price in result.shadow_prices],
 }
 """Tables of a result by name."""
 MOST_POINTS = 20

@@ -495,7 +495,7 @@ def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
     >>> demands = [ro.constraints.parse(text, {"home": np.zeros(6)}) for text in statements]
     >>> stated = ro.Formulation("as stated", penalty=cp.sum_squares, constraints=demands)
     >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
-    >>> for price in result.prices:
+    >>> for price in result.shadow_prices:
     ...     print(f"{price.text}: {price.multiplier:.2f} a {price.unit}")
     a3 + a4 = 824.0 +- 0.5 mm: 68.85 a mm
     |theta4| <= 1 mrad: 2.88 a mrad

@@ -262,7 +262,7 @@ def _parameters(content: Content) -> Iterator[Block]:
         head[4] = f"U ({k})"
         note = f"U = k u is the expanded uncertainty ({k}, 95 %), from measurement noise and prior."
     tolerance = plot.active_tolerance(result)
-    held = {each.name for each in result.held}
+    held = {each.name for each in result.active_bounds}
     rows = []
     for i, row in enumerate(result.parameter_rows()):
         if free.of_curves[i]:

@@ -291,7 +291,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "headline": headline(result),
         "errors": errors,
         "orientation": orientation_rows(result),
-        "prices": [price._asdict() for price in result.prices],
+        "shadow_prices": [price._asdict() for price in result.shadow_prices],
         "remarks": [*remarks, *result.verdict.beside(result.causes)],
         "likely_causes": list(result.causes),
         "lack_of_fit": lacking and lacking.content(),

@@ -17,7 +17,7 @@ from rpim_opt.basics.files import read_json, write_json
 from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.certificate import Certificate
-from rpim_opt.calibration.diagnosis import Held, Price
+from rpim_opt.calibration.diagnosis import ActiveBound, ShadowPrice
 from rpim_opt.calibration.identify import calibrate, mapped_as
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex import constraints
@@ -222,9 +222,9 @@ class Stored:
     """Optimality gap and violation."""
     trust: Trust | None
     """Equations that a script's loss downweighted or left out."""
-    held: tuple[Held, ...]
+    active_bounds: tuple[ActiveBound, ...]
     """Parameters at an active bound."""
-    prices: tuple[Price, ...]
+    shadow_prices: tuple[ShadowPrice, ...]
     """Multipliers of the constraints."""
     robots: dict[str, Robot]
     """Nominal robots."""
@@ -268,8 +268,8 @@ def content(result: Calibration) -> dict[str, Any]:
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
         x=result.x,
         trust=None if solvable else _trust(result),
-        held=result.held,
-        prices=result.prices,
+        active_bounds=result.active_bounds,
+        shadow_prices=result.shadow_prices,
         robots=dict(result.problem.arms),
         terms={name: _terms(robot.model, robot) for name, robot in result.problem.arms.items()},
         transmission=tuple(curve for robot in result.problem.arms.values() for curve in robot.model.curves),
@@ -314,7 +314,7 @@ def figures(result: Calibration) -> dict[str, Any]:
         "converged": result.converged,
         "message": result.message,
         "iterations": len(result.history),
-        "flagged": result.doubted,
+        "flagged": result.outliers,
         "parameters": result.parameter_rows(),
     }
 
@@ -497,9 +497,9 @@ def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: s
 def _kept(file: Stored, program: Program) -> Kept:
     """Return the values of a script's functions as they were saved; they cannot be called again."""
     if file.trust is None:
-        return Kept(file.held, None, prices=file.prices)
+        return Kept(file.active_bounds, None, shadow_prices=file.shadow_prices)
     keep = np.ones(len(program.model.b), dtype=bool)
     keep[file.trust.left_out] = False
     factor = file.trust.factor**2
     equations = kept_equations(program.model, keep, factor)
-    return Kept(file.held, equations, factor, tuple(file.trust.left_out), file.prices)
+    return Kept(file.active_bounds, equations, factor, tuple(file.trust.left_out), file.shadow_prices)

@@ -231,7 +231,7 @@ def test_what_other_arms_say_is_left_out_where_the_evidence_is_against_it() -> N
         names = [name + unit[d][0] for name, d in zip(free.names, free.dimensions, strict=True)]
         centre = {name: float(v) for name, v, own in zip(names, deviations, robot, strict=True) if own}
         width = {name: 0.2 * float(v) for name, v, own in zip(names, free.scale, robot, strict=True) if own}
-        return ro.bayes.Prior(centre=centre, scale=width, doubted=True)
+        return ro.bayes.Prior(centre=centre, scale=width, optional=True)
 
     right, wrong = (ro.calibrate(few, prior=told(each)) for each in (x, -3 * x))
     plain = ro.calibrate(few)
@@ -316,7 +316,7 @@ def test_blunders_are_left_out_and_named_and_no_good_row_with_them() -> None:
     assert result.learned is not None
     wrong = {POSITION.data.label[i] for i in (4, 17)}
     assert {row.label for row in result.learned.left_out} == wrong
-    assert wrong <= set(result.doubted)
+    assert wrong <= set(result.outliers)
     assert "Excluded outliers: " in result.weight_sentence()
     oracle = ro.calibrate(clean.without(wrong))
     assert np.abs(result.x - oracle.x).max() < 1e-6

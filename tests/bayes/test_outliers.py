@@ -41,7 +41,7 @@ def test_a_sweep_that_the_model_lacks_is_kept_and_said() -> None:
     problem = swept(0, wrong=(17, 55))
     result = ro.calibrate(problem, ro.robust, weight=ro.reml)
     sweep = set(problem.labels[RANDOM:])
-    assert len(sweep & set(result.kept_together)) >= SWEEP - 2
+    assert len(sweep & set(result.clustered)) >= SWEEP - 2
     refit = result.without_flagged()
     assert sweep <= set(refit.problem.labels)
     assert not {problem.labels[17], problem.labels[55]} & set(refit.problem.labels)
@@ -88,7 +88,7 @@ def test_sign_flips_are_survived(seed: int, kind: str) -> None:
     flipped = {problem.labels[row] for row in rows}
     result = ro.calibrate(problem)
     clean = ro.calibrate(arm.problem.without(flipped))
-    assert flipped <= set(result.doubted)
+    assert flipped <= set(result.outliers)
     assert result.errors(arm.true).mean() < 1.1 * clean.errors(arm.true).mean()
 
 

@@ -63,7 +63,7 @@ def bounded_result() -> ro.calibration.Calibration:
 def test_held_parameters_are_at_their_bounds_and_cost_what_loosening_gains() -> None:
     found = bounded_result()
     free = found.problem.parameters.free
-    helds = found.held
+    helds = found.active_bounds
     assert len(helds) > 3
     gains = [h.gain for h in helds]
     assert gains == sorted(gains, reverse=True)
@@ -84,7 +84,7 @@ def test_held_parameters_are_at_their_bounds_and_cost_what_loosening_gains() -> 
 def test_a_multiplier_is_the_slope_of_the_least_objective() -> None:
     found = bounded_result()
     free = found.problem.parameters.free
-    h = found.held[0]
+    h = found.active_bounds[0]
     i = free.names.index(h.name)
     by = 1e-4
 
@@ -101,17 +101,19 @@ def test_a_multiplier_is_the_slope_of_the_least_objective() -> None:
 
 def test_nothing_is_held_without_a_box_or_where_it_is_wide() -> None:
     problem, _ = simulated(noise=5e-5)
-    assert ro.calibrate(problem, ro.tikhonov, 1.0).held == ()
+    assert ro.calibrate(problem, ro.tikhonov, 1.0).active_bounds == ()
     wide = ro.constraints.Box("wide", lambda p: (np.full(len(p), -100.0), np.full(len(p), 100.0)))
-    assert ro.calibrate(problem, ro.Formulation("w", penalty=cp.sum_squares, constraints=(wide,)), 1.0).held == ()
+    assert (
+        ro.calibrate(problem, ro.Formulation("w", penalty=cp.sum_squares, constraints=(wide,)), 1.0).active_bounds == ()
+    )
     ball = ro.Formulation("ball", penalty=cp.sum_squares, constraints=(ro.in_ball(1.0, "*"),))
-    assert ro.calibrate(problem, ball, 1.0).held == ()
+    assert ro.calibrate(problem, ball, 1.0).active_bounds == ()
 
 
 def test_a_fixed_parameter_is_not_held_by_a_tolerance() -> None:
     problem, _ = simulated(noise=5e-5)
     fixed = ro.Formulation("fixed", penalty=cp.sum_squares, constraints=(ro.constraints.at_nominal("a2"),))
-    assert ro.calibrate(problem, fixed, 1.0).held == ()
+    assert ro.calibrate(problem, fixed, 1.0).active_bounds == ()
 
 
 def test_the_factor_of_a_loss_is_its_weight_against_squares() -> None:

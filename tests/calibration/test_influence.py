@@ -92,7 +92,7 @@ def tight() -> ro.CalibrationProblem:
 
 def test_parameters_at_a_bound_stay_there() -> None:
     result = ro.calibrate(tight(), ro.bounded, weight=1e-3)
-    held = {each.name for each in result.held}
+    held = {each.name for each in result.active_bounds}
     assert held
     found = influence(result)
     columns = [found.parameters.index(name) for name in held]

@@ -57,14 +57,14 @@ def test_the_noise_is_compared_with_the_declared() -> None:
 def held(uncertainty: ro.calibration.Uncertainty) -> set[str]:
     """The parameters that the budget marks."""
     frame = uncertainty.to_frame()
-    return {name for name, marked in zip(frame["parameter"], frame["held_back"], strict=True) if marked}
+    return {name for name, marked in zip(frame["parameter"], frame["actively_constrained"], strict=True) if marked}
 
 
 def test_what_active_bounds_do_is_said() -> None:
     instance = ro.load("constrained", "wrong_tolerance")
     u = ro.calibration.Uncertainty(instance.calibrate())
-    assert "a5" in u.result.held_back
-    assert held(u) == set(u.result.held_back)
+    assert "a5" in u.result.actively_constrained
+    assert held(u) == set(u.result.actively_constrained)
     assert "at an active bound" in u._repr_html_()
     with pytest.raises(ro.InputError, match="uncertainty: found formulation 'lasso'"):
         ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.lasso, 1.0))

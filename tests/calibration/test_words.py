@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration import words
 from rpim_opt.calibration.certificate import Certificate
-from rpim_opt.calibration.diagnosis import Flag, Held, Price
+from rpim_opt.calibration.diagnosis import ActiveBound, Flag, ShadowPrice
 from rpim_opt.calibration.identify import ending
 from rpim_opt.calibration.loop import Ended, State
 from tests.calibration.test_loop import state
@@ -45,12 +45,12 @@ def test_a_parameter_without_covariance_has_a_dash() -> None:
 
 def flagged(count: int, squared_loss: bool = False) -> list[str]:
     flags = tuple(Flag(f"r{k}", 10.4 + k, 1.234) for k in range(count))
-    held = tuple(Held("a2", 0.0005, 1.0, 0.05) for _ in range(count))
+    held = tuple(ActiveBound("a2", 0.0005, 1.0, 0.05) for _ in range(count))
     stand_in: Any = SimpleNamespace(
         flagged=flags,
-        kept_together=(),
-        held=held,
-        prices=(Price("a2 by 0.5 mm", "mm", 0.0, 2.0, 0.1, 0.2, 9.0),) * count,
+        clustered=(),
+        active_bounds=held,
+        shadow_prices=(ShadowPrice("a2 by 0.5 mm", "mm", 0.0, 2.0, 0.1, 0.2, 9.0),) * count,
         squared_loss=squared_loss,
         linear_penalty=False,
         problem=RESULT.problem,
@@ -90,8 +90,8 @@ def test_points_beyond_a_table_are_counted_with_the_largest_of_their_errors() ->
 def test_what_a_file_could_not_hold_is_said() -> None:
     stand_in: Any = SimpleNamespace(
         flagged=(),
-        held=(),
-        prices=(),
+        active_bounds=(),
+        shadow_prices=(),
         problem=RESULT.problem,
         x=np.zeros(len(FREE)),
         formulation=replace(ro.tikhonov, solvable=False),

@@ -98,9 +98,9 @@ def test_constrained_calibrations_reproduce_their_reference(variant: str | None)
         assert max(abs(values["alpha3"]), abs(values["beta2"])) < 1e-15
     if variant == "wrong_tolerance":
         assert "Active bound: a5 at" in str(result)
-        assert result.held[0].gain > 1
+        assert result.active_bounds[0].gain > 1
     else:
-        assert all(h.gain < 0.01 for h in result.held)
+        assert all(h.gain < 0.01 for h in result.active_bounds)
 
 
 def test_a_robust_loss_tells_what_a_tolerance_costs_too() -> None:
@@ -110,7 +110,7 @@ def test_a_robust_loss_tells_what_a_tolerance_costs_too() -> None:
         ro.CalibrationProblem(problem.robot, tight, problem.data),
         ro.Formulation("both", ro.huber(), cp.sum_squares, (ro.within_tolerance,), "configuration"),
         1.0,
-    ).held
+    ).active_bounds
     assert [h.name for h in held] == ["a3"]
     assert held[0].gain > 0.1
 

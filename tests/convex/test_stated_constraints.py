@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.calibration.diagnosis import Price
+from rpim_opt.calibration.diagnosis import ShadowPrice
 from rpim_opt.calibration.result import Calibration
 
 HOME = np.zeros((1, 6))
@@ -50,12 +50,12 @@ def loosened(text: str, number: str, by: float) -> str:
     return re.sub(rf"(?<![\d.]){re.escape(stem)}(?=\D*(?:mm|deg|mrad|<=|$))", f"{float(stem) + by:.6f}", text)
 
 
-def priced(text: str, formulation: ro.Formulation = ro.tikhonov) -> Price:
+def priced(text: str, formulation: ro.Formulation = ro.tikhonov) -> ShadowPrice:
     """Return the price of one statement, and hold it against a central difference of the misfit."""
     step = 2e-4
     more, less = (misfit(calibrated(loosened(text, TIGHT[text], by), formulation=formulation)) for by in (step, -step))
     result = calibrated(text, formulation=formulation)
-    (price,) = result.prices
+    (price,) = result.shadow_prices
     assert price.holds
     assert price.slack < 1e-6
     assert price.multiplier == pytest.approx((less - more) / (2 * step), rel=2e-4)
@@ -84,7 +84,7 @@ def test_so_is_that_of_another_loss() -> None:
 
 
 def test_an_equality_is_priced_by_giving_it_a_tolerance() -> None:
-    (price,) = calibrated("a4 = 70 mm").prices
+    (price,) = calibrated("a4 = 70 mm").shadow_prices
     exact, loose = (misfit(calibrated(text)) for text in ("a4 = 70 mm", "a4 = 70 +- 0.00002 mm"))
     assert price.slack == 0
     assert price.multiplier == pytest.approx((exact - loose) / 2e-5, rel=1e-3)  # one-sided: its error is the step's
@@ -95,10 +95,10 @@ def test_ten_statements_together_have_their_own_prices() -> None:
     """Whether or not they hold: multipliers are zero where there is slack, and slack is zero where they are not."""
     texts = (*list(TIGHT)[:7], "a2 - 0.5 a3 <= -134 mm", "a4 = 70 mm", "move at most 3 mm: home")
     result = calibrated(*texts)
-    assert [price.text for price in result.prices] == list(texts)
-    assert {price.text for price in result.prices if not price.holds} >= {"a2 - 0.5 a3 <= -134 mm"}
+    assert [price.text for price in result.shadow_prices] == list(texts)
+    assert {price.text for price in result.shadow_prices if not price.holds} >= {"a2 - 0.5 a3 <= -134 mm"}
     step = 2e-4
-    for text, price in zip(texts[:7], result.prices, strict=False):
+    for text, price in zip(texts[:7], result.shadow_prices, strict=False):
         assert price.holds == (price.multiplier > 0)
         assert (price.slack < 1e-6) == price.holds
         if text not in texts[1:7:3]:  # two of them suffice to see that the others matter
@@ -237,13 +237,13 @@ def test_a_file_keeps_statements_and_their_prices(tmp_path: Path) -> None:
     ro.store.save_result(result, tmp_path / "result.json")
     again = ro.load_result(tmp_path)
     assert again.formulation.solvable
-    for one, other in zip(result.prices, again.prices, strict=True):
+    for one, other in zip(result.shadow_prices, again.shadow_prices, strict=True):
         assert one.text == other.text
         assert one.multiplier == pytest.approx(other.multiplier, rel=1e-4)
     own = replace(result.formulation, loss=lambda r: cp.sum_squares(1.0 * r))
     script = ro.calibrate(result.problem, own, weight=1.0)
     ro.store.save_result(script, tmp_path / "script.json")
-    assert ro.load_result(tmp_path / "script.json").prices == script.prices
+    assert ro.load_result(tmp_path / "script.json").shadow_prices == script.shadow_prices
 
 
 def test_parameters_that_are_not_identified_are_nominal() -> None:
@@ -258,4 +258,4 @@ def test_parameters_that_are_not_identified_are_nominal() -> None:
 
 def test_intervals_say_which_parameters_are_held_back() -> None:
     result = calibrated("a3 + d4 = 572.00 +- 0.05 mm", "a2 - 0.5 a3 <= -100 mm")
-    assert set(result.held_back) == {"a3", "d4"}
+    assert set(result.actively_constrained) == {"a3", "d4"}

@@ -35,7 +35,7 @@ def test_a_drawing_makes_the_arm_better() -> None:
     """True statements about it: the ten of the variant, against nothing besides the data."""
     plain, drawn = ro.load("constrained"), ro.load("constrained", "drawing")
     before, after = plain.calibrate(), drawn.calibrate()
-    assert len(after.prices) == 10
+    assert len(after.shadow_prices) == 10
     assert before.converged
     assert after.converged
     assert after.errors(drawn.validation).mean() < 0.85 * before.errors(plain.validation).mean()
@@ -48,10 +48,10 @@ def test_reports_say_what_statements_cost(tmp_path: Path) -> None:
     assert said.exit_code == 0, said.output
     printed = json.loads(said.stdout)
     result = ro.load_result(out)
-    prices = json.loads((out / "result.json").read_text(encoding="utf-8"))["prices"]
-    assert [price["text"] for price in prices] == [price.text for price in result.prices]
-    assert [price["multiplier"] for price in printed["prices"]] == [price["multiplier"] for price in prices]
-    sentence = next(price for price in result.prices if price.holds).sentence()
+    prices = json.loads((out / "result.json").read_text(encoding="utf-8"))["shadow_prices"]
+    assert [price["text"] for price in prices] == [price.text for price in result.shadow_prices]
+    assert [price["multiplier"] for price in printed["shadow_prices"]] == [price["multiplier"] for price in prices]
+    sentence = next(price for price in result.shadow_prices if price.holds).sentence()
     assert "would lower the objective by" in sentence
     assert sentence in printed["remarks"]
     assert sentence in str(result)

@@ -97,7 +97,7 @@ NAMED = {
     "whether it is simulated": (("record", "simulated"), True),
     "when it was made": (("record", "made"), "2020-01-01T00:00:00+00:00"),
     "the certificate": (("certificate", "decrease"), 1e-15),
-    "a held parameter": (("held",), [{"name": "d5", "bound": 0.0, "multiplier": 0.0, "gain": 0.0}]),
+    "a held parameter": (("active_bounds",), [{"name": "d5", "bound": 0.0, "multiplier": 0.0, "gain": 0.0}]),
     "the nominal figures": (("nominal", "validation", "mean_mm"), 9.9),
     "the validation's figures": (("validation", "mean_mm"), 0.001),
     "the identification's figures": (("identification", "max_mm"), 0.001),
