@@ -84,4 +84,6 @@ def validate(model: type[Model], content: dict[str, Any], file: object) -> Model
         if first["type"] == "missing":
             raise InputError(f"key {where}", "nothing", "this key is required", file) from None
         wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
+        if first["type"] in ("too_short", "too_long"):
+            wanted = f"a list of {wanted.partition('should have ')[2].partition(' after')[0]}"
         raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None

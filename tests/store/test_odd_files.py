@@ -37,7 +37,7 @@ PROBLEMS = {
         "position", "[noise]", "[record]\nnotes = ' '\n[noise]", "0 characters, accepted: 1 to"
     ),
     "an acceptance of one side": (
-        "position", "[noise]", "[acceptance]\nlimit_mm = 0.1\nx_mm = [1.0]\n[noise]", "[low, high]"
+        "position", "[noise]", "[acceptance]\nlimit_mm = 0.1\nx_mm = [1.0]\n[noise]", "a list of at least 2 items"
     ),
 }  # fmt: skip
 
