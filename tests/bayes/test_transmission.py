@@ -69,7 +69,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     page = report.page(result)
     assert "transmission2_c1" not in page
     assert "Joint 2: 0." in page
-    assert "parameter combinations are identifiable from 360 equations, apart from the transmission errors" in page
+    assert "parameter combinations are identifiable from 360 equations, without the transmission errors" in page
 
 
 def test_beyond_the_measured_angles_the_interval_returns_to_the_prior(rippled):
