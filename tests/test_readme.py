@@ -193,7 +193,7 @@ def test_where_others_do_as_well_is_the_studys() -> None:
         assert complete(errors) - well == {STRUCTURAL}
     errors = errors_of_peers("clean10")
     assert abs(times(errors[MAP], errors[OURS]) - 1) < AS_WELL
-    assert "figaroh's priors, told the noise, do as well with ten" in PEERS
+    assert "figaroh's priors, given the noise, do as well with ten" in PEERS
     told = studies.load_study(studies.find_study("peers")).METHODS
     assert "noise" in told[MAP]
     assert "noise" not in told[OURS]
@@ -213,8 +213,8 @@ def test_by_how_much_others_are_better_is_the_studys() -> None:
 
 
 def test_where_the_difference_is_is_the_studys() -> None:
-    """Few data, blunders and sag, with the figures that the list of studies has of them."""
-    assert "The difference is few data, blunders and sag." in PEERS
+    """Few data, gross errors and sag, with the figures that the list of studies has of them."""
+    assert "The difference is few data, gross errors and sag." in PEERS
     few, some, clean, blunders, sag = map(errors_of_peers, ("clean10", "clean25", "clean52", "blunders52", "physics52"))
     least_squares = times(few["scipy, lm"], few[OURS])
     assert least_squares > 1.2
@@ -289,7 +289,7 @@ def test_figures_of_real_arms_in_texts_are_the_studys() -> None:
     rows = rows_of("real_data")
     counts = (10, 20, None)
     geometry = [over([row for row in rows if (row["count"] or None) == count], "learned", "reml") for count in counts]
-    said = "geometry alone has {} and {} of REML's error with 10 and 20 configurations, and {} with all"
+    said = "with geometry alone the ratios to REML are {} (10), {} (20) and {} (all)"
     assert said.format(*geometry) in README
     ten = [row for row in rows if row["count"] == 10]
     auto = [over(ten, AUTO, other) for other in ("least squares", "reml")]
@@ -303,7 +303,7 @@ def test_figures_of_real_arms_in_texts_are_the_studys() -> None:
     assert f"{said.format(*squares, *reml)} of that of one weight by REML" in STUDIES
     assert f"Of the held-out readings {100 * np.mean([row[f'{AUTO}, covers'] for row in rows]):.0f} % are" in STUDIES
     others = [row[AUTO] / row["reml"] for row in rows if "cable" not in row["name"]]
-    assert f"none is above {max(others):.2f}" in README
+    assert f"none exceeds {max(others):.2f}" in README
 
 
 def test_figures_of_simulated_arms_in_texts_are_the_studys() -> None:

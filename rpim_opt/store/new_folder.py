@@ -223,7 +223,7 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
     if not known:
         raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
     if chain in known:
-        raise InputError("--chain", f"'{chain}', which is there", "a name of its own for every chain", folder)
+        raise InputError("--chain", f"'{chain}', which is there", "a unique name for every chain", folder)
     if read_bytes(folder / ROBOT_OF_CHAINS) != urdf_text(robot):
         raise InputError("the robot", f"another one than {ROBOT_OF_CHAINS}", "the same URDF for all chains", robot)
     return read_bytes(folder / "problem.toml")
