@@ -94,28 +94,13 @@ def new_problem(
 ) -> Started:
     """Make a problem folder that `load` reads, completely or not at all.
 
-    Parameters
-    ----------
-    folder
-        A new one; or one whose problem file has chains of the same URDF, for one more.
-    robot, data, measurement, options, urdf_base, urdf_tip, dh
-        As for `understand_tables`.
-    validation
-        A table of measurements for validation.
-    hold_out, seed
-        Instead of that, which part of the configurations to hold out, drawn at random.
-    chain
-        What to call the chain in a problem on the origins of a URDF's joints, ``[chain.NAME]``. One that goes up the
-        tree through joints that move and down again is such a problem, and called as its tip where nothing is stated.
-    target
-        What a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``.
-    understood
-        Called with what was understood of the tables, before anything is computed.
-
-    Raises
-    ------
-    InputError
-        For a folder that is there already, and whatever of the robot or the data cannot be used.
+    Arguments that are not named here are as for `understand_tables`. ``folder`` is a new one, or for one more chain
+    one whose problem file has chains of the same URDF. ``validation`` is a table, or ``hold_out`` the part of the
+    configurations that is drawn at random with ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem on the
+    origins of a URDF's joints; a chain that goes up the tree through joints that move and down again always is one.
+    ``target`` is what a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is called
+    with what was understood of the tables, before anything is computed. Raises InputError for a folder that is there
+    already, and whatever of the robot or the data cannot be used.
 
     Examples
     --------

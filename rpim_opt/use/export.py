@@ -43,18 +43,8 @@ Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 def identified(result: Calibration, marker: str | None = None) -> Described:
     """Return the identified robot, its base in the instrument's frame, and a reflector as tool.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    marker
-        Which reflector; the first by default.
-
-    Raises
-    ------
-    InputError
-        Naming the identified parameters that no description of a robot holds: ratios, harmonics, backlash, what
-        gravity does (compliances, bends), terms of a user's own; for a marker that is not known.
+    ``marker`` names the reflector, the first by default. Refused are identified parameters that no description of a
+    robot holds (ratios, harmonics, backlash, compliances, bends, terms of a user's own), and unknown markers.
 
     Examples
     --------
@@ -98,38 +88,16 @@ def export_files(
 
     Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    out
-        Where to write what corrects a file; of several the folder.
-    urdf, ur_kinematics, camera_info
-        Files of the nominal robot to correct: a URDF, ``kinematics.yaml`` of ROS for a Universal Robot, a camera's YAML
-        of ROS (``camera_info_url``).
-    mdh, robodk
-        Files to write: MDH parameters (.csv, .json, .toml), RoboDK's four numbers a joint (.csv).
-    corrections
-        CSV file to write with the transmission errors of the calibration as a whole, ``joint``, ``angle_deg`` (of the
-        model), ``correction_mrad``, ``std_mrad``: a joint stands at its angle plus the correction, so that it is
-        subtracted from a command. They belong to the geometry of the whole model, which no other file holds.
-    marker
-        The reflector that is the tip.
-    despite_verdict
-        Write a robot that is not delivered, too, with a note in every file.
-    frames
-        ``root`` and ``tip`` of `export_urdf`.
+    ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS for a Universal Robot) and ``camera_info`` (a camera's YAML
+    of ROS) are files of the nominal robot to correct, which go to ``out``, of several a folder. ``mdh`` (.csv, .json,
+    .toml), ``robodk`` (.csv, four numbers a joint) and ``corrections`` are files to write, the last one the
+    transmission errors of the whole model: ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``.
+    A joint stands at its angle plus the correction: subtract it from a command. ``marker`` is the reflector that is the
+    tip, ``frames`` are ``root`` and ``tip`` of `export_urdf`; with ``despite_verdict`` a robot that is not delivered is
+    written, too, with a note in every file.
 
-    Returns
-    -------
-    The files, and sentences on what they do not hold.
-
-    Raises
-    ------
-    NotDelivered
-        For a calibration that is not delivered.
-    InputError
-        Where there is nothing to write, or a file cannot hold what was identified.
+    Returned are the files, and sentences on what they do not hold. Raises NotDelivered for a calibration that is not
+    delivered, InputError where there is nothing to write, or a file cannot hold what was identified.
     """
     whole = result
     result, notes = geometry_alone(whole)
@@ -247,18 +215,9 @@ def export_urdf(
     sentence for each of the two frames that was identified, the place in the frames of the file's links: of the root in
     the instrument's frame, of the reflector in the tip link's.
 
-    Parameters
-    ----------
-    result
-        The calibration.
-    source, target
-        The original, and where to write.
-    root, tip
-        Names of the links between which the robot is, as for `read_urdf`.
-    marker
-        The reflector that is the tip. Of several none is, unless it is named.
-    despite_verdict
-        As for `export_files`.
+    ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`.
+    ``marker`` is the reflector that is the tip; of several none is, unless it is named. ``despite_verdict`` as for
+    `export_files`.
 
     Examples
     --------
