@@ -44,7 +44,7 @@ MANY_REFUSED = 6
 """Refused steps in a row after which a small promise is the solver's noise; the certificate judges that."""
 STALLED = 10
 """Iterations after which an objective that did not fall is the least; the certificate judges that."""
-FEW = 10
+FEW_ITERATIONS = 10
 """Iterations that are too few to begin with a weight that no rule was asked for."""
 NEAR_FIRST = 0.01
 """Share of the solution that the next step at the first weight may be when the rule is asked: it would not tell."""
@@ -159,7 +159,7 @@ class Loop:
         choice = state.choice
         if choice.settled:
             return state
-        if choice.robust and not choice.answers and self.options.max_iterations > FEW:
+        if choice.robust and not choice.answers and self.options.max_iterations > FEW_ITERATIONS:
             # where weight 1 leads: at nominal the answer would be about outliers that no fit has shown yet
             return state.weighted(replace(choice, weight=1.0, settled=True))
         choice = choice.asked(self._judged(state))

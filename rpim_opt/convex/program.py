@@ -111,7 +111,7 @@ class Program(Brief):
     formulation: Formulation
     model: LinearModel
     structure: Structure
-    _kept: dict[str, Any] = field(default_factory=dict)  # shared with all programs that `on` makes of this
+    _warm: Warm  # shared with all programs that `on` makes of this
     _values: dict[Any, tuple[float, float]] = field(default_factory=dict, init=False)  # loops ask for a point again
 
     def __reduce__(self) -> Any:
@@ -122,7 +122,7 @@ class Program(Brief):
 
     def on(self, model: LinearModel) -> Program:
         """Return the program for another model of the same shape, without calling the functions anew."""
-        return Program(self.formulation, model, self.structure, self._kept)
+        return Program(self.formulation, model, self.structure, self._warm)
 
     def anew(self, formulation: Formulation, model: LinearModel, z: Array) -> Program:
         """Return the program with the formulation's functions called anew, warm-started at z (n,).
@@ -135,20 +135,19 @@ class Program(Brief):
         return again.beginning(z)
 
     def apart(self, model: LinearModel) -> Program:
-        """Return the program for another model, with a warm start of its own."""
-        return replace(self, model=model, _kept={"warm": self._warm.begun(self._warm.z)})
+        """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
+        return Program(self.formulation, model, self.structure, self._warm.begun(self._warm.z))
 
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""
-        if "squares" not in self._kept:
-            made = self.structure.on_squares()
-            self._kept["squares"] = made, {"warm": Warm(made.canonical)}
-        made, kept = self._kept["squares"]
-        return Program(made.formulation, model, made, kept)
+        if self._warm.squares is None:
+            self._warm.squares = Warm(self.structure.on_squares())
+        warm = self._warm.squares
+        return Program(warm.structure.formulation, model, warm.structure, warm)
 
     def beginning(self, z: Array) -> Program:
-        """Return the program with a warm start at z (n,)."""
-        self._kept["warm"] = self._warm.begun(z)
+        """Return the same program, whose next minimum is looked for from z (n,) on."""
+        self._warm.begin(z)
         return self
 
     # --- structure -----------------------------------------------------------------------------------------------
@@ -223,12 +222,6 @@ class Program(Brief):
     def _squares(self) -> Squares | None:
         """A quadratic loss, reduced to n + 1 rows."""
         return None if self.loss_form is None else Squares.of_factor(self.squared.triangle)
-
-    @property
-    def _warm(self) -> Warm:
-        if "warm" not in self._kept:
-            self._kept["warm"] = Warm(self.structure.canonical)
-        return self._kept["warm"]
 
     # --- values --------------------------------------------------------------------------------------------------
 
@@ -580,11 +573,13 @@ def _sides(lower: Array, upper: Array) -> np.ndarray:
     return np.concatenate([np.flatnonzero(side) for side in box_sides(lower, upper)])
 
 
-def pose(formulation: Formulation | str, model: LinearModel) -> Program:
+def pose(
+    formulation: Formulation | str, model: LinearModel, forms: Sequence[Quadratic | None] | None = None
+) -> Program:
     """Return the program of a formulation, or of the ready one of that name, on a linear model A z ~ b.
 
-    The formulation's functions are called now, once. InputError where they do not return convex expressions and
-    constraints of CVXPY.
+    The formulation's functions are called now, once; of one that is not ``solvable`` the quadratic ``forms`` of loss
+    and penalty may be known. InputError where they do not return convex expressions and constraints of CVXPY.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -594,4 +589,5 @@ def pose(formulation: Formulation | str, model: LinearModel) -> Program:
     (True, 2)
     """
     formulation = formulation_of(formulation)
-    return Program(formulation, model, structure(formulation, model))
+    made = structure(formulation, model, forms)
+    return Program(formulation, model, made, Warm(made))

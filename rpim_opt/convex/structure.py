@@ -1,4 +1,8 @@
-"""Expressions of a formulation for data of one shape, and their structure, which selects the solver."""
+"""What a formulation's functions return for data of one shape, and the structure by which they are solved.
+
+What is canonicalized lives as long as its `Structure`: a calibration long, or of a ready formulation until `MOST_KEPT`
+others came. Warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
+"""
 
 from __future__ import annotations
 
@@ -40,7 +44,7 @@ from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (SQUARES, NORM2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its QR factor."""
-FEW = 20_000
+MOST_CANONICALIZED = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
 
@@ -441,7 +445,7 @@ def invariant(formulation: Formulation, equations: Callable[[], int]) -> bool:
     if formulation.ready:
         return False
     count = equations()
-    if count > FEW:
+    if count > MOST_CANONICALIZED:
         return False
     form = _loss_form(formulation, count)
     return form is not None and form.diagonal and not form.c.any() and bool(np.ptp(form.L) == 0)

@@ -23,11 +23,10 @@ from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex import constraints
 from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, lost
-from rpim_opt.convex.program import Program
+from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import SELECTORS, Selector
-from rpim_opt.convex.structure import structure
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
@@ -437,7 +436,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
     formulation = formulation_of(file.formulation, file.definition)
     model = around(problem.linearize(file.x), file.x)
-    program = Program(formulation, model, structure(formulation, model, file.forms))
+    program = pose(formulation, model, file.forms)
     learned = file.learned if not file.record.earlier else None
     weight: float | Selector | None = None  # estimated, as it was
     if learned is None:

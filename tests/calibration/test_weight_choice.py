@@ -258,7 +258,7 @@ def test_a_rule_is_asked_however_few_the_passes(passes: int) -> None:
 
 
 def test_a_rule_is_asked_at_last_where_passes_run_out_on_the_way(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(loop, "FEW", 1)
+    monkeypatch.setattr(loop, "FEW_ITERATIONS", 1)
     result = ro.calibrate(ro.load("blunders").problem, ro.robust, rule(3.0), max_iterations=2)
     assert not result.converged
     assert result.selection is not None

@@ -133,7 +133,7 @@ def test_kinks_of_many_rows_are_those_of_all_rows_in_one_program(monkeypatch: py
     mine = ro.Formulation("mine", penalty=cp.norm1, **LOSSES[loss])
     many = ro.convex.pose(mine, model)
     found = [many.solve(weight).z for weight in (1.0, 100.0, 10.0)]  # the later ones start warm
-    monkeypatch.setattr("rpim_opt.convex.solvers.solve.FEW", 10_000)
+    monkeypatch.setattr("rpim_opt.convex.solvers.solve.FEW_ENTRIES", 10_000)
     one = ro.convex.pose(mine, model)
     for z, weight in zip(found, (1.0, 100.0, 10.0), strict=True):
         least = one.objective(one.solve(weight).z, weight)

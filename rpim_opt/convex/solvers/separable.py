@@ -26,8 +26,8 @@ INTERIOR = 1e-10
 """The same where an interior point solves the small program, which is no more exact."""
 STEPS = 60
 """Newton steps of one smoothing width."""
-FEW = 400
-"""Entries of a non-smooth loss up to which Clarabel takes them all as they are."""
+FEW_ENTRIES = 400
+"""Entries of a loss up to which Clarabel takes them all as they are, where that is quicker."""
 NEAR = 12
 """Times the number of parameters: rows near a kink that are taken as they are."""
 SMOOTHED = 0.02

@@ -5,13 +5,16 @@ from __future__ import annotations
 import threading
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.solvers.conic import EQUILIBRATED, Canonical, Damping, Point, Small, Squares, Unsolved
-from rpim_opt.convex.solvers.separable import FEW, TINY, Loss, Newton, OutsideDomain, Rows
+from rpim_opt.convex.solvers.separable import FEW_ENTRIES, TINY, Loss, Newton, OutsideDomain, Rows
+
+if TYPE_CHECKING:
+    from rpim_opt.convex.structure import Structure
 
 GENERATIONS = 40
 """Working sets of entries before all rows are taken."""
@@ -25,28 +28,38 @@ GAP = 1e-8
 class Warm:
     """Warm start of the next solution: point, smoothing width, sizes of working sets, Clarabel's data."""
 
-    penalty: Canonical
+    structure: Structure
     z: Array | None = None
     x: Array | None = None
     width: float = 0.0
     count: int = 0
-    small: dict[int, Small] = field(default_factory=dict)
-    direct: dict[int, Small] = field(default_factory=dict)
+    small: dict[Any, Small] = field(default_factory=dict)
     kink: float = -1.0
+    squares: Warm | None = None
     lock: Any = field(default_factory=threading.RLock)
 
-    def program(self, rows: int) -> Small:
-        """Return the small program with so many rows of squares."""
-        if rows not in self.small:
-            self.small[rows] = Small(self.penalty, rows)
-        return self.small[rows]
+    @property
+    def penalty(self) -> Canonical:
+        """Penalty and constraints in canonical form."""
+        return self.structure.canonical
+
+    def program(self, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None) -> Small:
+        """Return the small program with so many rows of squares, and with all rows of a loss."""
+        key = rows, loss is None
+        if key not in self.small:
+            self.small[key] = Small(self.penalty, rows, loss, sizes)
+        return self.small[key]
+
+    def begin(self, z: Array | None) -> Warm:
+        """Forget all but z (n,), where the next minimum is looked for, or that too."""
+        with self.lock:
+            self.z = self.x = z if z is not None and len(self.penalty.at) == self.penalty.size else None
+            self.width, self.count, self.small = 0.0, 0, {}
+        return self
 
     def begun(self, z: Array | None) -> Warm:
-        """Return a copy that shares the constant data, with its start at z (n,) or without one."""
-        other = Warm(self.penalty, kink=self.kink)
-        if z is not None and len(self.penalty.at) == self.penalty.size:
-            other.z, other.x = z, z
-        return other
+        """Return another one, to begin at z (n,) or anew."""
+        return Warm(self.structure, kink=self.kink).begin(z)
 
 
 def minimum(
@@ -64,7 +77,7 @@ def minimum(
     quadratic                  the small program of its QR factor
     separable, smooth          proximal Newton, a sequence of small programs
     separable, non-smooth      the same on the smoothed loss, then rows near kinks
-    of at most `FEW` entries   all rows as they are, where that is quicker (`_whole`)
+    at most `FEW_ENTRIES`      all rows as they are, where that is quicker (`_whole`)
     with a threshold           entries near a kink as they are, tangents of others
     any other                  all rows
     ========================== =====================================================
@@ -88,7 +101,7 @@ def minimum(
 
 
 def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
-    few = loss.variable.size <= FEW
+    few = loss.variable.size <= FEW_ENTRIES
     if few and _whole(loss, warm):
         return _all_rows(loss, rows, warm, weight, None, damping)
     if warm.kink < 0:
@@ -143,9 +156,8 @@ def _all_rows(
     n = rows.A.shape[1]
     terms = _beside(squares, n, damping)
     count = 0 if terms is None else n + 1
-    if count not in warm.direct:
-        warm.direct[count] = Small(warm.penalty, count, loss.canonical, rows.sizes if loss.positive else None)
-    return warm.direct[count].solve(terms, weight, rows.A, rows.b)
+    whole = warm.program(count, loss.canonical, rows.sizes if loss.positive else None)
+    return whole.solve(terms, weight, rows.A, rows.b)
 
 
 def _coupled(
@@ -157,7 +169,7 @@ def _coupled(
     that then have other slopes are added, until the bound is reached. Of any other loss all rows are taken.
     """
     n, at = rows.A.shape[1], warm.penalty.at
-    if loss.variable.size <= FEW or loss.threshold is None:
+    if loss.variable.size <= FEW_ENTRIES or loss.threshold is None:
         return _all_rows(loss, rows, warm, weight, squares, damping)
     terms = _beside(squares, n, damping) or Squares(np.zeros((0, n)), np.zeros(0), np.zeros(n))
     z = warm.z
