@@ -165,7 +165,7 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     ro.report.write_report(second, tmp_path / "report.html")
     page = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert last.digest in page
-    assert "changed since: theta4" in page
+    assert "changed since then: theta4" in page
     assert "What each selector takes" not in page  # weight 1 joins both sets of data, no other one does
 
 
@@ -177,7 +177,7 @@ def test_an_update_that_released_nothing_is_reported(monkeypatch, tmp_path) -> N
     assert run(monkeypatch, "update", str(tmp_path), validation, "--out", out) == 0
     assert run(monkeypatch, "report", out) == 0
     page = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
-    assert "changed since: no identifiable combination" in page
+    assert "changed since then: no identifiable combination" in page
 
 
 def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:
