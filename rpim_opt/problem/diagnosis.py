@@ -322,17 +322,6 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
             yield f"joints reach {np.degrees(largest):.0f} deg: degrees given as radians?"
         if largest < np.radians(2 * np.pi):
             yield "no joint leaves 6.3 deg: radians given as degrees?"
-    reach = float(np.sum(np.abs(robot.mdh[:, [1, 3]])))
-    for block in problem.data.blocks:
-        lengths = [i for i, d in enumerate(block.measurement.columns.values()) if d == "length"]
-        if not lengths or len(block.row) < 2:
-            continue
-        size = float(np.ptp(block.y[:, lengths], axis=0).max())
-        sizes = f"measured values spread over {size:.3g} m, the robot reaches {reach:.3g} m"
-        if size > 20 * reach:
-            yield f"{sizes}: millimetres given as metres?"
-        elif size < reach / 200:
-            yield f"{sizes}: metres given as millimetres?"
     for block in problem.data.blocks:
         if block.y.shape[1] < 3:
             continue
