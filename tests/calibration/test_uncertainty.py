@@ -65,7 +65,7 @@ def test_what_active_bounds_do_is_said() -> None:
     u = ro.calibration.Uncertainty(instance.calibrate())
     assert "a5" in u.result.actively_constrained
     assert held(u) == set(u.result.actively_constrained)
-    assert "at an active bound" in u._repr_html_()
+    assert "At an active bound" in u._repr_html_()
     with pytest.raises(ro.InputError, match="uncertainty: found formulation 'lasso'"):
         ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.lasso, 1.0))
     with pytest.raises(ro.InputError, match="confidence: found 95"):
