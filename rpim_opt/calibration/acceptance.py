@@ -265,7 +265,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     >>> result = ro.load("position").calibrate()
     >>> box = ((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9))
     >>> print(ro.calibration.accept(result, ro.data.Requirement(2e-4, box=box)).sentences()[0])
-    Accepted: limit 0.2 mm with 95 % at every configuration of the region.
+    Accepted: limit 0.2 mm with 95 % confidence at every configuration of the region.
     """
     requirement = requirement or result.record.requirement
     if requirement is None:

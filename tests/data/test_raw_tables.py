@@ -244,7 +244,7 @@ def test_a_common_column_counts_beside_a_pair_of_other_names(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("joints", "values", "key", "said"),
     [
-        (JOINTS, VALUES + "c,1,2,3\n", "row", "2 rows of joints and 3 measured, accepted: as many of both"),
+        (JOINTS, VALUES + "c,1,2,3\n", "row", "2 rows of joints and 3 measured, accepted: equal numbers of both"),
         (JOINTS.replace("b,3", "a,3"), VALUES, "", "'a' twice in"),
         (JOINTS, VALUES, "time", "found 'time'"),
         (JOINTS, VALUES, "row", "2 of 2 rows whose name is the name of another row"),

@@ -206,7 +206,7 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     assert "no column in both first.csv and second.csv" in capsys.readouterr().err
     points.write_text(text([["Point", *HEAD[7:]]], [[f"Q{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
-    assert "no value that first.csv and second.csv share, accepted: --key with a column" in capsys.readouterr().err
+    assert "no common value in first.csv and second.csv, accepted: --key with a column" in capsys.readouterr().err
     points.write_text(text([["Point", *HEAD[7:]]], [[f"P{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
     said = capsys.readouterr().out

@@ -114,7 +114,7 @@ def test_without_validation_data_a_row_says_so() -> None:
     found = ro.compare(POSITION.problem, selectors=1.0, progress=False)
     assert found.rows[0]["status"] == "impossible"
     assert "no validation data" in found.rows[0]["reason"]
-    with pytest.raises(ro.InputError, match="no replicate with figures; impossible: splits: found no validation data"):
+    with pytest.raises(ro.InputError, match="no replicate with results; impossible: splits: found no validation data"):
         found.summary()
 
 
@@ -174,7 +174,7 @@ def test_noise_that_is_added_is_declared_and_of_the_right_size() -> None:
         ({"seeds": 10**400}, "seeds: found 10000.*, accepted: at most 100000 draws"),
         ({"methods": "newton"}, "methods: found 'newton', accepted: a function of the problem, nominal"),
         ({"metrics": "rms"}, r"metrics: found 'rms', accepted: a function of a fit, rms_mm"),
-        ({"splits": 1}, "splits: found 1, accepted: 'folder', a part"),
+        ({"splits": 1}, "splits: found 1, accepted: 'folder', a fraction"),
         ({"splits": "half"}, "splits: found 'half'"),
         ({"splits": math.inf}, "splits: found inf"),
         ({"splits": [5, 1e308]}, r"splits: found 1e\+308, .* 2 to 10000"),

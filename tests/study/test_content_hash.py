@@ -175,7 +175,7 @@ def test_the_code_of_a_script_is_that_of_its_files(tmp_path: Path) -> None:
 def test_functions_of_a_session_have_no_file(monkeypatch: pytest.MonkeyPatch) -> None:
     typed = closure(2.0)
     typed.__module__ = "__main__"
-    monkeypatch.delattr(sys.modules["__main__"], "__file__")
+    monkeypatch.delattr(sys.modules["__main__"], "__file__", raising=False)
     with pytest.raises(ro.InputError, match=r"journal: found .* of an interactive session"):
         content_hash(typed, "journal")
 
