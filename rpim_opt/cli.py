@@ -535,6 +535,9 @@ def export(
     ur_kinematics: Annotated[
         File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")
     ] = None,
+    ur_calibration: Annotated[
+        File, Option(help="calibration.conf copied from a Universal Robot's controller; corrected file to --out.")
+    ] = None,
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
     mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
@@ -553,7 +556,7 @@ def export(
         from rpim_opt.use.export import export_files
 
         written, notes = export_files(
-            loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, camera_info=camera_info,
+            loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, camera_info=camera_info,
             mdh=mdh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
             marker=marker, despite_verdict=despite_verdict,
         )  # fmt: skip

@@ -8,6 +8,7 @@ import os
 import re
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -27,7 +28,7 @@ from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.use.validation import validate
 from tests import SHARED
-from tests.robot.test_exchange import YAML_PLAIN
+from tests.robot.test_exchange import CONF, YAML_PLAIN
 from tests.simulate import ARM, simulated
 from tests.test_cli import no_luck, run
 
@@ -393,6 +394,29 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     assert "a robot whose parameters were identified from this file's" in capsys.readouterr().err
     assert not (tmp_path / "again.json").exists()
     assert not (tmp_path / "both").exists()
+
+
+def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
+    (tmp_path / "calibration.conf").write_text(CONF)
+    nominal = ro.read_robot(Path(ro.__file__).parent / "robot" / "ready" / "ur10.toml")
+    problem, _ = simulated(robot=nominal, identify=("alpha?", "a?", "theta?", "d?", "beta[23]"), size=0.3)
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    ro.store.save_result(result, tmp_path / "result.json")
+    assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", str(tmp_path / "calibration.conf"),
+               "--out", str(tmp_path / "new.conf")) == 0  # fmt: skip
+    assert "alpha1 and a1" in capsys.readouterr().out
+    assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", "none.conf", "--out", "new.conf") == 2
+    assert "copied from its controller" in capsys.readouterr().err
+    read, q = (
+        ro.robot.read_ur_calibration(tmp_path / "new.conf", nominal),
+        np.random.default_rng(0).uniform(-2, 2, (9, 6)),
+    )
+    mdh = result.robot.mdh.copy()
+    mdh[0, :2] = nominal.mdh[0, :2]  # where the base is, not how the robot is
+    there = ro.robot.forward_kinematics(replace(nominal, mdh=mdh), q)
+    found = ro.robot.forward_kinematics(read.robot, q)
+    bridge = np.linalg.inv(there) @ found  # one constant tool, read as such
+    assert np.abs(bridge - bridge[0]).max() < 1e-9
 
 
 def test_another_payload_is_compensated_for(monkeypatch, capsys, tmp_path) -> None:

@@ -10,6 +10,7 @@ from .formats.tables import write_robodk as write_robodk
 from .formats.tables import write_robot as write_robot
 from .formats.universal_robots import read_ur_calibration as read_ur_calibration
 from .formats.universal_robots import read_ur_kinematics as read_ur_kinematics
+from .formats.universal_robots import write_ur_calibration as write_ur_calibration
 from .formats.universal_robots import write_ur_kinematics as write_ur_kinematics
 from .formats.urdf import read_urdf as read_urdf
 from .formats.urdf import write_origins as write_origins

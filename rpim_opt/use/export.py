@@ -31,7 +31,7 @@ from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import write_robodk, write_robot
-from rpim_opt.robot.formats.universal_robots import write_ur_kinematics
+from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
@@ -76,6 +76,7 @@ def export_files(
     *,
     urdf: Path | None = None,
     ur_kinematics: Path | None = None,
+    ur_calibration: Path | None = None,
     camera_info: Path | None = None,
     mdh: Path | None = None,
     robodk: Path | None = None,
@@ -88,13 +89,13 @@ def export_files(
 
     Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
 
-    ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS for a Universal Robot) and ``camera_info`` (a camera's YAML
-    of ROS) are files of the nominal robot to correct, which go to ``out``, of several a folder. ``mdh`` (.csv, .json,
-    .toml), ``robodk`` (.csv, four numbers a joint) and ``corrections`` are files to write, the last one the
-    transmission errors of the whole model: ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``.
-    A joint stands at its angle plus the correction: subtract it from a command. ``marker`` is the reflector that is the
-    tip, ``frames`` are ``root`` and ``tip`` of `export_urdf`; with ``despite_verdict`` a robot that is not delivered is
-    written, too, with a note in every file.
+    ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS) and ``ur_calibration`` (``calibration.conf``) of a
+    Universal Robot and ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to
+    ``out``, of several a folder. ``mdh`` (.csv, .json, .toml), ``robodk`` (.csv, four numbers a joint) and
+    ``corrections`` are files to write, the last one the transmission errors of the whole model: ``joint``,
+    ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``. A joint stands at its angle plus the correction:
+    subtract it from a command. ``marker`` is the reflector that is the tip, ``frames`` are ``root`` and ``tip`` of
+    `export_urdf`; with ``despite_verdict`` a robot that is not delivered is written, too, with a note in every file.
 
     Returned are the files, and sentences on what they do not hold. Raises NotDelivered for a calibration that is not
     delivered, InputError where there is nothing to write, or a file cannot hold what was identified.
@@ -106,6 +107,7 @@ def export_files(
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
         (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, marker).robot, target)),
+        (ur_calibration, partial(export_ur_calibration, result)),
         (camera_info, partial(export_camera, result)),
     ]
     sources = [(source, write) for source, write in corrected if source]
@@ -126,7 +128,9 @@ def export_files(
     ]
     writers += [(target, write) for target, write in plain if target]
     if not writers:
-        accepted = "--urdf, --ur-kinematics, --camera-info, --mdh, --robodk, --corrections, one or several"
+        accepted = (
+            "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections, one or several"
+        )
         raise InputError("export", "nothing to write", accepted)
     said = write_all(writers, note)
     requirement = whole.record.requirement
@@ -281,6 +285,26 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
     write_origins(source, parts, target)
     frames = sorted({own_name(name).partition("_")[0] for name in others})
     return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []
+
+
+def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
+    """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
+    robot = identified(result).robot
+    nominal = result.problem.robot
+    if np.abs(nominal.mdh[0, :2]).max() > 0:
+        raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
+    mdh = robot.mdh.copy()
+    mdh[0, :2] = 0.0
+    write_ur_calibration(source, replace(robot, mdh=mdh), nominal, target)
+    notes = []
+    if b"joint_checksum" in read_bytes(Path(source)):
+        notes.append(
+            "joint_checksum is copied from the source: its algorithm is not published, so a controller may refuse "
+            "the file. Keep the original."
+        )
+    if not np.array_equal(mdh, robot.mdh):
+        notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
+    return notes
 
 
 def export_camera(result: Calibration, source: str | Path, target: str | Path) -> list[str]:

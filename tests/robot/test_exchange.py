@@ -492,6 +492,44 @@ def test_a_controllers_deltas_give_a_robot_near_nominal(tmp_path: Path, conf: st
     assert np.abs((arm.robot.mdh - UR10.mdh)[:, [0, 2, 4]]).max() < 0.02
 
 
+@pytest.mark.parametrize("conf", [CONF, FAR])
+def test_deltas_written_read_as_the_same_robot(tmp_path: Path, conf: str) -> None:
+    path, target = tmp_path / "calibration.conf", tmp_path / "new.conf"
+    path.write_text(conf)
+    arm = ro.robot.read_ur_calibration(path, UR10)
+    change = 1e-4 * np.random.default_rng(0).normal(size=(6, 5))
+    change[0, :2], change[5, 4] = 0, 0
+    better = replace(arm.robot, mdh=arm.robot.mdh + change)
+    ro.robot.write_ur_calibration(path, better, UR10, target)
+    again = ro.robot.read_ur_calibration(target, UR10)
+    q = configurations(6)
+    assert np.abs(reach(again, q) - ro.robot.forward_kinematics(better, q)).max() < 1e-9
+    lists = re.compile(r"(?<=delta_)(\w+ = \[).*(?=\])")
+    assert lists.sub(r"\1", path.read_text()) == lists.sub(r"\1", target.read_text())
+    assert target.read_text().count("e-") > 3  # numbers in full
+
+
+def test_what_the_controller_cannot_hold_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "calibration.conf"
+    path.write_text(CONF)
+
+    def changed(joint: int, column: int, by: float) -> ro.robot.Robot:
+        mdh = UR10.mdh.copy()
+        mdh[joint, column] += by
+        return replace(UR10, mdh=mdh)
+
+    for robot, found in [
+        (changed(0, 1, 1e-3), "alpha1 or a1 that deviate"),
+        (changed(5, 4, 1e-3), "beta6 = 0.001 rad"),
+        (changed(2, 4, 3e-10), "too nearly parallel"),
+    ]:
+        with pytest.raises(ro.InputError, match=found):
+            ro.robot.write_ur_calibration(path, robot, UR10, tmp_path / "new.conf")
+    with pytest.raises(ro.InputError, match="joints of the robot: found revolute"):
+        ro.robot.write_ur_calibration(path, ro.read_robot(find_robot("iiwa7")), UR10, tmp_path / "new.conf")
+    assert not (tmp_path / "new.conf").exists()
+
+
 @pytest.mark.parametrize(
     ("old", "new", "found"),
     [

@@ -23,6 +23,7 @@ from rpim_opt.robot.chain import (
     reach,
     require_same_arm,
     spliced,
+    without_beta,
 )
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Robot
@@ -71,7 +72,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     array([ 0.66,  0.  ,  0.  , -0.83, -0.02,  0.02])
     """
     path = Path(path)
-    deltas = _deltas(read_bytes(path), path)
+    deltas, _ = _deltas(read_bytes(path), path)
     require_same_arm(nominal, nominal.mdh, REVOLUTE, path)
     table = nominal.mdh.copy()
     table[:, 2:4] += np.column_stack([deltas["theta"], deltas["d"]])
@@ -82,12 +83,41 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
-def _deltas(data: bytes, path: Path) -> dict[str, Array]:
-    """Return the four lists (6,)."""
+def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> None:
+    """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
+
+    The betas are turned into common normals first, as the controller's parameters are. Not tried on a controller:
+    what else it checks (the file has checksums of the joints) is not documented. Keep the original.
+
+    ``robot`` is in the controller's Base; ``source``, its own file, may be the target, too. Refused are alpha1 or a1
+    that deviate (the base has to hold them), beta6, and axes too nearly parallel.
+    """
+    path = Path(source)
+    if not path.exists():
+        raise InputError("the file", "nothing", "the robot's own file, copied from its controller", path)
+    data = read_bytes(path)
+    old, places = _deltas(data, path)
+    require_same_arm(robot, nominal.mdh, REVOLUTE, path)
+    if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
+        raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1", path)
+    change = without_beta(robot).mdh - nominal.mdh
+    behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
+    new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
+    edits = {
+        places[name]: ", ".join(repr(float(v)) for v in values)
+        for name, values in new.items()
+        if not np.array_equal(values, old[name])
+    }
+    write_bytes(Path(target), spliced(data, edits))
+
+
+def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
+    """Return the four lists (6,), and by name where in the file their numbers stand."""
     section = re.search(rb"^\s*\[mounting\](.*?)(?=^\s*\[\w+\]|\Z)", data, re.MULTILINE | re.DOTALL)
     if section is None:
         raise InputError("section [mounting]", "nothing", "a controller's calibration.conf", path)
     values = {}
+    places = {}
     for name, key in DELTAS.items():
         line = rb"^[ \t]*" + key.encode() + rb"[ \t]*=[ \t]*\[([^\]\n]*)\]"
         lists = list(re.finditer(line, section[1], re.MULTILINE))
@@ -96,7 +126,8 @@ def _deltas(data: bytes, path: Path) -> dict[str, Array]:
             found = f"{len(parts)} numbers" if len(lists) == 1 else f"{len(lists)} lists"
             raise InputError(f"key {key}", found, "one list of six numbers", path)
         values[name] = np.array([_number(part.strip(), f"key {key}", path) for part in parts])
-    return values
+        places[name] = (section.start(1) + lists[0].start(1), section.start(1) + lists[0].end(1))
+    return values, places
 
 
 # kinematics.yaml
