@@ -142,6 +142,20 @@ def stated_variance(problem: Source, dimension: str) -> Array:
     return variance
 
 
+def arm_length(problem: Source) -> float:
+    """Return the length of the longest arm stretched out [m], prismatic joints as far as they were measured."""
+    longest = 0.0
+    for robot in problem.arms.values():
+        sliding = np.array(robot.joint_dimensions) == "length"
+        stroke = np.zeros(robot.dof)
+        for part in problem.rows() if sliding.any() else ():
+            for block in part.data.blocks:
+                if block.q.shape[-1] == robot.dof:
+                    stroke = np.maximum(stroke, np.abs(block.q).max(axis=(0, 1)))
+        longest = max(longest, float(np.abs(robot.mdh[:, [1, 3]]).sum() + stroke[sliding].sum()))
+    return longest
+
+
 def rms(errors: Array) -> float:
     """Return the root mean square of the finite errors; 0 if there are none."""
     finite = errors[np.isfinite(errors)]
@@ -179,16 +193,7 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
         np.where(kept, result.errors(dimension=each), np.nan) for each in ("length", "angle", "pixel")
     )
     ratio = max(noise_ratio(problem, lengths), noise_ratio(problem, pixels, "pixel"))
-    longest = 0.0  # of the arms stretched out [m], prismatic joints as far as they were measured
-    for robot in problem.arms.values():
-        sliding = np.array(robot.joint_dimensions) == "length"
-        stroke = np.zeros(robot.dof)
-        for part in problem.rows() if sliding.any() else ():
-            for block in part.data.blocks:
-                if block.q.shape[-1] == robot.dof:
-                    stroke = np.maximum(stroke, np.abs(block.q).max(axis=(0, 1)))
-        longest = max(longest, float(np.abs(robot.mdh[:, [1, 3]]).sum() + stroke[sliding].sum()))
-    share = rms(lengths) / longest
+    share = rms(lengths) / arm_length(problem)
     if ratio > NOISY and share > REACH:
         yield (
             f"Residual RMS {three_digits(1e3 * rms(lengths))} mm: {three_digits(ratio)} times the stated noise and "

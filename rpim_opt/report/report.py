@@ -377,6 +377,12 @@ def _flagged(result: Calibration) -> Block:
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{kept}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
+    if result.learned is not None:
+        rows += [
+            [row.label, "", "", f"excluded outlier: {row.ratio:.0f} times the median error"]
+            for row in result.learned.left_out
+            if row.label not in result.record.excluded
+        ]
     if not rows:
         return "text", ["No row is flagged or excluded (one in a hundred good data sets has a flagged row)."]
     head = ["row", "standardized residual", "error [mm]", "status"]

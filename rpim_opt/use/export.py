@@ -188,7 +188,9 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     """Write four rows a period of the finest harmonic, with standard deviations; say how large the errors are."""
     curves = transmission_errors(result)
     if not curves:
-        accepted = "one with transmission errors of joints (model 'auto', where the data support them)"
+        accepted = (
+            "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
+        )
         raise InputError("the calibration", "no transmission error", accepted)
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
     for curve in curves:

@@ -14,6 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, table
 from rpim_opt.basics.units import UNITS, accepted_units, display
+from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.causes import refuse_misread
@@ -244,13 +245,19 @@ def update(
             found = f"readings {1e3 * missed:.3g} mm off, whatever is released"
             raise InputError("the new measurements", found, accepted)
     old, new = result.problem.parameters.free, updated.problem.parameters.free
+    was, now = (  # values: of a frame that was registered again, deviations refer to another orientation
+        dict(zip(each.problem.parameters.names, parameter_values(each.problem, each.x), strict=True))
+        for each in (result, updated)
+    )
     moved = []
     for name in released:
         if name in old.names:
             i = new.names.index(name)
             std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
-            change = new.nominal[i] + updated.x[i] - old.nominal[i] - result.x[i]
-            moved.append(Moved(name, new.dimensions[i], float(change), float(std)))
+            change = float(now[name] - was[name])
+            if new.dimensions[i] == "angle":
+                change = float(np.angle(np.exp(1j * change)))
+            moved.append(Moved(name, new.dimensions[i], change, float(std)))
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = result.record
     last = Earlier(

@@ -10,12 +10,12 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
-from rpim_opt.basics.text import listed, table
+from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import worse_sentence, worse_than_nominal
+from rpim_opt.calibration.verdict import REACH, arm_length, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, scatter, scatter_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import shared_rows
@@ -152,5 +152,17 @@ def validate(result: Calibration, data: Dataset) -> Validation:
         remarks += [*contact_remarks(problem), *known_points(problem, data)]
     return Validation(
         data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *judged(result, data),
-        outside=result.outside(data), touched=touched, remarks=tuple(remarks), mistake=misread(result, data),
+        outside=result.outside(data), touched=touched, remarks=tuple(remarks),
+        mistake=misread(result, data) or _elsewhere(result, error),
     )  # fmt: skip
+
+
+def _elsewhere(result: Calibration, error: Array) -> str:
+    """Say that most rows are further off than any robot is by itself; empty if they are not."""
+    if not np.isfinite(error).any() or np.nanmedian(error) <= REACH * arm_length(result.problem):
+        return ""
+    return (
+        f"Median error {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's own effects stay below "
+        f"{100 * REACH:g} % of the arm's length. The instrument or the base may have moved (`update --reset 'base_*'` "
+        "registers it again), or these are another robot's measurements."
+    )

@@ -29,6 +29,7 @@ class Robot(NamedTuple):
     after: ro.Dataset
     now: ro.Dataset
     truth: np.ndarray
+    before_truth: np.ndarray
 
 
 def happened(seed: int, **changes: float) -> Robot:
@@ -48,7 +49,7 @@ def happened(seed: int, **changes: float) -> Robot:
     before = seen(slice(0, FIRST), truth, SIGMA)
     after = seen(slice(FIRST, FIRST + NEW), later, SIGMA)
     now = seen(slice(FIRST + NEW, None), later, 0.0)
-    return Robot(problem.on(before), before, after, now, later)
+    return Robot(problem.on(before), before, after, now, later, truth)
 
 
 def rms(result: ro.calibration.Calibration, data: ro.Dataset) -> float:
@@ -119,6 +120,16 @@ def test_a_wrong_reading_is_no_change_of_the_robot() -> None:
     assert not found.changed
     assert rms(found.result, robot.now) < 2 * SIGMA * 1e3
     assert list(found.result.record.excluded) == [after.label[2]]
+
+
+def test_what_moved_of_a_base_that_is_registered_again_is_the_difference_of_its_values() -> None:
+    """Deviations of the new result are about other axes."""
+    robot = happened(8, base_x=1.5, base_y=-0.8, base_rx=0.7, base_rz=1.0)
+    free = robot.problem.parameters.free
+    was, now = (dict(zip(free.names, free.values(x), strict=True)) for x in (robot.before_truth, robot.truth))
+    found = ro.use.update(ro.calibrate(robot.problem), robot.after, reset=("base_*",))
+    for each in found.moved:
+        assert abs(each.change - (now[each.name] - was[each.name])) < 2 * each.std
 
 
 def test_a_base_that_moved_is_one_cause() -> None:
