@@ -223,6 +223,8 @@ def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
     except cp.SolverError as error:  # atoms that call a solver when they are made
         found = f"an error of CVXPY: {error}".rstrip(".")
         raise InputError(where, found, "atoms that the installed solvers know") from None
+    except NotImplementedError as error:  # CVXPY's word on strict inequalities
+        raise InputError(where, f"{error}".rstrip("."), "expressions of CVXPY, with <=, >= or ==") from error
     except TypeError as error:
         if error.__traceback__ is None or error.__traceback__.tb_next is not None:  # of the function's own code
             raise

@@ -647,7 +647,7 @@ def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
 def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
     """Return patterns of parameters; ``"auto"``: geometry, beta where it is needed, frames, own parameters of types."""
     if patterns != "auto":
-        return patterns
+        return [patterns] if isinstance(patterns, str) else patterns
     kinds = [block.measurement for block in data.blocks]
     kept = [GEOMETRY]
     if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands

@@ -73,6 +73,11 @@ def test_the_innermost_part_that_breaks_the_rules_is_named() -> None:
     assert "1 +" not in str(error.value)
 
 
+def test_a_strict_inequality_is_refused_by_the_name_of_its_constraint() -> None:
+    with pytest.raises(ro.InputError, match=r"constraint 1: found Strict inequalities are not allowed, accepted"):
+        posed(constraints=lambda z, p: z < 2).solve(1.0)
+
+
 def test_a_prior_and_something_else_are_no_prior() -> None:
     with pytest.raises(TypeError):
         Prior() & 3  # type: ignore[operator]

@@ -151,6 +151,31 @@ def test_where_no_marker_tells_the_base_all_are_fitted() -> None:
     assert found.base == pytest.approx([0.4, -0.3, 0.2, 0.1, -0.2, 0.5], abs=0.02)
 
 
+@pytest.mark.parametrize(
+    ("stated", "said"),
+    [
+        ({"base": [0, 0, 0]}, r"base: found \[0, 0, 0\], accepted: six finite numbers"),
+        ({"base": None}, "base: found None"),
+        ({"tool": "flange"}, "tool: found 'flange'"),
+        ({"data": 5}, "5 joint values a row, accepted: 6"),
+    ],
+)
+def test_frames_and_joints_that_do_not_fit_are_named(stated, said: str) -> None:
+    arm = ro.load("position").problem
+    if "data" in stated:
+        stated = {"data": ro.Dataset.of(arm.data.q[:, : stated["data"]], np.zeros((len(arm.data), 3)), 1e-4)}
+    with pytest.raises(ro.InputError, match=said):
+        ro.problem_from(**{"robot": arm.robot, "data": arm.data, **stated})
+
+
+def test_a_base_may_be_a_transform_and_a_pattern_stand_alone() -> None:
+    arm = ro.load("position").problem
+    one = ro.problem_from(arm.robot, arm.data, "theta?", base=numeric_frame([1.8, -0.7, 0.35, 0.1, 0.2, 0.3]))
+    assert one.parameters.free.names == tuple(f"theta{k}" for k in range(1, 7))
+    two = ro.problem_from(arm.robot, arm.data, ["theta?"], base=[1.8, -0.7, 0.35, 0.1, 0.2, 0.3])
+    np.testing.assert_allclose(one.parameters.nominal, two.parameters.nominal, atol=1e-12)
+
+
 def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:
     """Else errors and identifiable combinations would be those of a reflector in the flange."""
     arm = ro.load("position").problem

@@ -180,10 +180,11 @@ def problem_from(
 
     The ``robot`` is the nominal one, what `read_urdf` returns, a file that describes one, or the name of a ready robot;
     ``identify`` are patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`. ``base`` (6,) is a start of
-    the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx; ``"auto"`` registers it; zero
-    where the measurements do not depend on it. ``tool`` (6,) is a start of the reflector in the frame behind the last
-    joint's modified-DH row, by default that of the URDF's tip, or zero; one that the data contradict is replaced by its
-    registration. InputError for data that do not determine where the base is, or a pattern that matches no parameter.
+    the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, or its transform (4, 4);
+    ``"auto"`` registers it; zero where the measurements do not depend on it. ``tool`` (6,) or (4, 4) is a start of the
+    reflector in the frame behind the last joint's modified-DH row, by default that of the URDF's tip, or zero; one that
+    the data contradict is replaced by its registration. InputError for data of another number of joints, data that do
+    not determine where the base is, or a pattern that matches no parameter.
 
     >>> import rpim_opt as ro
     >>> arm = ro.load("position").problem
@@ -196,14 +197,30 @@ def problem_from(
     if isinstance(robot, Described):
         tool = robot.tool if tool is None else tool
         robot = robot.robot
-    start = np.zeros(6) if tool is None else np.asarray(tool, dtype=float)
-    placed = None if isinstance(base, str) else np.asarray(base, dtype=float)
+    joints = {block.q.shape[-1] for block in data.blocks}
+    if joints - {robot.joint_map.shape[1]}:
+        found = f"{', '.join(map(str, sorted(joints)))} joint values a row"
+        raise InputError("the data", found, f"{robot.joint_map.shape[1]}, those of '{robot.name}'")
+    start = np.zeros(6) if tool is None else _frame(tool, "tool")
+    placed = None if isinstance(base, str) and base == "auto" else _frame(base, "base")
     if placed is None and not any(block.measurement.registers for block in data.blocks):
         placed = np.zeros(6)  # lengths do not depend on it
     parameters = starting_parameters(robot, data, placed, {"": start})
     problem = CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
     found = relocated(problem)
     return found if isinstance(found, CalibrationProblem) else problem
+
+
+def _frame(value: Any, name: str) -> Array:
+    """Return the six numbers of a frame that is stated by them or by its transform."""
+    accepted = "six finite numbers x, y, z [m], roll, pitch, yaw [rad], or a transform (4, 4)"
+    try:
+        numbers = np.asarray(value, dtype=float)
+    except (TypeError, ValueError):
+        raise InputError(name, f"{value!r}", accepted) from None
+    if numbers.shape not in ((6,), (4, 4)) or not np.isfinite(numbers).all():
+        raise InputError(name, f"{value!r}", accepted)
+    return numbers if numbers.ndim == 1 else np.array(frame_numbers(numbers))
 
 
 FIXTURE, REFLECTOR = 1.0, 0.1
