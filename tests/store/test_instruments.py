@@ -56,6 +56,14 @@ def test_a_file_as_it_is_exported_is_the_clean_table(monkeypatch, capsys, empty,
         assert np.abs(turned - T[order][:, :3, :3]).max() < 1e-8
 
 
+def test_units_above_the_header_are_not_said_to_be_stated(monkeypatch, capsys, empty) -> None:
+    write, _, _ = FILES["units above the header"]
+    assert new(monkeypatch, write(empty).name) == 0
+    said = capsys.readouterr().out
+    assert "unit above the header" in said
+    assert "unit --units" not in said
+
+
 @pytest.mark.parametrize("name", sorted(NOT_READ))
 def test_a_format_without_a_reader_is_one_sentence(monkeypatch, capsys, empty, name) -> None:
     write, options, _ = INSTRUMENTS[name]

@@ -102,7 +102,7 @@ def understand(
         if any(re.fullmatch(r"q\d+", found[0][name].stem) for name in raw.columns):  # the file with the joints
             raw, (read, rotation) = more, found
     rotation = options.rotation or rotation
-    columns, meant = _under_our_names(raw.columns, read, kind, known, options.units)
+    columns, meant = _under_our_names(raw.columns, read, kind, known, options.units, stated)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         names = {split_unit(name)[0]: name for name in columns}
         if any(turn not in names for turn in TURNED):
@@ -323,8 +323,12 @@ def _under_our_names(
     kind: Measurement,
     known: Mapping[str, Sequence[str]],
     units: Mapping[str, str],
+    stated: Mapping[str, str],
 ) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
-    """Return the columns with canonical names and units, and the meaning of every column."""
+    """Return the columns with canonical names and units, and the meaning of every column.
+
+    ``units`` are those above the header and, in their place, the ``stated`` ones.
+    """
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
     unitless: dict[str, str] = {}
@@ -337,7 +341,7 @@ def _under_our_names(
         dimensions = [dimension for dimension in known.get(found.stem, []) if dimension]
         if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
             dimensions = ["length"]
-        unit, why = _unit(name, found, dimensions, units)
+        unit, why = _unit(name, found, dimensions, units, stated)
         if unit and dimension_of(unit) not in dimensions:
             accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"
             raise InputError("the header", f"column '{name}' ({meaning(found.stem)}) in {unit}", accepted)
@@ -371,18 +375,20 @@ def meaning(stem: str) -> str:
     return next((match.expand(words) for match, words in matches if match), f"measured {stem}")
 
 
-def _unit(name: str, found: Reading, dimensions: Sequence[str], units: Mapping[str, str]) -> tuple[str, str]:
+def _unit(
+    name: str, found: Reading, dimensions: Sequence[str], units: Mapping[str, str], stated: Mapping[str, str]
+) -> tuple[str, str]:
     """Return a column's unit and why: its own, the given one, that of its dialect."""
     if found.unit:
         return found.unit, "in the header"
-    stated = units.get(found.stem) or units.get(found.stem.rstrip("0123456789"))
-    if stated:
-        return stated, "--units"
+    for key in (found.stem, found.stem.rstrip("0123456789")):
+        if key in units:
+            return units[key], "--units" if key in stated else "above the header"
     if len(dimensions) != 1:  # a sigma may be of lengths or of angles: no unit of one dimension is meant
         return "", ""
     (dimension,) = dimensions
     if dimension in units:
-        return units[dimension], "--units"
+        return units[dimension], "--units" if dimension in stated else "above the header"
     if dimension == "pixel":
         return "px", "the only unit"
     why = next((why for pattern, why in known_names.IN_SI.items() if re.fullmatch(pattern, name)), "")
