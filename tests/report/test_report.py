@@ -317,3 +317,13 @@ def test_a_robot_less_certain_than_the_nominal_one_errs_is_not_called_delivered(
     assert "is above the error of the nominal robot" in text
     assert "Delivered" not in text
     assert summary.inconclusive(first, summary.workspace(first)) == ""
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_outliers_that_were_excluded_automatically_are_in_the_table(tmp_path) -> None:
+    result = ro.calibrate(ro.load("blunders").problem)
+    assert result.learned.left_out
+    ro.report.write_report(result, tmp_path / "report.html")
+    page = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert page.count("excluded outlier: ") == len(result.learned.left_out)
+    assert "No row is flagged or excluded" not in page

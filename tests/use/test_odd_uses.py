@@ -197,6 +197,15 @@ def test_approaches_with_other_columns() -> None:
 # --- files ---------------------------------------------------------------------------------------------------------
 
 
+def test_rows_of_an_instrument_that_moved_are_named() -> None:
+    instance = ro.load("position")
+    result = ro.calibrate(instance.problem)
+    (block,) = instance.validation.blocks
+    moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.5, -0.2, 0.1])),))
+    assert "registers it again" in ro.use.validate(result, moved).mistake
+    assert not ro.use.validate(result, instance.validation).mistake
+
+
 def test_a_urdf_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match=r"none\.urdf"):
         export_urdf(calibrated(), tmp_path / "none.urdf", tmp_path / "out.urdf")
