@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import os
 import re
@@ -229,6 +230,13 @@ def test_held_out_rows_are_used_once_they_have_validated(monkeypatch, capsys, ma
         capsys.readouterr()
         assert run(monkeypatch, "validate", str(folder), str(made / "validation.csv")) == 0
         assert ("8 of 8 rows of the validation set are identification rows" in capsys.readouterr().out) == used
+
+
+def test_the_file_that_was_handed_over_is_named_with_its_digest(cell, made) -> None:
+    digest = hashlib.sha256((cell / "measured.csv").read_bytes()).hexdigest()
+    files = ro.load_result(made / "results").record.files
+    assert files["measured.csv (raw data)"] == digest
+    assert files["identification.csv"] == hashlib.sha256((made / "identification.csv").read_bytes()).hexdigest()
 
 
 def test_every_guess_is_what_auto_means(cell, made) -> None:

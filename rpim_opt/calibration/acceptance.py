@@ -17,7 +17,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
-from rpim_opt.calibration.held_out import judged
+from rpim_opt.calibration.held_out import excluded_by_fit, judged
 from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
@@ -179,9 +179,22 @@ class Acceptance:
 
     The verdict is ``"accepted"`` where at every configuration of the region the bound is within the limit, and held-out
     rows bear it out; ``"rejected"`` where they miss oftener than chance allows, or the robot's repeatability at its
-    least is above the limit; ``"undecided"`` where something is lacking. ``reasons`` say why, a sentence each.
-    ``workspace`` has the bounds at configurations of the region, ``scatter`` is what would be left of the largest if
-    all parameters were known [m], ``held_out`` what held-out rows say, a document [mm] with its ``sentence``.
+    least is above the limit; ``"undecided"`` where something is lacking.
+
+    Parameters
+    ----------
+    requirement
+        Limit, confidence and region.
+    verdict
+        ``"accepted"``, ``"rejected"`` or ``"undecided"``.
+    reasons
+        Why, a sentence each; empty where it is accepted.
+    workspace
+        Expanded uncertainties at configurations of the region.
+    scatter
+        The largest of them if all parameters were known: the repeatability's part [m].
+    held_out
+        Errors on held-out rows and coverage of their intervals, a document [mm] with its ``sentence``.
 
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()
@@ -323,11 +336,13 @@ def _held_out(
     """
     apart = result.record.validation if data is None else data
     held = result.record.held_out
+    excluded: list[str] = []
     if apart is not None:
         error, (sigmas, allowed, coverage) = result.errors(apart), judged(result, apart)
     elif held is not None:
+        excluded = excluded_by_fit(result)
+        kept = ~np.isin(held.label, excluded)
         known = {label: row for row, label in enumerate(result.problem.data.label)}
-        kept = np.array([label in known for label in held.label])
         apart = result.problem.data.take([known[label] for label in held.label if label in known])
         error, sigmas, allowed, coverage = held.error[kept], held.sigmas[kept], held.allowed[kept], held.coverage
     else:
@@ -371,11 +386,25 @@ def _held_out(
         sentence += f"; {share} (at least {100 * least:.0f} % are required for this number of rows)"
         if coverage < least:
             lacking.append(f"Lacking: valid prediction intervals. Only {share}.")
-    document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
-    document |= {"beyond": beyond, "coverage95": coverage, "sentence": f"{sentence}."}
     if not count:
-        document["sentence"] = f"None of the {rows} held-out rows is in the region."
+        sentence = f"None of the {rows} held-out rows is in the region"
+        if not _any_inside(result, region):
+            lacking.append("Lacking: measurements in the region. No identification row is in it either.")
+    if excluded:
+        sentence += f". Not counted: {listed(excluded, MOST)}, excluded as outliers by the fit to all rows"
+    document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
+    document |= {"beyond": beyond, "excluded": excluded, "coverage95": coverage, "sentence": f"{sentence}."}
     return document, missed, lacking
+
+
+def _any_inside(result: Calibration, region: Region) -> bool:
+    """Whether any identification row is in the region with all its points."""
+    for part in result.problem.rows():
+        for block in part.data.blocks:
+            points = [region.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
+            if np.all(points, axis=0).any():
+                return True
+    return False
 
 
 def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:

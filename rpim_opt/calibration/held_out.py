@@ -65,6 +65,15 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     return Judged(sigmas, allowed, float(covered.mean()) if len(covered) else None)
 
 
+def excluded_by_fit(result: Calibration) -> list[str]:
+    """Return the labels of held-out rows that the fit to all rows excludes as outliers."""
+    held = result.record.held_out
+    if held is None:
+        return []
+    used = set(result.problem.labels)
+    return [label for label in held.label if label not in used]
+
+
 def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibration:
     """Return the calibration from identification and validation rows together, with the same settings.
 

@@ -23,7 +23,8 @@ from rpim_opt.calibration.certificate import DECREASE
 from rpim_opt.calibration.loop import ROUNDS, Ended, Iteration, Options, minimize, nearby, require_finite, require_start
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
-from rpim_opt.convex.select import Selector, weight_of
+from rpim_opt.convex.rules.selection import Selector
+from rpim_opt.convex.select import weight_of
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import require_affordable
 from rpim_opt.problem.registration.frames import relocated

@@ -16,7 +16,7 @@ from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.weight_choice import WeightChoice, weight_choice
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
-from rpim_opt.convex.select import Selector
+from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.structure import in_blocks
 from rpim_opt.convex.trust import Squares, trusted
 from rpim_opt.problem.blocks import Source, in_parts

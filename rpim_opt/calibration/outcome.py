@@ -53,11 +53,20 @@ COVERAGE_FACTOR = 2.0
 
 
 class Prediction(NamedTuple):
-    """Predicted positions (N, 3) [m], their covariances (N, 3, 3) [m^2], and the coverage factor k of U = k u.
+    """Predicted positions with their uncertainty.
 
-    The factor is (N, 1) where rows have degrees of ``freedom`` (N,) of their own: readings of a session that is not
-    known, where a few sessions told how far they lie apart. ``outside`` says which rows are beyond the joint ranges
-    that were measured; there an interval may be too narrow.
+    Parameters
+    ----------
+    position
+        (N, 3) in the instrument's frame [m].
+    covariance
+        (N, 3, 3) of the positions [m^2].
+    coverage_factor
+        k of U = k u; (N, 1) where rows have degrees of freedom of their own.
+    outside
+        Which rows are beyond the measured joint ranges; there an interval may be too narrow.
+    freedom
+        Degrees of freedom; (N,) for readings of an unknown session, whose offset few sessions estimate.
     """
 
     position: Array

@@ -23,32 +23,38 @@ class Calibration(Outcome):
 
     Parameters
     ----------
-    problem, formulation
-        What was asked.
+    problem
+        The calibration problem, with estimated scales, noise and model extensions.
+    formulation
+        Loss, penalty and constraints.
     x
         (n,) identified deviations [SI], in the order of ``problem.parameters.free``.
-    weight, selection
-        The weight, and the choice it comes from (None when it was given).
-    converged, message
-        Whether the loop came to rest at a solution that the certificate confirms, and how it ended.
+    weight
+        The weight of the penalty.
+    selection
+        The selector's choice with its evidence; None for a given weight.
+    converged
+        Whether the loop ended at a solution that the certificate confirms.
+    message
+        How the loop ended, in a sentence. It does not judge the data: whether to use the robot is the `verdict`.
     history
-        One entry an iteration.
+        One `Iteration` each.
     program
         The convex program at the last linearization.
     certificate
-        Evidence that this is a solution, computed anew from the functions that state it.
+        Evidence that this is a solution, computed anew from the functions that define it.
     asked
-        `calibrate` with all that it was given but the problem.
+        `calibrate` with all its arguments but the problem.
     record
-        Where the data come from, for files and reports.
+        Origin of the data, for files and reports.
     learned
         Estimated hyperparameters: scales and noise, model extensions, excluded rows; None with a weight.
     mapping
-        Signs and zeros of the joints that were found from the data; None where the nominal ones explain them.
+        Signs and zeros of the joints estimated from the data; None where the nominal ones explain them.
     kept
-        What functions said that a file cannot hold; None where they can be asked.
+        Values of a script's functions, of a result that was read from a file; None otherwise.
     known_causes
-        Likely causes of a bad fit, where they were found before; None where they are looked for.
+        Likely causes of a bad fit that were computed before; None where `causes` computes them.
 
     Examples
     --------
@@ -113,8 +119,8 @@ class Calibration(Outcome):
 
     def __repr__(self) -> str:
         """Return one line."""
-        asked = f"'{self.formulation.name}', {len(self.x)} parameters, weight {self.weight:.4g}"
-        return f"<Calibration {asked}: {self.message}>"
+        said = self.message if self.verdict.delivered else f"Not delivered. {self.verdict.reasons[0]}"
+        return f"<Calibration '{self.formulation.name}', {len(self.x)} parameters, weight {self.weight:.4g}: {said}>"
 
     def _repr_html_(self) -> str:
         """Return the same as the text for a notebook."""

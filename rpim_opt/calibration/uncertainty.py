@@ -34,7 +34,12 @@ class Uncertainty(Tabled):
     It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty; other penalties
     (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.actively_constrained``.
 
-    ``confidence`` of the intervals is between 0 and 1. InputError for another one, or a penalty without covariance.
+    Parameters
+    ----------
+    result
+        The calibration. InputError for a penalty without covariance.
+    confidence
+        Of the intervals, between 0 and 1.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)

@@ -10,8 +10,8 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.threads import phase
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.rules.selection import SAME_WEIGHT, require_weight
-from rpim_opt.convex.select import Selection, Selector, weight_of
+from rpim_opt.convex.rules.selection import SAME_WEIGHT, Selection, Selector, require_weight
+from rpim_opt.convex.select import weight_of
 
 SETTLED = 1e-3
 """The weight is chosen anew while a step is longer than this share of the solution, then stays."""
@@ -49,9 +49,11 @@ class WeightChoice:
             return self
         with phase("selection"):
             selection = self.rule(program)
+        name = getattr(self.rule, "__name__", "selector")
+        if isinstance(selection, int | float | np.integer | np.floating) and not isinstance(selection, bool):
+            selection = Selection(float(selection), name, np.empty(0), np.empty(0), True)
         if not isinstance(selection, Selection):
-            name = getattr(self.rule, "__name__", "selector")
-            raise InputError(f"selector {name}", f"a {type(selection).__name__}", "a Selection with a weight")
+            raise InputError(f"selector {name}", f"a {type(selection).__name__}", "a weight, or a Selection with one")
         weight = float(selection.weight)
         if not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"selector {selection.name}", f"weight {weight}", "a number, zero or more")

@@ -67,17 +67,18 @@ def parameter_rows(result: Outcome) -> list[dict[str, Any]]:
     return rows
 
 
+def rotated(row: Mapping[str, Any]) -> bool:
+    """Whether the deviation of a row of `parameter_rows` is a composed rotation, not a difference of the columns."""
+    return abs(row["identified"] - row["nominal"] - row["deviation"]) > LAST_DIGIT
+
+
 def turned_frames(result: Outcome) -> list[str]:
-    """Return a note on frames whose deviation is a composed rotation, not a difference of the columns."""
-    names = [
-        row["name"]
-        for row in parameter_rows(result)
-        if abs(row["identified"] - row["nominal"] - row["deviation"]) > LAST_DIGIT
-    ]
+    """Return a note on the parameters that tables mark with ``*``, since they are `rotated`."""
+    names = [row["name"] for row in parameter_rows(result) if rotated(row)]
     if not names:
         return []
-    turn = "the rotation from the nominal frame about the axes of its parent, not a difference of the angles"
-    return [f"Deviations of {listed(names)}: {turn}."]
+    turn = "roll, pitch and yaw of the rotation from the nominal to the identified frame, about the axes of its parent"
+    return [f"Deviations marked * ({listed(names)}) are not identified minus nominal, but {turn}."]
 
 
 def parameter_table(result: Outcome) -> str:
@@ -93,7 +94,8 @@ def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
         if not of_curve:
             figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
             std = "-" if row["std"] is None else f"{row['std']:.4f}"
-            cells.append([row["name"], row["unit"], *figures, std])
+            name = f"{row['name']} *" if rotated(row) else row["name"]
+            cells.append([name, row["unit"], *figures, std])
     return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
 
 

@@ -59,6 +59,11 @@ class Ready:
     quadratic: ClassVar[Any] = None
     """The quadratic of its argument that a penalty declares to be, where it knows that exactly."""
 
+    def __post_init__(self) -> None:
+        for argument in self.arguments:
+            if isinstance(argument, list):
+                raise InputError(self.maker, f"{argument}", f"arguments one by one: {self.maker}(*{argument})")
+
     def __call__(self, *given: Any) -> Any:
         """Return what the function does."""
         return self.function(*given, *self.arguments)

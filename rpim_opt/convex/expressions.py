@@ -216,6 +216,10 @@ def _domain(expression: Any) -> list[Any]:
     return [*own, *(limit for arg in expression.args for limit in _domain(arg))]
 
 
+OF_NUMPY = ("You're calling a NumPy function on a CVXPY expression", "unexpected keyword argument 'out'")
+"""Errors of CVXPY's expressions in functions of NumPy; ``np.sum`` calls their method ``sum``."""
+
+
 def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
     """Call a user's function, and turn its errors into an InputError."""
     try:
@@ -225,7 +229,12 @@ def called(function: Callable[..., Any], where: str, *arguments: Any) -> Any:
         raise InputError(where, found, "atoms that the installed solvers know") from None
     except NotImplementedError as error:  # CVXPY's word on strict inequalities
         raise InputError(where, f"{error}".rstrip("."), "expressions of CVXPY, with <=, >= or ==") from error
-    except TypeError as error:
+    except (TypeError, RuntimeError) as error:
+        if any(text in str(error) for text in OF_NUMPY):
+            accepted = "functions of CVXPY: cp.abs, cp.sum, cp.norm, cp.maximum, cp.sqrt, ..."
+            raise InputError(where, "a NumPy function of a CVXPY expression", accepted) from error
+        if isinstance(error, RuntimeError):
+            raise
         if error.__traceback__ is None or error.__traceback__.tb_next is not None:  # of the function's own code
             raise
         constraint = "z and the parameters, lambda z, p: cp.norm1(z) <= 5"

@@ -26,7 +26,9 @@ def places(names: Sequence[str], pattern: str, where: str, kind: str = "paramete
 
 
 def index_of(names: Sequence[str], key: Any, where: str) -> Any:
-    """Return the index of a name, the indices that a pattern matches, or any other index unchanged."""
+    """Return the index of a name, the indices that a pattern or a list of them matches, or another index unchanged."""
+    if isinstance(key, list | tuple) and key and all(isinstance(each, str) for each in key):
+        return [index for each in key for index in places(names, each, where)]
     if not isinstance(key, str):
         return key
     if key in names:

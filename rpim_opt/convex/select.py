@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.curve import corner, l_curve
 from rpim_opt.convex.rules.folds import k_fold, leave_one_out, two_step
 from rpim_opt.convex.rules.scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
-from rpim_opt.convex.rules.selection import Selection, Selector
+from rpim_opt.convex.rules.selection import Selection
 
 __all__ = [
     "Selection",
@@ -56,7 +57,7 @@ def compare(program: Program) -> dict[str, Selection]:
     return chosen
 
 
-SELECTORS: dict[str, Selector] = {
+SELECTORS: dict[str, Callable[[Program], Selection]] = {
     "reml": reml,
     "l_curve": l_curve,
     "corner": corner,

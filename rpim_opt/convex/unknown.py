@@ -11,12 +11,12 @@ from rpim_opt.convex.given import index_of
 
 
 class Unknown(cp.Variable):
-    """z (n,), deviations in units of their scales, whose entries have names: ``z["a2"]``, ``z["a?"]``.
+    """z (n,), deviations in units of their scales, with named entries: ``z["a2"]``, ``z["a?"]``, ``z[["a2", "d1"]]``.
 
     >>> import rpim_opt as ro
     >>> z = ro.convex.Unknown(("a1", "a2", "d1"))
-    >>> z["a2"].shape, z["a?"].shape, z[1].shape
-    ((), (2,), ())
+    >>> z["a2"].shape, z["a?"].shape, z[["a2", "d1"]].shape, z[1].shape
+    ((), (2,), (2,), ())
     >>> z["a4"]
     Traceback (most recent call last):
     rpim_opt.basics.exceptions.InputError: z: found 'a4', accepted: parameters: a1, a2, d1.

@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, pick
+from rpim_opt.basics.exceptions import InputError, RowError, pick
 from rpim_opt.basics.text import Brief, Tabled, counted
 from rpim_opt.basics.units import LARGEST, display
 from rpim_opt.data.measurements.measurement import Measurement
+from rpim_opt.data.measurements.pose import from_matrices, pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.parameters import session_prefix
 
@@ -267,9 +268,10 @@ class Dataset(Tabled):
         q
             (N, dof) joint values of the controller [rad or m]; (N, p, dof) where a row involves p points.
         y
-            (N, c) measured values [SI].
+            (N, c) measured values [SI]; poses also as transforms (N, 4, 4).
         sigma
-            One standard deviation [SI] for all components of the residual, or their covariance, (k, k) or (N, k, k).
+            Standard deviation [SI] of all k components of the residual, or of each, (k,), or their covariance, (k, k)
+            or (N, k, k). A position has the components x, y, z, a pose x, y, z [m], rx, ry, rz [rad].
         label
             N row labels; numbers from 1 by default.
         measurement
@@ -307,22 +309,37 @@ class Dataset(Tabled):
             q = q[:, None]
         N = len(q)
         points, c = measurement.points, len(measurement.columns)
-        fits = q.ndim == 3 and q.shape[:2] == (len(y), points) and y.shape[1:] == (c,)
-        if not fits or not (np.abs(q) <= LARGEST).all() or not (np.abs(y) <= LARGEST).all():
-            accepted = (
-                f"finite numbers of at most {LARGEST:g} m or rad, {points} x dof joint and {c} measured values a row"
-            )
-            raise InputError("q and y", f"shapes {q.shape} and {y.shape}", accepted)
+        for name, values in (("q", q), ("y", y)):
+            wrong = np.flatnonzero(~(np.abs(values) <= LARGEST).reshape(len(values), -1).all(axis=1))
+            if len(wrong):
+                found = f"{values[wrong[0]].ravel().tolist()}"
+                accepted = f"finite numbers of at most {LARGEST:g} m or rad"
+                raise InputError(f"{name}, row {wrong[0] + 1}", found, accepted)
+        if y.shape[1:] == (4, 4) and measurement.columns == pose.columns:
+            try:
+                y = from_matrices(np.hstack([y[:, :3, 3], y[:, :3, :3].reshape(len(y), 9)]))
+            except RowError as error:
+                raise error.named(f"y, {error.where}") from None
+        if q.ndim != 3 or q.shape[:2] != (len(y), points) or y.shape[1:] != (c,):
+            of_q = "(N, dof)" if points == 1 else f"(N, {points}, dof)"
+            stated = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
+            accepted = f"{of_q} and (N, {c}) for measurement '{measurement.name}': {', '.join(measurement.columns)}"
+            raise InputError("q and y", f"shapes {stated.shape} and {y.shape}", accepted)
         k = len(measurement.components)
         rows = np.arange(N)
         covariance = np.array(sigma, dtype=float)
-        positive = covariance.ndim > 0 or covariance > 0
-        if covariance.ndim == 0:
+        positive = covariance.ndim > 1 or bool((covariance > 0).all())
+        if covariance.shape in ((), (k,)):
             covariance = covariance**2 * np.eye(k)
         if covariance.ndim == 2:
             covariance = covariance[None]
         if not positive or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
-            raise InputError("sigma", f"{sigma}", f"a number greater than zero, or a covariance of shape ({k}, {k})")
+            found = f"{sigma}" if covariance.size == 1 or not positive else f"shape {np.shape(sigma)}"
+            accepted = (
+                f"a standard deviation above zero, ({k},) of them for the components, or covariances ({k}, {k}) or "
+                f"({N}, {k}, {k}); of (N, {k}) standard deviations s: s[:, :, None] ** 2 * np.eye({k})"
+            )
+            raise InputError("sigma", found, accepted)
         block = Block(
             measurement,
             q,

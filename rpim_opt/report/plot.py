@@ -233,16 +233,19 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     return _with_legend(ax)
 
 
-def selection(selection: Selection, ax: Axes = None) -> Axes:
+def selection(of: Selection | Calibration, ax: Axes = None) -> Axes:
     """Draw a selector's score over the weights, and its choice, dashed where it is at an edge.
 
-    Arguments as for `errors`.
+    Arguments as for `errors`. InputError for a calibration whose weight no selector chose.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ro.plot.selection(result.selection).get_ylabel()
+    >>> ro.plot.selection(result).get_ylabel()
     'score of reml'
     """
+    selection = of.selection if isinstance(of, Calibration) else of
+    if selection is None:
+        raise InputError("plot.selection", "a calibration without a selected weight", "weight=ro.reml, or another rule")
     ax = _axes(ax)
     finite = np.isfinite(selection.score)
     ax.plot(selection.weights[finite], selection.score[finite], color=COLORS["ink"], lw=1.5)

@@ -27,6 +27,7 @@ from rpim_opt.calibration.words import (
     HEADER,
     curve_columns,
     noise_sentence,
+    rotated,
     scatter,
     scatter_rows,
     turned_frames,
@@ -271,6 +272,8 @@ def _parameters(content: Content) -> Iterator[Block]:
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in held:
             name += ", at its bound"
+        if rotated(row):
+            name += " *"
         expanded = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
@@ -393,8 +396,8 @@ def _convergence(result: Calibration) -> Iterator[Block]:
     try:
         c = result.certificate
         text = (
-            f"Certificate at the solution: next step of the convex program {c.step:.1e}, constraint "
-            f"violation {c.violation:.1e} (in prior scales)."
+            f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
+            f"violation {c.violation:.2g} (in prior scales)."
         )
     except RpimError as error:
         text = f"No certificate. {error}"

@@ -11,6 +11,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import counted, joined, listed, percent, table
 from rpim_opt.calibration import words
+from rpim_opt.calibration.held_out import excluded_by_fit
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import rms
@@ -208,6 +209,13 @@ def headline(result: Calibration) -> str:
             f" This validates the procedure with parameters from {held.used} rows; the delivered parameters are "
             f"from all {len(result.problem.labels)}."
         )
+        excluded = excluded_by_fit(result)
+        kept = held.error[~np.isin(held.label, excluded)]
+        if excluded and np.isfinite(kept).any():
+            sentence += (
+                f" Without {listed(excluded)}, excluded as outliers by that fit and not counted by an acceptance test, "
+                f"the mean error is {mm(1e3 * float(np.nanmean(kept)))} mm."
+            )
     if result.record.earlier:
         last = result.record.earlier[-1]
         changed = joined(last.let_go) if last.let_go else "no identifiable combination"

@@ -181,7 +181,10 @@ def load(
         title=table.title,
         source=table.source,
         validation=validation,
-        files={name: sha256_of(file) for name, file in used.items()},
+        files={
+            **{name: sha256_of(file) for name, file in used.items()},
+            **{f"{name} (raw data)": digest for name, digest in table.raw.items()},
+        },
         excluded=table.exclude,
         simulated=bool(table.simulation),
         details=details,

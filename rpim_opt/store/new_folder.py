@@ -19,6 +19,7 @@ from rpim_opt.basics.files import (
     read_text,
     read_toml,
     scratch_folder,
+    sha256_of,
     undoing,
     write_bytes,
     write_files,
@@ -151,6 +152,7 @@ def new_problem(
         said = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
     if board.table:
         tables[names[TARGET]] = board.table
+    handed = [Path(file) for file in (*paths, validation) if file is not None]
     links = [("urdf_base", urdf_base), ("urdf_tip", urdf_tip)]
     followers = [f"{i}" for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading]
     context = {
@@ -166,6 +168,7 @@ def new_problem(
         "data": Path(found.file).name,
         "count": len(rows),
         "validation": said,
+        "raw": {toml(str(name)): sha256_of(file) for name, file in zip(_names(handed), handed, strict=True)},
         "fixture": kind.start is not None,
         "reading": [(name, toml(text)) for name, text in replace(found.options, joints=arm.names).texts().items()],
     }
@@ -196,6 +199,12 @@ def new_problem(
             f"Chain '{chain}' identifies the URDF's own origins; {folder} takes another chain by --chain NAME."
         )
     return Started(folder, counts, tuple(notes), replace(found, kind=kind))
+
+
+def _names(files: Sequence[Path]) -> list[str]:
+    """Return the names of files; their paths where two have one name."""
+    names = [file.name for file in files]
+    return names if len(set(names)) == len(names) else [str(file) for file in files]
 
 
 def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:

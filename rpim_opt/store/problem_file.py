@@ -14,8 +14,8 @@ from rpim_opt.basics.files import inside, read_toml
 from rpim_opt.basics.schema import Angle, Length, Name, Table, validate
 from rpim_opt.basics.units import accepted_units, split_unit
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
-from rpim_opt.convex.rules.selection import require_weight
-from rpim_opt.convex.select import LEARNED, SELECTORS, Selector
+from rpim_opt.convex.rules.selection import Selector, require_weight
+from rpim_opt.convex.select import LEARNED, SELECTORS
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import Board, grid_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement
@@ -187,6 +187,8 @@ class ProblemTable(Table):
     """Table of the validation data."""
     held_out: bool = False
     """Validation data were drawn from the same table: once they have validated, all rows are used."""
+    raw: dict[str, str] = Field(default_factory=dict)
+    """Files from which `new` made the tables: name = SHA-256."""
     observation: list[Observation] = Field(default_factory=list)
     """Several measurement types, a table each."""
     target: str | dict[str, Any] | None = None

@@ -25,8 +25,8 @@ from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, lost
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.quadratic import Quadratic
-from rpim_opt.convex.rules.selection import Selection
-from rpim_opt.convex.select import SELECTORS, Selector
+from rpim_opt.convex.rules.selection import Selection, Selector
+from rpim_opt.convex.select import SELECTORS
 from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement

@@ -56,15 +56,15 @@ class Compensation:
     ``position_before`` and ``position_error`` (N,) [m] are by how much these miss the target, both by the calibrated
     model, of which the solution leaves nothing where the target is attainable; ``orientation_before`` and
     ``orientation_error`` [rad] likewise, NaN where orientations do not count. ``std`` (N,) [m] is the standard
-    uncertainty of the position there, sqrt(tr J C J' + tr R), with the calibration's covariance C, the Jacobian J of
-    the position in the instrument's frame and the repeatability R; infinite without C.
+    uncertainty of the position in the instrument's frame, sqrt(tr J C J' + tr R), with the covariance C of all
+    identified parameters, those of the base included, their Jacobian J and the repeatability R; infinite without C.
 
     ``status`` of a row is ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
     prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
     ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where any of the
-    latter leaves more than that. ``outside`` are commands beyond the joint ranges that the calibration measured,
-    ``note`` says why a robot is not delivered that is used all the same, ``point`` which point is moved, with its place
-    in the flange frame.
+    latter leaves more than that. A row that would be ``"ok"`` is ``"extrapolated"`` beyond the measured joint ranges,
+    where no measurement checked the model; ``outside`` are all rows there. ``note`` says why a robot is not delivered
+    that is used all the same, ``point`` which point is moved, with its place in the flange frame.
     """
 
     robot: Robot
@@ -87,7 +87,7 @@ class Compensation:
         for name, values in {
             "position [mm], nominal command": self.position_before,
             "position [mm], corrected, by the model": self.position_error,
-            "position [mm], standard uncertainty": self.std,
+            "position in the instrument's frame [mm], standard uncertainty": self.std,
             "orientation [mrad], nominal command": self.orientation_before,
             "orientation [mrad], corrected, by the model": self.orientation_error,
         }.items():
@@ -246,9 +246,11 @@ def compensate(
     parts = on_all_cores(compensated, range(0, N, BLOCK))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     above = (whole["position_error"] > limit) & (whole["status"] != UNREACHABLE)
-    whole["status"] = tuple(np.where(above, ABOVE, whole["status"]).tolist())
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
     outside = result.outside(commands)
+    status = np.where(above, ABOVE, whole["status"])
+    status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
+    whole["status"] = tuple(status.tolist())
     return Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=tooled.point
     )
@@ -260,8 +262,8 @@ def compensate_file(result: Calibration, targets: str | Path, out: str | Path, *
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
     >>> found = ro.use.compensate_file(result, "targets.csv", "commands.csv")
-    >>> len(found.q), set(found.status)
-    (18, {'ok'})
+    >>> len(found.q), set(found.status)  # some joints are beyond the nine measured configurations
+    (18, {'extrapolated'})
     """
     read = read_targets(targets, result.problem.robot)
     columns = {"torque": read.torque, "payload": read.payload, "label": read.label}

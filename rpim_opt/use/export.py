@@ -94,14 +94,19 @@ def export_files(
     ``out``, of several a folder. ``mdh`` (.csv, .json, .toml), ``robodk`` (.csv, four numbers a joint) and
     ``corrections`` are files to write, the last one the transmission errors of the whole model: ``joint``,
     ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``. A joint stands at its angle plus the correction:
-    subtract it from a command. ``marker`` is the reflector that is the tip, ``frames`` are ``root`` and ``tip`` of
-    `export_urdf`; with ``despite_verdict`` a robot that is not delivered is written, too, with a note in every file.
+    subtract it from a command. Without transmission errors the other files are written, and a note says so. ``marker``
+    is the reflector that is the tip, ``frames`` are ``root`` and ``tip`` of `export_urdf`; with ``despite_verdict`` a
+    robot that is not delivered is written, too, with a note in every file.
 
     Returned are the files, and sentences on what they do not hold. Raises NotDelivered for a calibration that is not
     delivered, InputError where there is nothing to write, or a file cannot hold what was identified.
     """
     whole = result
     result, notes = geometry_alone(whole)
+    others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
+    if corrections and any(others) and not transmission_errors(whole):
+        notes.append(f"Not written: {corrections.name}, since the calibration has no transmission errors.")
+        corrections = None
     note = result.verdict.require(despite_verdict)
     frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [

@@ -146,7 +146,7 @@ class Update:
         count = f"{self.readings} readings"
         if self.changes:
             verdict = "The robot has changed" if self.changed else "The robot has not changed, but readings are wrong"
-            lines = [f"{verdict}: {self.before} as it was."]
+            lines = [f"{verdict}. With the previous calibration: {self.before}."]
         elif self.before.likely:
             lines = [f"No change of the robot is detectable from {count}: {self.before}."]
         else:

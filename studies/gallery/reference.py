@@ -25,13 +25,16 @@ MEMBERS = {
     "jacobian, linearize, modelled, robot",
 }
 """Members of large classes that a user calls; the others serve the loop."""
+ATTRIBUTES = (("calibration", "Calibration"), ("calibration", "Prediction"), ("calibration", "Uncertainty"),
+              ("calibration", "Verdict"), ("calibration", "Acceptance"))  # fmt: skip
+"""Classes whose attributes are listed with those that they inherit."""
 VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
 
 
 def write(folder: Path) -> None:
     """Write all pages into a folder; Sphinx reads only those again that changed."""
     folder.mkdir(exist_ok=True)
-    pages = {"commands": commands(), "files": files(), "names": top_level()}
+    pages = {"commands": commands(), "files": files(), "names": top_level(), "attributes": attributes()}
     pages |= {name: module(name) for name in (*NAMESPACES, *FOLDERS)}
     for name, text in pages.items():
         path = folder / f"{name}.md"
@@ -91,9 +94,40 @@ def top_level() -> str:
     folders = [("namespace", "what")]
     for each in (*NAMESPACES, *FOLDERS):
         folders.append((f"[ro.{each}]({each}.md)", _first(getattr(rpim_opt, each))))
-    pages = "\n".join(["```{toctree}", ":hidden:", "", *NAMESPACES, *FOLDERS, "```", ""])
+    pages = "\n".join(["```{toctree}", ":hidden:", "", "attributes", *NAMESPACES, *FOLDERS, "```", ""])
     head = "# Public names\n\n`import rpim_opt as ro`. The top level has what most scripts need:"
-    return f"{head}\n\n{_table(*rows)}\n\nThe rest is in namespaces and folders:\n\n{_table(*folders)}\n\n{pages}"
+    rest = "[Attributes of a result](attributes.md). Other names are in namespaces and folders:"
+    return f"{head}\n\n{_table(*rows)}\n\n{rest}\n\n{_table(*folders)}\n\n{pages}"
+
+
+def attributes() -> str:
+    """Return the page of everything that a result and its predictions have, inherited members included."""
+    text = "# Attributes of a result\n\nIn alphabetical order; with `()` it is a method."
+    for folder, name in ATTRIBUTES:
+        owner = getattr(getattr(rpim_opt, folder), name)
+        fields = _fields(owner)
+        rows = [("attribute", "what")]
+        for each in sorted(each for each in dir(owner) if not each.startswith("_")):
+            value = inspect.getattr_static(owner, each, None)
+            called = "()" if inspect.isfunction(value) or isinstance(value, classmethod) else ""
+            if name != "Prediction" or each not in ("count", "index"):  # of any tuple
+                rows.append((f"`{each}{called}`", fields.get(each) or _first(value)))
+        rows += [(f"`{each}`", what) for each, what in fields.items() if not hasattr(owner, each)]
+        text += f"\n\n## {{py:obj}}`{name} <rpim_opt.{folder}.{name}>`\n\n{_table(rows[0], *sorted(rows[1:]))}"
+    return text + "\n"
+
+
+def _fields(owner: type) -> dict[str, str]:
+    """Return what the section Parameters of a class's docstring says of every field."""
+    section = (inspect.getdoc(owner) or "").partition("Parameters\n----------\n")[2].partition("\n\n")[0]
+    found: dict[str, str] = {}
+    names: list[str] = []
+    for line in section.splitlines():
+        if not line.startswith(" "):
+            names = line.split(", ")
+        for name in names if line.startswith(" ") else ():
+            found[name] = f"{found.get(name, '')} {line.strip()}".strip()
+    return found
 
 
 # --- commands ---------------------------------------------------------------------------------------------

@@ -152,6 +152,10 @@ def test_corrections_are_a_table(rippled, tmp_path):
     plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):
         ro.use.export_files(plain, corrections=tmp_path / "none.csv")
+    written, said = ro.use.export_files(plain, mdh=tmp_path / "arm.csv", corrections=tmp_path / "none.csv")
+    assert [file.name for file in written] == ["arm.csv"]
+    assert said[0] == "Not written: none.csv, since the calibration has no transmission errors."
+    assert not (tmp_path / "none.csv").exists()
 
 
 def test_commands_are_corrected_for_curves(rippled):

@@ -15,6 +15,7 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_json
 from rpim_opt.calibration.acceptance import distance_quantile, reaching, region_of
 from rpim_opt.problem.workspace import in_base
+from rpim_opt.report.summary import headline
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -149,6 +150,21 @@ def test_held_out_rows_may_be_elsewhere(result) -> None:
     found = accept(result, Requirement(1e-3, joints=((1, (-0.01, 0.01)),)))
     assert found.content()["checked"]["in_region"] == 0
     assert "None of the 40 held-out rows is in the region." in found.sentences()
+    rows = result.problem.data.q[:, 0]
+    wide = accept(result, Requirement(1e-3, joints=((1, (rows.min(), rows.min() + 1e-3)),)))
+    assert wide.content()["checked"]["in_region"] == 0
+    assert wide.verdict == "accepted"  # an identification row is in it
+
+
+def test_a_region_in_which_nothing_was_measured_is_not_accepted(result) -> None:
+    drawn = region_of(result, Requirement(1e-3)).drawn()
+    there, measured = (in_base(result.problem, q) for q in (drawn, result.problem.data.q))
+    far = there[np.argmax(np.linalg.norm(there[:, None] - measured, axis=2).min(axis=1))]
+    box = tuple((float(at) - 0.03, float(at) + 0.03) for at in far)
+    found = accept(result, Requirement(1e-3, box=box))
+    assert found.bound < 1e-3
+    assert found.verdict == "undecided"
+    assert found.reasons == ("Lacking: measurements in the region. No identification row is in it either.",)
 
 
 def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
@@ -210,6 +226,20 @@ def test_all_rows_are_calibrated_as_if_they_had_been_given_so(instance, result, 
     assert held.used == len(instance.problem.data)
     assert everything.record.validation is None
     assert set(held.label) <= set(everything.problem.labels)
+
+
+def test_a_held_out_row_that_the_last_fit_excludes_is_in_the_headline_and_named_in_both(instance, result) -> None:
+    validation = moved(instance.validation, [7], 4e-3)
+    found = ro.calibration.refit_all(replace(result, record=replace(result.record, validation=validation)))
+    errors = 1e3 * found.record.held_out.error
+    said = headline(found)
+    assert f"to {errors.mean():.3f} mm" in said
+    assert f"Without validation:c7, excluded as outliers by that fit and not counted by an acceptance test, the mean " \
+        f"error is {np.delete(errors, 7).mean():.3f} mm." in said  # fmt: skip
+    tested = accept(found, Requirement(1e-3))
+    assert tested.content()["checked"]["rows"] == 39
+    assert tested.content()["checked"]["excluded"] == ["validation:c7"]
+    assert str(tested).endswith("Not counted: validation:c7, excluded as outliers by the fit to all rows.")
 
 
 def test_all_rows_know_more(result, everything) -> None:

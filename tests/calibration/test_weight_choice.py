@@ -270,3 +270,17 @@ def test_two_answers_hardly_apart_of_a_robust_loss_end_between_them() -> None:
     result = ro.calibrate(ro.load("position").problem, absolute, ro.l_curve, max_iterations=100)
     assert result.converged
     assert "alternates" not in result.message
+
+
+def test_a_rule_may_return_a_number() -> None:
+    problem = ro.load("position").problem
+
+    def smallest(program: ro.convex.Program) -> float:
+        return 0.5
+
+    result = ro.calibrate(problem, ro.tikhonov, weight=smallest)
+    assert result.weight == 0.5
+    assert result.selector == "smallest"
+    assert result.x == pytest.approx(ro.calibrate(problem, ro.tikhonov, weight=0.5).x, abs=1e-12)
+    with pytest.raises(ro.InputError, match="selector <lambda>: found a str, accepted: a weight, or a Selection"):
+        ro.calibrate(problem, ro.tikhonov, weight=lambda program: "reml")

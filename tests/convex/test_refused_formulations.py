@@ -31,6 +31,12 @@ def drawn(text: str, **identify: Any) -> ro.calibration.Calibration:
 
 
 REFUSED: dict[str, tuple[Callable[[], object], str]] = {
+    "NumPy's absolute value": (
+        lambda: posed(penalty=lambda z: np.sum(np.abs(z))), "penalty: found a NumPy function of a CVXPY expression"
+    ),
+    "NumPy's sum": (lambda: posed(penalty=lambda z: np.sum(z**2)), "functions of CVXPY: cp.abs, cp.sum"),
+    "NumPy's maximum as a loss": (lambda: posed(loss=lambda r: np.max(np.abs(r))), "loss: found a NumPy function"),
+    "a list of patterns": (lambda: ro.in_ball(1.0, ["a1", "a2"]), "arguments one by one"),  # type: ignore[arg-type]
     "a statement that is a number": (lambda: combination(3), "prior: found 3"),  # type: ignore[arg-type]
     "a value beside a text that has one": (
         lambda: Prior.known("a2 = 0.1 +- 0.1 mm", value=1.0), "a separate value or sd, accepted: the text alone"
@@ -98,6 +104,6 @@ def test_a_statement_without_a_unit_is_in_si() -> None:
 
 
 def test_one_constraint_may_stand_alone() -> None:
-    alone = ro.Formulation("own", constraints=ro.constraints.at_nominal(["a3"]))
-    assert alone.constraints == ro.Formulation("own", constraints=[ro.constraints.at_nominal(["a3"])]).constraints
+    alone = ro.Formulation("own", constraints=ro.constraints.at_nominal("a3"))
+    assert alone.constraints == ro.Formulation("own", constraints=[ro.constraints.at_nominal("a3")]).constraints
     assert "1 constraint" in repr(alone)

@@ -85,3 +85,32 @@ def test_a_ready_measurement_is_known_by_its_name() -> None:
     assert list(data.blocks[0].measurement.columns) == ["distance"]
     with pytest.raises(ro.InputError, match=r"measurement: found 'cabel', accepted: .*did you mean cable"):
         ro.Dataset.of(np.zeros((2, 6)), [[0.3], [0.4]], 1e-4, measurement="cabel")
+
+
+def test_sigmas_of_components_and_poses_as_transforms() -> None:
+    q = np.zeros((2, 6))
+    data = ro.Dataset.of(q, np.zeros((2, 3)), sigma=[1e-5, 2e-5, 3e-5])
+    assert data.blocks[0].covariance[0] == pytest.approx(np.diag([1e-10, 4e-10, 9e-10]))
+    T = np.tile(np.eye(4), (2, 1, 1))
+    T[1] = [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    half = np.sqrt(0.5)
+    poses = ro.Dataset.of(q, T, sigma=1e-5, measurement="pose")
+    assert poses.blocks[0].y[1] == pytest.approx([0.1, 0.2, 0.3, half, 0, 0, half])
+    T[1, 0, 0] = 0.5
+    with pytest.raises(ro.InputError, match="y, row 2: found a matrix that misses"):
+        ro.Dataset.of(q, T, sigma=1e-5, measurement="pose")
+
+
+@pytest.mark.parametrize(
+    ("q", "y", "sigma", "sentence"),
+    [
+        (np.full((2, 6), np.nan), np.zeros((2, 3)), 1e-5, r"q, row 1: found \[nan, .*accepted: finite numbers"),
+        (np.zeros((2, 6)), [[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]], 1e-5, r"y, row 2: found \[0.0, inf, 0.0\]"),
+        (np.zeros((2, 6)), np.zeros((3, 3)), 1e-5, r"shapes \(2, 6\) and \(3, 3\), accepted: \(N, dof\) and \(N, 3\)"),
+        (np.zeros((2, 6)), np.zeros((2, 3)), np.full((2, 3), 1e-5), r"s\[:, :, None\] \*\* 2 \* np.eye\(3\)"),
+        (np.zeros((2, 6)), np.zeros((2, 3)), [1e-5, 0.0, 1e-5], r"sigma: found \[1e-05, 0.0, 1e-05\]"),
+    ],
+)
+def test_arrays_that_do_not_fit(q: np.ndarray, y: np.ndarray, sigma: object, sentence: str) -> None:
+    with pytest.raises(ro.InputError, match=sentence):
+        ro.Dataset.of(q, y, sigma)  # type: ignore[arg-type]

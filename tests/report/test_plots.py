@@ -137,3 +137,11 @@ def test_errors_have_a_direction_where_a_position_was_measured() -> None:
         want = result.nominal_errors() if nominal else result.errors()
         assert length[positions] == pytest.approx(want[positions], rel=1e-12)
     assert np.isfinite(result.measured_positions()).all()
+
+
+def test_the_choice_of_a_calibration_can_be_drawn(ax) -> None:
+    problem = ro.load("position").problem
+    result = ro.calibrate(problem, ro.tikhonov, weight=ro.reml)
+    assert ro.plot.selection(result, ax).lines[1].get_xdata()[0] == result.selection.weight
+    with pytest.raises(ro.InputError, match="a calibration without a selected weight"):
+        ro.plot.selection(ro.calibrate(problem, ro.tikhonov, weight=1.0), ax)

@@ -484,3 +484,16 @@ def test_bad_input_is_answered_in_a_sentence_and_leaves_the_file(tmp_path: Path)
         with pytest.raises(ro.InputError, match=message):
             ro.use.compensate_file(result, table, out)
     assert out.read_text() == "what was there"
+
+
+def test_a_row_beyond_the_measured_joint_ranges_is_extrapolated_and_the_uncertainty_is_that_of_a_prediction() -> None:
+    result, _ = calibrated()
+    low, high = result.ranges[""]
+    q = np.tile(low + 0.65 * (high - low), (2, 1))
+    q[1, 5] = high[5] + 0.6
+    found = ro.use.compensate(result, q)
+    assert found.status == ("ok", "extrapolated")
+    assert not found.missed
+    predicted = result.predict(found.q, of="reached")  # in the instrument's frame, with the base's uncertainty
+    assert found.std == pytest.approx(np.linalg.norm(predicted.standard, axis=1), rel=1e-9)
+    assert "position in the instrument's frame [mm], standard uncertainty" in str(found)

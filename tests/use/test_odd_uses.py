@@ -63,7 +63,9 @@ def test_an_update_says_what_came_out() -> None:
     assert "8 readings lie outside the prediction intervals of the last calibration" in str(lost)
     assert "No small set of changed parameters, frames or readings explains the rest." in str(lost)
     wrong = replace(found, before=unlikely(found.before), changes=(READING,), causes=(READING,))
-    assert str(wrong).startswith("The robot has not changed, but readings are wrong: ")
+    assert str(wrong).startswith(
+        "The robot has not changed, but readings are wrong. With the previous calibration: chi-squared"
+    )
     assert "reading c1: chi-squared falls by 40.0, posterior probability 0.9, left out." in str(wrong)
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))

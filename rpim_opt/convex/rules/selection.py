@@ -39,7 +39,7 @@ class Selection(Tabled):
     ``name`` is the rule's, ``weights`` and ``score`` (K,) are what it tried and compared; ``interior`` says whether the
     choice lies inside of them, and if not, ``note``, a sentence for the report, what that means.
 
-    A selector of one's own is a function of the program that returns one:
+    A selector of one's own is a function of the program that returns a weight, or with its evidence one of these:
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -80,7 +80,7 @@ class Selection(Tabled):
         return [self.note]
 
 
-Selector = Callable[[Program], Selection]
+Selector = Callable[[Program], Selection | float]
 
 
 def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:

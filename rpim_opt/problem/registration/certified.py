@@ -147,7 +147,7 @@ def certified_hand_eye(
         base=rigid(first, first @ u), tool=rigid(last[0].T if last else np.eye(3), t), cost=solved.cost,
         bound=solved.cost - excess, gap=gap, rank_ratio=best.rank_ratio, uncertainty=uncertainty, radius=radius,
         weights=solved.weights, certified=not cause,
-        reason=cause or f"no other start is better: the bound meets the cost within {gap:.1e} of it",
+        reason=cause or f"globally optimal (relative optimality gap at most {GAP:g})",
     )  # fmt: skip
 
 
