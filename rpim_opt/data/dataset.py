@@ -323,7 +323,7 @@ class Dataset(Tabled):
         if q.ndim != 3 or q.shape[:2] != (len(y), points) or y.shape[1:] != (c,):
             of_q = "(N, dof)" if points == 1 else f"(N, {points}, dof)"
             stated = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
-            accepted = f"{of_q} and (N, {c}) for measurement '{measurement.name}': {', '.join(measurement.columns)}"
+            accepted = f"{of_q} joint values and (N, {c}) measured values: {', '.join(measurement.columns)}"
             raise InputError("q and y", f"shapes {stated.shape} and {y.shape}", accepted)
         k = len(measurement.components)
         rows = np.arange(N)

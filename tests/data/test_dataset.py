@@ -106,7 +106,12 @@ def test_sigmas_of_components_and_poses_as_transforms() -> None:
     [
         (np.full((2, 6), np.nan), np.zeros((2, 3)), 1e-5, r"q, row 1: found \[nan, .*accepted: finite numbers"),
         (np.zeros((2, 6)), [[0.0, 0.0, 0.0], [0.0, np.inf, 0.0]], 1e-5, r"y, row 2: found \[0.0, inf, 0.0\]"),
-        (np.zeros((2, 6)), np.zeros((3, 3)), 1e-5, r"shapes \(2, 6\) and \(3, 3\), accepted: \(N, dof\) and \(N, 3\)"),
+        (
+            np.zeros((2, 6)),
+            np.zeros((3, 3)),
+            1e-5,
+            r"shapes \(2, 6\) and \(3, 3\), accepted: \(N, dof\) joint values and \(N, 3\)",
+        ),
         (np.zeros((2, 6)), np.zeros((2, 3)), np.full((2, 3), 1e-5), r"s\[:, :, None\] \*\* 2 \* np.eye\(3\)"),
         (np.zeros((2, 6)), np.zeros((2, 3)), [1e-5, 0.0, 1e-5], r"sigma: found \[1e-05, 0.0, 1e-05\]"),
     ],

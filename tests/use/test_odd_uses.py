@@ -69,7 +69,7 @@ def test_an_update_says_what_came_out() -> None:
     assert "reading c1: chi-squared falls by 40.0, posterior probability 0.9, left out." in str(wrong)
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
-    assert str(moved).startswith("The robot has changed: ")
+    assert str(moved).startswith("The robot has changed. With the previous calibration: chi-squared")
     assert "These readings do not distinguish this from a change of theta3: measure more." in str(moved)
     assert "left out" not in str(moved)
     sure = replace(moved, causes=(JOINT,))
