@@ -30,6 +30,9 @@ SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 
 """What a unit is in lower case (`str.casefold`)."""
 SAME = 0.8
 """Share of the shorter one's values that two columns of other names have in common where they are one key."""
+OTHER_KEYS = "--key row for rows in the same order, or --time-tolerance for the nearest time"
+SIMULTANEOUS = 0.01
+"""Times that differ by less than this part of the shortest time between rows are those of one row."""
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
@@ -44,6 +47,16 @@ class Whole(NamedTuple):
     raw: Columns
     notes: tuple[str, ...]
     keys: Sequence[str] = ()
+
+
+class Pairing(NamedTuple):
+    """Rows of two tables that belong together, their names, the columns that tell it, and sentences on it."""
+
+    left: list[int]
+    right: list[int]
+    names: list[str]
+    columns: Sequence[str]
+    notes: list[str]
 
 
 def together(
@@ -63,59 +76,46 @@ def together(
         lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
         found = f"{lost or 'some tables'} with only part of joint and measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
-    joints = _stacked(moving)
-    values = _stacked(seen)
-    notes = [*joints.notes, *values.notes]
-    if within is None:
-        how, used, keys, others = _keys(moving, seen, joints, values, key)
-        place = {name: i for i, name in enumerate(keys)}
-        if len(place) < len(keys):
-            twice = next(name for name, count in Counter(keys).items() if count > 1)
-            raise InputError(f"the key {how}", f"'{twice}' twice in {moving[0].file}", "unique keys")
-        right = [i for i, name in enumerate(others) if name in place]
-        if not right:
-            found = f"no common value in {moving[0].file} and {seen[0].file}"
-            accepted = "--key with a column of common values, --key row, or --time-tolerance for the nearest time"
-            raise InputError(f"the key {how}", found, accepted)
-        names = [others[i] for i in right]
-        left = [place[name] for name in names]
-        notes.append(f"joined by {how}: {len(right)} rows of {len(keys)} with joints and {len(others)} measured.")
-        known = set(names)
-        lonely = [name for name in keys if name not in known] + [name for name in others if name not in place]
-        if lonely:
-            notes.append(f"without a match, left out: {listed(lonely)}.")
-    else:
-        if not (np.isfinite(within) and within >= 0):
-            raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
-        clocks, there = _times(moving, key)
-        other_clocks, then = _times(seen, key)
-        used = [*clocks, *other_clocks]
-        rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
-        at, of, apart = partners(there, then, within + rounding)
-        if not len(at):
-            nearest = float(np.abs(there - then[0]).min())
-            found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
-            raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
-        left, right = at.tolist(), of.tolist()
-        labels = _labels(values.columns)
-        names = [labels[i] for i in right]
-        notes.append(
-            f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
-            f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
-        )
-        lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right))]
-        if lonely:
-            several = f"{len(lonely)} measured rows without a match within {within:g} s, left out"
-            notes.append(f"{several}: {listed(lonely)}.")
-    sides = ((joints, left), (values, right))
+    joints, values = Side(moving, _stacked(moving)), Side(seen, _stacked(seen))
+    pairing = _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
+    sides = ((joints.whole, pairing.left), (values.whole, pairing.right))
     whole = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.columns.items()}
     raw = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.raw.items()}
     whole.pop("label", None)
-    if len(set(names)) == len(names):
-        whole = {"label": names, **whole}
+    if len(set(pairing.names)) == len(pairing.names):
+        whole = {"label": pairing.names, **whole}
     else:  # several measured values of a configuration
-        whole.setdefault("configuration", names)
-    return Whole(whole, raw, tuple(notes), used)
+        whole.setdefault("configuration", pairing.names)
+    return Whole(whole, raw, (*joints.whole.notes, *values.whole.notes, *pairing.notes), pairing.columns)
+
+
+class Side(NamedTuple):
+    """The tables of joint values, or those of measured ones, and all their rows below each other."""
+
+    tables: Sequence[Understood]
+    whole: Whole
+
+    @property
+    def file(self) -> str:
+        """The name of the first file."""
+        return self.tables[0].file
+
+    @property
+    def raw(self) -> Mapping[str, list[Any]]:
+        """The columns that all files have, by names in lower case."""
+        return _raw(self.tables)
+
+    @property
+    def labels(self) -> list[str]:
+        """Labels of the rows, or their numbers."""
+        return _labels(self.whole.columns)
+
+    def naming(self) -> dict[str, list[str]]:
+        """Return the keys of columns, labels or left out, that name every row differently."""
+        raw = self.raw
+        free = [each.column for each in self.tables[0].meant if each.name in ("", "label", "configuration")]
+        cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
+        return {name: keys for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)}
 
 
 # --- below each other ----------------------------------------------------------------------------------------------
@@ -162,58 +162,85 @@ def _labels(columns: Columns) -> list[str]:
 # --- by a key ------------------------------------------------------------------------------------------------------
 
 
-def _keys(
-    moving: Sequence[Understood], seen: Sequence[Understood], joints: Whole, values: Whole, key: str
-) -> tuple[str, Sequence[str], list[str], list[str]]:
-    """Return what the key is, its columns, and the keys of the rows with joints and of the measured ones."""
-    left, right = _raw(moving), _raw(seen)
-    # columns of either side, labels or left out, that name every row alike
-    sides = []
-    for tables, raw in ((moving, left), (seen, right)):
-        free = [each.column for each in tables[0].meant if each.name in ("", "label", "configuration")]
-        cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
-        sides.append({name: set(keys) for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)})
+class Key(NamedTuple):
+    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
+
+    how: str
+    columns: Sequence[str]
+    left: list[str]
+    right: list[str]
+
+
+def _by_key(joints: Side, values: Side, key: str) -> Pairing:
+    """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
+    chosen = _key(joints, values, key)
+    place = {name: i for i, name in enumerate(chosen.left)}
+    if len(place) < len(chosen.left):
+        twice = next(name for name, count in Counter(chosen.left).items() if count > 1)
+        raise InputError(f"the key {chosen.how}", f"'{twice}' twice in {joints.file}", "unique keys")
+    right = [i for i, name in enumerate(chosen.right) if name in place]
+    if not right:
+        within = _clock_tolerance(joints, values)
+        if within and not key:
+            return _by_time(joints, values, key, within)
+        found = f"no common value in {joints.file} and {values.file}"
+        raise InputError(f"the key {chosen.how}", found, f"--key with a column of common values, {OTHER_KEYS}")
+    names = [chosen.right[i] for i in right]
+    counts = f"{len(right)} rows of {len(chosen.left)} with joints and {len(chosen.right)} measured"
+    notes = [f"joined by {chosen.how}: {counts}."]
+    known = set(names)
+    lonely = [name for name in chosen.left if name not in known] + [name for name in chosen.right if name not in place]
+    if lonely:
+        notes.append(f"without a match, left out: {listed(lonely)}.")
+    return Pairing([place[name] for name in names], right, names, chosen.columns, notes)
+
+
+def _key(joints: Side, values: Side, key: str) -> Key:
+    """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
     pairs = [
-        (name, other)
-        for (name, keys), (other, others) in product(sides[0].items(), sides[1].items())
-        if len(keys & others) >= SAME * min(len(keys), len(others))
+        Key(f"{name} = {other}", (name.lower(), other.lower()), own, others)
+        for (name, own), (other, others) in product(joints.naming().items(), values.naming().items())
+        if len(set(own) & set(others)) >= SAME * min(len(own), len(others))
         and (key in ("", "row") or key.lower() in (name.lower(), other.lower()))
     ]
-    names = [pair for pair in pairs if not _running(_normal(left[pair[0].lower()]))]
-    pair = next(iter(names or pairs), None) if len(names or pairs) == 1 else None
-    own: list[str] = []
-    others: list[str] = []
-    if pair:
-        own, others = _normal(left[pair[0].lower()]), _normal(right[pair[1].lower()])
+    telling = [pair for pair in pairs if not _running(pair.left)]
+    pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
     if key == "row":
-        count, other = (len(next(iter(side.columns.values()))) for side in (joints, values))
-        if count != other:
-            found = f"{count} rows of joints and {other} measured"
-            raise InputError("--key row", found, "equal numbers of both, or a common column")
-        there = set(others)
-        wrong = sum(a != b and a in there for a, b in zip(own, others, strict=True))
-        if names and pair and wrong:
-            found = f"{wrong} of {len(own)} rows whose {pair[0]} is the {pair[1]} of another row"
-            raise InputError("--key row", found, f"no --key, which joins by {' = '.join(pair)}")
-        numbers = [str(i) for i in range(1, count + 1)]
-        return "the number of the row", (), numbers, numbers
-    if "label" in joints.columns and key in ("", "label"):
-        labels = _normal(joints.columns["label"])
+        return _row_numbers(joints, values, pair if telling else None)
+    if key in ("", "label") and "label" in joints.whole.columns:
+        labels = _normal(joints.labels)
         for column in ("label", "configuration"):
-            measured = _normal(values.columns.get(column, ()))
-            if set(labels) & set(measured) and not (names and _running(labels)):
-                return "label", (), labels, measured
+            others = _normal(values.whole.columns.get(column, ()))
+            if set(labels) & set(others) and not (telling and _running(labels)):
+                return Key("label", (), labels, others)
+    left, right = joints.raw, values.raw
     common = [name for name in left if name in right]
     name = key.lower()
-    if not key and len(common) == 1 and not (names and pair):
+    if not key and len(common) == 1 and not (telling and pair):
         name = common[0]
     if name in common:
-        return f"column '{name}'", (name,), _normal(left[name]), _normal(right[name])
+        return Key(f"column '{name}'", (name,), _normal(left[name]), _normal(right[name]))
     if pair:
-        return " = ".join(pair), [each.lower() for each in pair], own, others
-    found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {moving[0].file} and {seen[0].file}"
-    accepted = "a common column, --key row for rows in the same order, or --time-tolerance"
-    raise InputError("--key", found, f"{accepted} for the nearest time")
+        return pair
+    found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
+    raise InputError("--key", found, f"a common column, {OTHER_KEYS}")
+
+
+def _row_numbers(joints: Side, values: Side, pair: Key | None) -> Key:
+    """Return the numbers of the rows as the key, unless a pair of columns shows that the rows are in another order."""
+    count, other = len(joints.labels), len(values.labels)
+    if count != other:
+        found = f"{count} rows of joints and {other} measured"
+        raise InputError("--key row", found, "equal numbers of both, or a common column")
+    if pair:
+        there = set(pair.right)
+        wrong = sum(a != b and a in there for a, b in zip(pair.left, pair.right, strict=True))
+        if wrong:
+            name, other_name = pair.how.split(" = ")
+            found = f"{wrong} of {count} rows whose {name} is the {other_name} of another row"
+            raise InputError("--key row", found, f"no --key, which joins by {pair.how}")
+    numbers = [str(i) for i in range(1, count + 1)]
+    return Key("the number of the row", (), numbers, numbers)
 
 
 def _running(keys: Sequence[str]) -> bool:
@@ -229,8 +256,11 @@ def _raw(tables: Sequence[Understood]) -> Mapping[str, list[Any]]:
 
 
 def _normal(cells: Sequence[Any]) -> list[str]:
-    """Return keys as texts, numbers without zeros before or behind them."""
+    """Return keys as texts: numbers without zeros before or behind them, ``Collection::Group::P1`` as P1."""
     keys = [str(cell).strip() for cell in cells]
+    last = [key.rpartition("::")[2] for key in keys]
+    if len(set(last)) == len(set(keys)):
+        keys = last
     return [str(int(key.partition(".")[0])) if re.fullmatch(r"\d+(?:\.0*)?", key) else key for key in keys]
 
 
@@ -253,6 +283,42 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     np.minimum.at(least, partner, np.abs(apart))
     kept = np.flatnonzero((np.abs(apart) <= within) & (np.abs(apart) == least[partner]))
     return partner[kept], kept, apart[kept]
+
+
+def _by_time(joints: Side, values: Side, key: str, within: float) -> Pairing:
+    """Return the rows of the nearest times."""
+    if not (np.isfinite(within) and within >= 0):
+        raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
+    clocks, there = _times(joints.tables, key)
+    other_clocks, then = _times(values.tables, key)
+    rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
+    left, right, apart = partners(there, then, within + rounding)
+    if not len(left):
+        nearest = float(np.abs(there - then[0]).min())
+        found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
+        raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
+    labels = values.labels
+    notes = [
+        f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
+        f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
+    ]
+    lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
+    if lonely:
+        several = f"{len(lonely)} measured rows without a match within {within:g} s, left out"
+        notes.append(f"{several}: {listed(lonely)}.")
+    names = [labels[i] for i in right]
+    return Pairing(left.tolist(), right.tolist(), names, [*clocks, *other_clocks], notes)
+
+
+def _clock_tolerance(joints: Side, values: Side) -> float:
+    """Return a small part of the time between rows [s] where every measured row has a partner within it, else 0."""
+    if any(time_column(table.raw) is None for side in (joints, values) for table in side.tables):
+        return 0.0
+    there, then = _times(joints.tables, "")[1], _times(values.tables, "")[1]
+    if min(len(there), len(then)) < 2:
+        return 0.0
+    within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
+    return within if len(partners(there, then, within)[1]) == len(then) else 0.0
 
 
 def _times(tables: Sequence[Understood], key: str) -> tuple[list[str], Array]:
