@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, read_columns, read_grid
+from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, matlab_columns, read_columns, read_grid
 from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6
@@ -24,10 +24,11 @@ DIMENSIONS = frozenset(unit.dimension for unit in UNITS.values())
 MOST_NAMED = 5
 """Lines that are left out and named one by one."""
 SUMMARIES = frozenset({
-    "mean", "average", "avg", "std", "std dev", "stddev", "stdev", "sigma", "min", "max", "minimum", "maximum", "range",
-    "rms", "sum", "total", "median", "mittelwert", "mittel", "summe", "moyenne",
+    "mean", "average", "avg", "std", "stddev", "stdev", "sigma", "min", "max", "minimum", "maximum", "range", "rms",
+    "sum", "total", "median", "standarddeviation", "mittelwert", "mittel", "summe", "stdabw", "standardabweichung",
+    "spannweite", "moyenne", "écarttype", "media", "promedio", "平均", "最大", "最小", "标准差", "標準偏差",
 })  # fmt: skip
-"""What a row begins with that is no measurement."""
+"""What a row begins with that is no measurement, letters alone."""
 COMMENT = ("//", "#", "%", "!", "*")
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """How tables say that there is no value."""
@@ -190,6 +191,8 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     try:
         if columns is None and path.suffix.lower() == ".parquet":
             columns = read_columns(path)
+        elif columns is None and path.suffix.lower() == ".mat":
+            columns = matlab_columns(path)
         if columns is not None:
             found = [Column(name, Head(name), cells) for name, cells in columns.items()]
         else:
@@ -218,7 +221,7 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
         raise InputError("the table", found, "at least one row of numbers")
     numeric = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, numeric, options)
-    full = [i for i in numeric if next(filter(None, grid.rows[i])).lower().rstrip(":") not in SUMMARIES]
+    full = [i for i in numeric if _letters(next(filter(None, grid.rows[i]))) not in SUMMARIES]
     columns, mark = _columns([grid.rows[i] for i in full], heads, options)
     left = sorted(set(range(numeric[0], len(grid.rows))) - set(full))
     notes = [*grid.notes, *_notes(grid, above, left, options)]
@@ -233,6 +236,10 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
             units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
             notes.append(f"units above the header: {stated[1]}.")
     return columns, notes, units
+
+
+def _letters(cell: str) -> str:
+    return "".join(filter(str.isalpha, cell)).lower()
 
 
 def _count(row: Sequence[str]) -> int:
@@ -270,7 +277,10 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
         above_numbers = sum(
             cell[:1].isalpha() and is_numeral(below) for cell, below in zip(first, second, strict=False)
         )
-        if not above_names and above_numbers < 2:
+        # LabVIEW: counts and steps of the channels, above the names of columns that begin with a number
+        lines = not is_numeral(first[0]) and is_numeral(rows[full[-1]][0])
+        lines = lines and any(not _count(row) and len(row) > 1 for row in rows[full[0] + 1 : full[-1]])
+        if not above_names and not lines and above_numbers < 2:
             break
         full = full[1:]
     return full
@@ -396,8 +406,9 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
     Where both stand in a number, the last one is it. Where commas alone do, one that cannot part thousands decides. A
     stated mark holds unless a number contradicts it.
     """
+    stated = {"comma": ",", "point": "."}.get(stated, stated)
     if stated not in ("", ",", "."):
-        raise InputError("--decimal", f"'{stated}'", "a comma or a point")
+        raise InputError("--decimal", f"'{stated}'", "comma or point")
     marks = [(_mark(cell), cell) for cell in cells]
     if stated:
         for mark, cell in marks:
@@ -410,7 +421,9 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
         raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark, or --decimal with it")
     if not shown and doubtful:
         raise InputError(
-            "the numbers", f"'{doubtful}', whose mark may separate thousands or decimals", "--decimal , or --decimal ."
+            "the numbers",
+            f"'{doubtful}', whose mark may separate thousands or decimals",
+            "--decimal comma, or --decimal point",
         )
     return next(iter(shown), ".")
 
@@ -473,8 +486,9 @@ def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
     axis = next((each for each in columns if {str(cell).lower() for cell in each.cells} == set("xyz")), None)
     if axis is None:
         return columns, []
-    others = [each for each in columns if each is not axis]
-    points = _points([str(cell).lower() for cell in axis.cells], others)
+    letters = [str(cell).lower() for cell in axis.cells]
+    others = [_without_letters(each, letters) for each in columns if each is not axis]
+    points = _points(letters, others)
     if not points:
         accepted = "a column that names its point, all three once"
         raise InputError("the header", f"a row a coordinate ('{axis.name}')", accepted)
@@ -496,6 +510,14 @@ def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
         cells = [str(value.cells[rows[letter]]) if letter in rows else "" for rows in points]
         whole.append(Column(str(head), head, cells))
     return whole, [f"a row a coordinate: column '{value.name}' by '{axis.name}'."]
+
+
+def _without_letters(column: Column, letters: Sequence[str]) -> Column:
+    """Return a column whose cells all name their row's coordinate, ``P1.X``, without it; others unchanged."""
+    cells = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", str(cell).strip(), re.IGNORECASE)
+             for cell, letter in zip(column.cells, letters, strict=True)]  # fmt: skip
+    found = [match[1] for match in cells if match]
+    return column._replace(cells=found) if len(found) == len(letters) else column
 
 
 def _points(letters: Sequence[str], keys: Sequence[Column]) -> list[dict[str, int]]:

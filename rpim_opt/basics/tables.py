@@ -13,6 +13,7 @@ import csv
 import io
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import islice
@@ -21,6 +22,7 @@ from typing import Any, NamedTuple
 from zipfile import ZipFile
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import LARGEST_DATA, read_bytes, read_text, require_file
@@ -131,7 +133,7 @@ def _require_names(header: Sequence[str]) -> None:
 
 
 def _parquet(path: Path) -> Columns:
-    parquet = _library("pyarrow.parquet", "Parquet files")
+    parquet = library("pyarrow.parquet", "Parquet files")
     try:
         with parquet.ParquetFile(path) as file:
             metadata, schema = file.metadata, file.schema_arrow
@@ -168,16 +170,36 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
 # --- files as people have them -------------------------------------------------------------------------------------
 
 
+def matlab_columns(path: Path) -> Columns:
+    """Return the arrays of numbers of a MATLAB file, those of the most common length, as ``q_1, q_2, ...``."""
+    require_file(path, LARGEST_DATA)
+    accepted = "a file that MATLAB saved with -v7 and variables of numbers, a row a configuration"
+    try:
+        sizes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind in ("double", "single")}
+        if sum(map(math.prod, sizes.values())) > MOST_CELLS:
+            raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
+        arrays = scipy.io.loadmat(path, variable_names=list(sizes)) if sizes else {}
+    except (OSError, ValueError, TypeError, NotImplementedError, MemoryError) as error:
+        raise InputError("the file", _first_line(error), accepted) from None
+    rows = Counter(shape[0] for shape in sizes.values() if len(shape) == 2 and shape[0] > 1)
+    columns: dict[str, Sequence[Any]] = {}
+    for name, shape in sizes.items():
+        if rows and len(shape) == 2 and shape[0] == rows.most_common(1)[0][0]:
+            columns |= {
+                f"{name}_{i}" if shape[1] > 1 else name: part for i, part in enumerate(arrays[name].T.tolist(), 1)
+            }
+    if not columns:
+        raise InputError("the file", f"variables {', '.join(sizes) or 'without numbers'}", accepted)
+    return columns
+
+
 def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
     """Return the rows of a text or Excel file; arguments as in `TableOptions`."""
-    known = (*TEXTS, *EXCEL, ".parquet")
-    require_file(path, LARGEST_DATA, known)
+    require_file(path, LARGEST_DATA, (*TEXTS, *EXCEL))
     if path.suffix.lower() in EXCEL:
         return _excel(path, sheet)
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
-    if path.suffix.lower() not in TEXTS:
-        raise InputError("the file's name", f"'{path.name}'", f"a name ending in {', '.join(known)}")
     whole, said = decoded(path, encoding)
     text = THOUSANDS.sub("", whole)
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
@@ -204,7 +226,11 @@ def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
     try:
         text = data.decode(name)
     except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
-        raise InputError("the text", str(error), "an encoding that fits: --encoding utf-8, cp1252, utf-16") from None
+        raise InputError(
+            "the text",
+            str(error),
+            "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chinese), utf-16, ...",
+        ) from None
     if "\x00" in text:
         raise binary
     text = text.replace("\u2212", "-").replace("\r\n", "\n").replace("\r", "\n")
@@ -320,7 +346,7 @@ def _words(line: str) -> list[str]:
 
 def _excel(path: Path, sheet: str) -> Grid:
     """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has cells."""
-    openpyxl = _library("openpyxl", "Excel files")
+    openpyxl = library("openpyxl", "Excel files")
     rows: list[tuple[int, list[str]]] = []
     try:
         with path.open("rb") as stream:
@@ -366,7 +392,8 @@ def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
             yield number, cells
 
 
-def _library(name: str, what: str) -> Any:
+def library(name: str, what: str) -> Any:
+    """Return a module of an optional package."""
     try:
         return import_module(name)
     except ImportError:

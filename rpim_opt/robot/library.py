@@ -14,7 +14,7 @@ from rpim_opt.robot.chain import XACRO, Described
 from rpim_opt.robot.formats.tables import read_robot, read_sheet
 
 READY = Path(__file__).resolve().parent / "ready"
-ROBOT_FILES = (".toml", ".urdf", ".csv", ".json")
+ROBOT_FILES = (".toml", ".urdf", ".csv", ".json", ".yaml", ".yml")
 REFUSED = {
     XACRO: "a xacro file, which is executed and so may be named by commands and scripts only",
     ".xml": "an XML file, of MuJoCo or others",
@@ -41,7 +41,7 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     ready = robots()
     if name in ready:
         return READY / f"{name}.toml"
-    accepted = "a file .toml, .urdf, .csv or .json"
+    accepted = "a file .toml, .urdf, .csv, .json or .yaml (Universal Robots' kinematics)"
     file = None if folder is None else folder / "problem.toml"
     refused = REFUSED.get(Path(name).suffix.lower())
     if refused:
@@ -63,6 +63,10 @@ def read_arm(
         raise InputError("chain", f"a robot {file.name}", "a robot in a file .urdf")
     if file.suffix == ".csv":
         return read_sheet(file, convention)
+    if file.suffix in (".yaml", ".yml"):
+        from rpim_opt.robot.formats.universal_robots import read_ur_kinematics
+
+        return read_ur_kinematics(file)
     if convention:
         raise InputError("--dh", f"'{convention}' of {file.name}", "a table .csv; other files state their convention")
     return Described(read_robot(file), np.zeros(6), np.zeros(6))

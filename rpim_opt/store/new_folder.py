@@ -191,7 +191,13 @@ def new_problem(
                 write_robot(arm.robot, made / "robot.toml")
             made.rename(folder)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
+    assumed = ", ".join(
+        f"{name.rpartition('_')[0]} {value:g} {name.rpartition('_')[2]}" for name, value in noise.items()
+    )
     notes += [f"Measurement {kind.name}: {how}.", guessed]
+    notes.append(
+        f"Assumed where no column states it: measurement noise (1 sigma) {assumed}; change [noise] in problem.toml."
+    )
     if before:
         notes.append(SHARED)
     elif chain:

@@ -21,7 +21,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import together
-from rpim_opt.data.tables.names import ORDERS
+from rpim_opt.data.tables.names import ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
 from rpim_opt.problem.misreadings import pose_misfit
@@ -206,7 +206,7 @@ def understand_of(
 ) -> Understanding:
     """Interpret raw tables (files or data frames) as `understand_tables` does, or tables of targets."""
     options = options or TableOptions()
-    files = [each for source in data for each in _sheets(source, options)]
+    files = [(path, _upright(raw, arm)) for source in data for path, raw in _sheets(source, options)]
     columns = [raw.columns for _, raw in files]
     if measurement is None:
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
@@ -236,6 +236,19 @@ def _sheets(source: Any, options: TableOptions) -> Files:
         if error.where != "--sheet" or "," not in options.sheet:
             raise
     return [(path, read_raw(path, replace(options, sheet=sheet.strip()))) for sheet in options.sheet.split(",")]
+
+
+def _upright(raw: RawTable, arm: Described) -> RawTable:
+    """Return a table that has a row a quantity with a column a quantity; any other unchanged."""
+    first, *others = raw.columns.items()
+    names = [str(cell).strip() for cell in first[1]]
+    wanted = {"x", "y", "z", *(f"q{i}" for i in range(1, arm.robot.dof + 1))}
+    stems = {recognize(split(name)[0], arm.names).stem for name in names}
+    if not wanted <= stems or len(set(names)) < len(names):
+        return raw
+    columns = {name: [cells[i] for _, cells in others] for i, name in enumerate(names)}
+    columns = {"label": [name for name, _ in others], **columns}
+    return RawTable(columns, {}, (*raw.notes, "a row a quantity: turned by 90 degrees."), raw.units)
 
 
 def _tables(

@@ -55,13 +55,13 @@ def book(folder: Path) -> Path:
 
 REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     "a sign that is two": (HEAD + ROWS, {"separator": "::"}, "--separator: found '::'"),
-    "a decimal mark": (HEAD + ROWS, {"decimal": "'"}, "a comma or a point"),
+    "a decimal mark": (HEAD + ROWS, {"decimal": "'"}, "comma or point"),
     "a decimal mark that numbers do not have": (
         HEAD + ROWS.replace("401", "401.5"), {"decimal": ",", "separator": ","}, "the mark that the numbers have"
     ),
     "nothing": ("\n\n", {}, "an empty file"),
-    "an encoding that no text has": (HEAD + ROWS, {"encoding": "\ud800"}, "an encoding that fits"),
-    "an encoding of no name": (HEAD + ROWS, {"encoding": "\x00"}, "an encoding that fits"),
+    "an encoding that no text has": (HEAD + ROWS, {"encoding": "\ud800"}, "--encoding with the one that fits"),
+    "an encoding of no name": (HEAD + ROWS, {"encoding": "\x00"}, "--encoding with the one that fits"),
     "a sheet of a text": (HEAD + ROWS, {"sheet": "1"}, "an Excel workbook"),
     "angles that no file has": (HEAD + ROWS, {"rotation": "euler"}, "--rotation: found 'euler'"),
     "no row with values": (HEAD + "P1,1,2,-,-,-\nP2,-,-,3,4,5\n", {}, "no row with values"),

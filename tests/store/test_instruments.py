@@ -12,15 +12,17 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
+from tests.store.fresh_files import FRESH
 from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl
 from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, book, cells, text
 from tests.test_cli import run
 
-NOT_READ = {"ROS, rostopic echo as YAML", "MELFA joint variables"}
+NOT_READ = {"MELFA joint variables"}
 """Formats without a reader."""
 FILES = {
     **REFUSED_THOUGH_RIGHT,
     **STRANGERS,
+    **FRESH,
     **{name: shape for name, shape in INSTRUMENTS.items() if name not in NOT_READ},
 }
 
@@ -46,6 +48,7 @@ def test_a_file_as_it_is_exported_is_the_clean_table(monkeypatch, capsys, empty,
     assert new(monkeypatch, *paths, **options) == 0, capsys.readouterr().err
     (block,) = ro.load("cell").problem.data.blocks
     labels = ro.load("cell").problem.data.label
+    labels = [label.upper() for label in labels]
     order = [LABELS.index(label) for label in labels] if set(labels) <= set(LABELS) else list(range(len(Q)))
     assert block.measurement.name == kind
     assert len(order) == len(Q)

@@ -22,9 +22,12 @@ from rpim_opt.robot.mdh import Robot
 
 TURNED = ("rx", "ry", "rz")
 """Columns of three turns; without a unit they may also be a rotation vector, as Universal Robots' are."""
+COORDINATES = {"x", "y", "z"}
 ANOTHER_POINT = re.compile(r"(?:p|pos|position|meas|measured)?_?[xyz]_?[2-9]")
 INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 """In the name of a coordinate that is not the robot's own; actual may be either."""
+CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
+"""Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
@@ -104,31 +107,46 @@ def understand(
     rotation = options.rotation or rotation
     columns, meant = _under_our_names(raw.columns, read, kind, known, options.units, stated)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
-        names = {split_unit(name)[0]: name for name in columns}
-        if any(turn not in names for turn in TURNED):
-            raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
-        turned = [names[turn] for turn in TURNED]
-        angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns.pop(name), name) for name in turned]
-        columns |= known_names.quaternions(np.column_stack(angles), rotation)
-        said = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
-        new = {"meaning": said, "name": "qw, qx, qy, qz", "unit": ""}
-        meant = [each._replace(**new) if each.name in turned else each for each in meant]
+        columns, meant = _as_quaternions(columns, meant, rotation)
     kept, notes = range(len(next(iter(columns.values()), ()))), []
     if not targets:
         kept, columns, notes = _rows_with_values(columns, robot, kind)
+    cells = {name: [cells[i] for i in kept] for name, cells in raw.columns.items()}
+    notes = [*raw.notes, *notes, *_unused_units(meant, stated)]
+    return Understood(columns, cells, tuple(meant), tuple(notes), _doubt(read, robot, options, rotation))
+
+
+def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> tuple[Columns, list[Meant]]:
+    """Return columns and meanings with a quaternion in the place of three turns."""
+    names = {split_unit(name)[0]: name for name in columns}
+    if any(turn not in names for turn in TURNED):
+        raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
+    turned = [names[turn] for turn in TURNED]
+    angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns[name], name) for name in turned]
+    others = {name: cells for name, cells in columns.items() if name not in turned}
+    said = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
+    new = {"meaning": said, "name": "qw, qx, qy, qz", "unit": ""}
+    meant = [each._replace(**new) if each.name in turned else each for each in meant]
+    return others | known_names.quaternions(np.column_stack(angles), rotation), meant
+
+
+def _unused_units(meant: Sequence[Meant], stated: Mapping[str, str]) -> list[str]:
+    """Say which stated units a header contradicts."""
+    notes = []
     for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
         unit = stated.get(dimension, each.unit)
         if unit != each.unit:
             notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
-    doubt = ""
+    return notes
+
+
+def _doubt(read: Readings, robot: Robot, options: TableOptions, rotation: str) -> str:
+    """Return the option that only a check against the robot decides, or nothing."""
+    if not options.quaternion and quaternion_columns(read, robot.dof):
+        return "quaternion"
     turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
     named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
-    if not options.quaternion and quaternion_columns(read, robot.dof):
-        doubt = "quaternion"
-    elif len(turns) == 3 and not named and not rotation:
-        doubt = "rotation"
-    cells = {name: [cells[i] for i in kept] for name, cells in raw.columns.items()}
-    return Understood(columns, cells, tuple(meant), (*raw.notes, *notes), doubt)
+    return "rotation" if len(turns) == 3 and not named and not rotation else ""
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------
@@ -154,9 +172,10 @@ def _readings(
     numbered(read, table, dof, options.quaternion or "wxyz")
     read.update(_in_robots_order(read, table, dof, joints))
     read.update(_from_one(read, dof))
-    for stems in ({f"q{i}" for i in range(1, dof + 1)}, {"x", "y", "z"}):
+    for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
         read.update(_without_prefix(read, stems, joints, options.prefix))
     read.update(_counted(read, robot))
+    read.update(_counted_coordinates(read))
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "a row each, with a column marker")
@@ -248,9 +267,37 @@ def _from_one(read: Readings, dof: int) -> Readings:
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
-    """Return the meanings of names without a common prefix, if no name is known with it."""
-    if wanted & {each.stem for each in read.values()}:
+    """Return the meanings of names without a common prefix, where no name is known with it.
+
+    Coordinates that are known with theirs, ``POS_ACT.X``, may be the controller's: beside others they are asked for.
+    """
+    known = [name for name, each in read.items() if each.stem in wanted]
+    direct = dict.fromkeys(known, Reading("", "", "another column is of the instrument"))
+    bare = any(len(split(name)[0]) == 1 or INSTRUMENT.search(name) for name in known)
+    if known and (bare or wanted != COORDINATES):
         return {}
+    stated = stated.strip(" ._/:-")
+    whole = {}
+    for prefix, each in _prefixed(read, joints).items():
+        counted = each | _from_one(each, len(wanted))
+        missing = sorted(wanted - {found.stem for found in counted.values()})
+        if not missing:
+            whole[prefix] = counted
+        elif len(missing) < len(wanted) / 2 and not known:  # is it one that did not move
+            why = f"of {prefix}, which has no {', '.join(missing)}: --constants"
+            read.update({name: Reading("", "", why) for name in each})
+    if known and whole and not all(CONTROLLER.match(name) for name in known):
+        own = split(known[0])[0][:-1].strip(" ._/:-")
+        whole = {own: {name: read[name] for name in known}} | whole
+    if stated in whole:
+        whole = {stated: whole[stated]}
+    if len(whole) > 1:
+        raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix with the one that was measured")
+    return direct | next(iter(whole.values())) if whole else {}
+
+
+def _prefixed(read: Readings, joints: Sequence[str]) -> dict[str, Readings]:
+    """Return the meanings of unknown names without what stands before them, by that."""
     found: dict[str, Readings] = {}
     for name, each in read.items():
         for prefix, rest in endings(split(name)[0]):
@@ -259,18 +306,8 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
                 bare = prefix.strip(" ._/:-")
                 new = Reading(known.stem, each.unit, f"{known.why}, of {bare}", known.kind or each.kind)
                 found.setdefault(bare, {})[name] = new
-    whole = {}
-    for prefix, each in found.items():
-        counted = each | _from_one(each, len(wanted))
-        missing = sorted(wanted - {known.stem for known in counted.values()})
-        if not missing and stated.strip(" ._/:-") in ("", prefix):
-            whole[prefix] = counted
-        elif len(missing) < len(wanted) / 2:  # is it one that did not move
-            why = f"of {prefix}, which has no {', '.join(missing)}: --constants"
-            read.update({name: Reading("", "", why) for name in each})
-    if len(whole) > 1:
-        raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix with the one that was measured")
-    return next(iter(whole.values()), {})
+                break  # the shortest prefix: orientation/x is no x
+    return found
 
 
 def _counted(read: Readings, robot: Robot) -> Readings:
@@ -288,18 +325,38 @@ def _counted(read: Readings, robot: Robot) -> Readings:
     return whole[0] if len(whole) == 1 else {}
 
 
+def _counted_coordinates(read: Readings) -> Readings:
+    """Return x, y, z of three columns of one word that are counted, ``p_1, p_2, p_3``, if nothing else is measured."""
+    if any(each.stem in (*COORDINATES, "distance", "q0") for each in read.values()):
+        return {}
+    found: dict[str, dict[str, str]] = {}
+    for name, each in read.items():
+        match = re.fullmatch(r"(\D*?)_?(\d)", each.stem)
+        if match and not each.why and (not each.unit or dimension_of(each.unit) == "length"):
+            found.setdefault(match[1], {})[match[2]] = name
+    triples = [columns for columns in found.values() if sorted(columns) in (list("123"), list("012"))]
+    if len(triples) != 1:
+        return {}
+    names = [triples[0][number] for number in sorted(triples[0])]
+    why = "the only three columns that are counted, beside the joints"
+    return {name: read[name]._replace(stem=axis, why=why) for name, axis in zip(names, "xyz", strict=True)}
+
+
 def _leave_out(read: Readings, targets: bool) -> None:
     """Ignore computed columns, and commanded ones where measured ones exist; for targets ignore measured ones."""
     measured = {each.stem for each in read.values() if each.kind in ("", "measured")}
     named = {each.stem for name, each in read.items() if each.kind == "measured" and INSTRUMENT.search(name)}
-    by_instrument = {"x", "y", "z"} if named >= {"x", "y", "z"} else set()  # one alone is of another frame
+    by_instrument = COORDINATES if named >= COORDINATES else set()  # one alone is of another frame
     wanted = {each.stem for each in read.values() if each.kind == "wanted"}
+    letters = COORDINATES & {split(name)[0].lower() for name in read}
     for name, each in list(read.items()):
         why = ""
         if each.kind == "derived":
             why = "computed from others"
         elif not each.kind and each.stem in by_instrument and not INSTRUMENT.search(name):
             why = "another column is of the instrument"
+        elif name == "X_Value" and letters == COORDINATES:
+            why = "LabVIEW's time"
         elif targets:
             if each.kind != "wanted" and each.stem in wanted:
                 why = "not a target of the robot"

@@ -1,4 +1,4 @@
-"""JSON: an object a line, an array of objects, or an object of columns."""
+"""JSON and YAML: an object a line or document, an array of objects, or an object of columns."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import parse_json
+from rpim_opt.basics.tables import library
 from rpim_opt.basics.units import split
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
@@ -21,16 +22,33 @@ def read(text: str) -> Rows:
             found = parse_json(text)
     except ValueError as error:
         raise InputError("the JSON text", str(error), "a whole JSON file, or an object a line") from None
+    return _rows(found)
+
+
+def read_yaml(text: str) -> Rows:
+    """Return the rows of a YAML text without aliases, which grow beyond memory."""
+    yaml = library("yaml", "YAML files")
+    try:
+        if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
+            raise InputError("the YAML text", "an alias (*)", "values written out")
+        found = [document for document in yaml.safe_load_all(text) if document is not None]
+    except (yaml.YAMLError, ValueError, RecursionError) as error:
+        raise InputError("the YAML text", " ".join(str(error).split())[:200], "a whole YAML file") from None
+    return _rows(found[0] if len(found) == 1 else found)
+
+
+def _rows(found: Any) -> Rows:
+    """Return the rows of a document."""
     if isinstance(found, dict) and all(isinstance(cells, list) for cells in found.values()):
         if len(set(map(len, found.values()))) != 1:
-            raise InputError("the JSON text", "lists of several lengths", "an array of rows, or columns of one length")
+            raise InputError("the text", "lists of several lengths", "an array of rows, or columns of one length")
         found = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
     elif isinstance(found, dict):
         lists = [value for value in found.values() if isinstance(value, list) and value]
         inner = [value for value in lists if all(isinstance(row, dict) for row in value)]
         found = inner[0] if len(inner) == 1 else [found]
-    if not all(isinstance(row, dict) for row in found):
-        raise InputError("the JSON text", "an array of other things", "an array of objects, one a row")
+    if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
+        raise InputError("the text", "an array of other things", "an array of objects, one a row")
     return [dict(_flat("", row)) for row in found]
 
 
@@ -45,10 +63,14 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     for name, part in value.items():
         if isinstance(joints, list) and isinstance(part, list) and part is not joints:
             # ROS: lists of values beside one of names, in whatever order
-            yield from ((f"/{prefix}/{joint}/{name}", cell) for joint, cell in zip(joints, part, strict=False))
+            topic = f"/{prefix}" if prefix else ""
+            yield from ((f"{topic}/{joint}/{name}", cell) for joint, cell in zip(joints, part, strict=False))
             continue
         whole = f"{stem}.{name} [{unit}]" if unit else f"{prefix}.{name}"
         yield from _flat(whole if prefix else name, part)
 
 
-FORMATS = (TableFormat("JSON", (".json", ".jsonl", ".ndjson"), lambda text: text.lstrip()[:1] in "[{", read),)
+FORMATS = (
+    TableFormat("JSON", (".json", ".jsonl", ".ndjson"), lambda text: text.lstrip()[:1] in "[{", read),
+    TableFormat("YAML", (".yaml", ".yml"), lambda text: ":" in text, read_yaml),
+)

@@ -2,7 +2,8 @@
 
 FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXIS XP1={A1 10.0,A2 -90.0,...}``; ABB
 ``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
-in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Staubli
+in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Kawasaki
+``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Staubli
 ``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out.
 """
 
@@ -24,6 +25,7 @@ ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
+KAWASAKI = re.compile(r"^\.JOINTS[^\n]*\n(.*?)^\.END", re.MULTILINE | re.DOTALL | re.IGNORECASE)
 STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
 KUKA_NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **dict(zip("XYZ", PLACE, strict=True)),
@@ -114,6 +116,12 @@ def read_yaskawa(text: str) -> Rows:
     return _rows([(name, dict(zip(PLACE, map(str.strip, cells.split(",")), strict=False))) for name, cells in points])
 
 
+def read_kawasaki(text: str) -> Rows:
+    """Return the points of joint values of an AS program or of what a controller saved."""
+    lines = [line.split() for section in KAWASAKI.findall(text) for line in section.splitlines()]
+    return _rows([(words[0].removeprefix("#"), _joints(",".join(words[1:]))) for words in lines if len(words) > 1])
+
+
 def read_staubli(text: str) -> Rows:
     """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]``."""
     array, i = "", -1
@@ -144,5 +152,6 @@ FORMATS = (
         "URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)) is not None, read_urscript
     ),
     TableFormat("Yaskawa job", (".jbi",), lambda text: YASKAWA.search(text) is not None, read_yaskawa),
+    TableFormat("Kawasaki AS program", (".as", ".pg"), lambda text: KAWASAKI.search(text) is not None, read_kawasaki),
     TableFormat("VAL3 data", (".dtx",), lambda text: "<Value" in text, read_staubli),
 )

@@ -18,6 +18,12 @@ Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
 
+BINARY = frozenset(
+    {".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npz", ".npy", ".pkl"}
+)
+"""Endings of files that are no text; any other unknown ending may be one of an instrument's table."""
+
+
 class TableFormat(NamedTuple):
     """A format of tables: a module of this folder lists its own in ``FORMATS``.
 
@@ -42,8 +48,8 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     ending = path.suffix.lower()
     every = formats()
     fitting = [each for each in every if ending in each.endings]
-    plain = {*TEXTS, *EXCEL, ".parquet"}
-    if not fitting and ending not in plain:
+    plain = {*TEXTS, *EXCEL, ".parquet", ".mat"}
+    if not fitting and ending in BINARY:
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
     found = None

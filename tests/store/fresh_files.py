@@ -1,0 +1,134 @@
+# ruff: noqa: E501
+"""Formats that were written without sight of the reader and not read at first contact, of the clean table of `raw_files`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from scipy.io import savemat
+
+from tests.store.instrument_files import Shape, many
+from tests.store.raw_files import (
+    COUNT,
+    JOINTS,
+    LABELS,
+    METRES,
+    NAMED,
+    POINTS,
+    RADIANS,
+    WXYZ,
+    P,
+    Q,
+    beside,
+    cells,
+    excel,
+    joint_names,
+    one,
+    text,
+)
+
+AXES = text([["Point", *joint_names("A{}")]], beside(NAMED, JOINTS))
+BOTH = {"units": "deg,mm"}
+IN_SI = {"units": "rad,m"}
+XYZW = cells(WXYZ[:, [1, 2, 3, 0]])
+STAMPS = [f"{1403636579.763 + 5 * i:.3f}" for i in range(COUNT)]
+
+
+def spatial_analyzer() -> str:
+    points = "".join(f"A::KR6 Cal::{label}, {', '.join(row)}\n" for label, row in zip(LABELS, POINTS, strict=True))
+    return f"// Spatial Analyzer ASCII Point Export\n// Units: Millimeters\n// Collection::Group::Target, X, Y, Z\n{points}"
+
+
+def calypso() -> str:
+    head = ["planid", "id", "type", "idsymbol", "actual", "nominal", "uppertol", "deviation", "unit"]
+    rows = [["Kalib", f"{label}.{axis}", f"{axis.lower()}Value", axis, value, "1.0", "0.1", "2.5", "mm"]
+            for label, row in zip(LABELS, POINTS, strict=True) for axis, value in zip("XYZ", row, strict=True)]  # fmt: skip
+    return text([head], [*rows, ["END", *[""] * 8]], "\t")
+
+
+def plotjuggler() -> str:
+    head = [
+        "__time",
+        *joint_names("/joint_states/joint_a{}/position"),
+        *joint_names("/joint_states/joint_a{}/velocity"),
+    ]
+    head += [f"/mocap/flange/pose/pose/position/{c}" for c in "xyz"] + [
+        f"/mocap/flange/pose/pose/orientation/{c}" for c in "xyzw"
+    ]
+    return text([head], beside([[stamp] for stamp in STAMPS], RADIANS, [["1e-5"] * 6] * COUNT, METRES, XYZW))
+
+
+def matlab(folder: Path) -> Path:
+    savemat(folder / "data.mat", {"q": Q, "p": P, "note": "cell 7", "rate": 250.0})
+    return folder / "data.mat"
+
+
+def kawasaki() -> str:
+    moves = "".join(f"  JMOVE #{label.lower()}\n" for label in LABELS)
+    points = "".join(f"#{label.lower()} {' '.join(row)}\n" for label, row in zip(LABELS, JOINTS, strict=True))
+    return f".PROGRAM calib()\n{moves}.END\n.JOINTS\n{points}.END\n"
+
+
+def samples() -> str:
+    lines = [f"- id: {i}\n  joint_positions: [{', '.join(q)}]\n  marker_position: {{x: {p[0]}, y: {p[1]}, z: {p[2]}}}\n"
+             for i, (q, p) in enumerate(zip(RADIANS, METRES, strict=True))]  # fmt: skip
+    return "# collected by a script\nsamples:\n" + "".join(lines)
+
+
+def labview() -> str:
+    blocks = [["Channels", "9"], ["Samples", *["1"] * 9], ["Date", *["2024/03/14"] * 9], ["Y_Unit_Label", *["deg"] * 6, *["mm"] * 3],
+              ["X0", *["0.0E+0"] * 9], ["Delta_X", *["1.000000"] * 9], ["***End_of_Header***"]]  # fmt: skip
+    head = ["X_Value", *joint_names("J{}"), "X", "Y", "Z", "Comment"]
+    rows = beside([[f"{i}.000000"] for i in range(COUNT)], JOINTS, POINTS, [[""]] * COUNT)
+    return "LabVIEW Measurement\t\nSeparator\tTab\n***End_of_Header***\t\n\t\n" + text([*blocks, head], rows, "\t")
+
+
+def trajectory() -> str:
+    rows = [" ".join([stamp, *p, *turn]) for stamp, p, turn in zip(STAMPS, METRES, XYZW, strict=True)]
+    return "# ground truth trajectory\n# timestamp tx ty tz qx qy qz qw\n" + "\n".join(rows) + "\n"
+
+
+def clocked_joints() -> str:
+    later = [[f"{float(stamp) + 0.002:.3f}"] for stamp in STAMPS]
+    return text([["timestamp", *joint_names("joint_{}")]], beside(later, RADIANS))
+
+
+def trace() -> str:
+    head = ["Zeit", *joint_names("$AXIS_ACT.A{}"), *(f"$POS_ACT.{c}" for c in "XYZABC"), "LT_X", "LT_Y", "LT_Z"]
+    return text(
+        [head],
+        beside(
+            [[f"{10 * i}"] for i in range(COUNT)], JOINTS, cells(P - 9.0, 3), [["12.1", "-3.2", "90.0"]] * COUNT, POINTS
+        ),
+        ";",
+    )
+
+
+PROTOCOL = [["Messprotokoll"], ["Datum:", "14.03.2024", "", "Prüfer:", "H. Schmidt"], [], ["Pkt.-Nr.", *joint_names("A{}"), "X-Ist", "Y-Ist", "Z-Ist"],
+            ["", *["°"] * 6, *["mm"] * 3], *beside(NAMED, JOINTS, POINTS), [], ["Mittelwert", *["1.5"] * 9], ["Std.-Abw.", *["60.5"] * 9]]  # fmt: skip
+JAPANESE = text(
+    [["測定点", *joint_names("第{}軸(度)"), "X座標(mm)", "Y座標(mm)", "Z座標(mm)"]], beside(NAMED, JOINTS, POINTS)
+)
+TURNED = [["Point", *LABELS], *([name, *column] for name, *column in zip([*joint_names("J{} [deg]"), "X [mm]", "Y [mm]", "Z [mm]"], *beside(JOINTS, POINTS), strict=True))]  # fmt: skip
+
+
+def japanese(folder: Path) -> Path:
+    (folder / "raw.csv").write_bytes(JAPANESE.encode("cp932"))
+    return folder / "raw.csv"
+
+
+FRESH: dict[str, Shape] = {
+    "SpatialAnalyzer, collection::group::point": many(("points.txt", spatial_analyzer()), ("joints.csv", AXES), **BOTH),
+    "CALYPSO, a row a characteristic": many(("chr.txt", calypso()), ("joints.csv", AXES), **BOTH),
+    "PlotJuggler, topics": one(plotjuggler(), kind="pose"),
+    "MATLAB, table(q, p)": one(text([[*joint_names("q_{}"), *(f"p_{i}" for i in (1, 2, 3))]], beside(RADIANS, METRES)), **IN_SI),
+    "MATLAB, .mat": (matlab, BOTH, "position"),
+    "a protocol with statistics below": excel({"Messung": PROTOCOL}),
+    "Japanese in Shift-JIS": (japanese, {"encoding": "cp932"}, "position"),
+    "Kawasaki AS": many(("calib.as", kawasaki()), ("points.csv", text([["point", "x [mm]", "y [mm]", "z [mm]"]], beside([[label.lower()] for label in LABELS], POINTS)))),
+    "YAML, a list of samples": one(samples(), "raw.yaml", **IN_SI),
+    "Excel, a row a quantity": excel({"quer": TURNED}),
+    "LabVIEW": one(labview(), "raw.lvm", **BOTH),
+    "TUM trajectory, joints by time": many(("trajectory.txt", trajectory()), ("joints.csv", clocked_joints()), kind="pose", **IN_SI),
+    "KUKA trace beside a tracker": one(trace(), **BOTH),
+}  # fmt: skip
