@@ -327,15 +327,9 @@ def _series(curve: Curve, joint: Joint, *sizes: Symbol) -> Symbol:
     half = curve.period / 2
     moved = joint.q - curve.centre
     repeated = math.pi / half * ca.fmin(ca.fmax(moved, -half), half)
-    pairs = list(zip(sizes[: len(sizes) // 2], sizes[len(sizes) // 2 :], strict=True))
-    total = 0.0
-    for u, own in ((moved, pairs[: curve.waves]), (repeated, pairs[curve.waves :])):
-        cosine, sine = ca.cos(u), ca.sin(u)
-        c, s = 1.0, 0.0
-        for a, b in own:
-            c, s = c * cosine - s * sine, s * cosine + c * sine
-            total = total + a * c + b * s
-    return total
+    angles = ca.vertcat(moved * ca.DM(range(1, curve.waves + 1)), repeated * ca.DM(range(1, curve.harmonics + 1)))
+    cosines, sines = sizes[: len(sizes) // 2], sizes[len(sizes) // 2 :]
+    return ca.dot(ca.vertcat(*cosines), ca.cos(angles)) + ca.dot(ca.vertcat(*sines), ca.sin(angles))
 
 
 # Models
