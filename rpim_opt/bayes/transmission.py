@@ -17,7 +17,7 @@ from rpim_opt.basics.threads import phase
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as FAMILY_GAIN
-from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, deviations, extended, named, questions
+from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, extended, named, questions
 from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.problem.noise import Scatter, Stack
 from rpim_opt.problem.problem import CalibrationProblem
@@ -89,11 +89,11 @@ def admitted(
         if found is None:
             return None
         point, curves, columns = found
-        geometry = _integrated(models.columns, columns, point)
+        rest = _integrated(models.columns, columns, point)
         kept = {"gravity"}.intersection(trials[0].families)
 
         def price(families: tuple[str, ...]) -> Candidate:
-            model = geometry.restricted(models.members(families))
+            model = rest.restricted(models.members(families))
             best = model.optima(model.starts()[:1])[0]
             price = FAMILY_GAIN * questions(families) + (MOMENTS_GAIN - FAMILY_GAIN) * (MOMENTS in families)
             if not kept.issubset(families):
@@ -103,7 +103,9 @@ def admitted(
         compared = sorted(models.compared(price), key=lambda each: each.price)
     best = compared[0]
     problem = extended(bare, models.added(best.families))
-    x = np.append(deviations(problem, deviation), point.z[len(point.z) - columns.shape[1] :])
+    prior = estimator.prior.stated(problem.parameters)
+    geometry = problem.parameters.free.scale * (prior.centre + prior.scale * best.found.z)
+    x = np.append(geometry, point.z[len(point.z) - columns.shape[1] :])
     logs = np.append(best.found.logs, point.logs)
     joint = replace(estimator, curves=curves).fit(problem.with_transmission(curves), x, logs, ROUNDS)
     gain = plain.value - point.value
