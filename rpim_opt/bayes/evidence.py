@@ -195,7 +195,7 @@ class Point:
     ``value`` is -2 ln of the restricted likelihood and of the hyperprior, with ``gradient`` (s,) and ``curvature``
     (s, s). ``z`` (p,), ``C`` (p, p) are posterior mean and covariance of the deviations, ``v`` (p,) the variances of a
     Tikhonov program with these, ``slopes`` (p, s) those of z. The information C^-1 falls by diag(``own`` (p, s)),
-    and by ``noise`` (q, p, p).
+    and by noise in the equations of the ``parts``.
     """
 
     logs: Array
@@ -207,12 +207,14 @@ class Point:
     v: Array
     slopes: Array
     own: Array
-    noise: Array
+    parts: Sequence[Whitened]
 
     def falls(self, M: Array) -> Array:
         """Return the decreases (s,) of tr(M C^-1) for a symmetric M (p, p)."""
         found = M.diagonal() @ self.own
-        found[len(found) - len(self.noise) :] += np.einsum("aij,ij->a", self.noise, M)
+        for part in self.parts:
+            blocks = part.X @ M @ part.X.transpose(0, 2, 1)
+            found[len(found) - len(part.noise) :] += np.einsum("anij,nij->a", part.noise, blocks)
         return np.asarray(found, dtype=float)
 
 
@@ -285,19 +287,11 @@ class Evidence:
         prior = self.prior
         s = len(prior.hyperparameters)
         parts = whitened(self.data, self.scatter(logs), dict(zip(self.noise, logs[s:], strict=True)))
-        H = prior.rows.T @ prior.rows
-        h = prior.rows.T @ prior.values
-        S = np.zeros((len(self.noise), len(h), len(h)))  # X'R^-1 R_a R^-1 X
-        for part in parts:
-            X = part.X.reshape(-1, len(h))
-            H = H + X.T @ X
-            h = h + X.T @ part.y.ravel()
-            S += X.T @ (part.noise @ part.X).reshape(len(S), len(X), len(h))
         size2, of_size, bend = prior.variances(logs)
         v = size2
         if near is not None:
             v = near.v * size2 / prior.variances(near.logs)[0]
-        z, C, logdet, v = self._settled(H, h, size2, v, accuracy)
+        z, C, logdet, v = self._settled(parts, size2, v, accuracy)
         e2 = z**2 + C.diagonal()
         residuals = [part.y - part.X @ z for part in parts]
         own = ~prior.replaced
@@ -311,14 +305,13 @@ class Evidence:
         slope = 2 * (1 - e2 / v)
         slope[self._heavy] = (2 * nu * (size2 / v - 1))[self._heavy]
         gradient = slope @ of_size / 2
-        by_noise, f, among = _by_noise(parts, residuals, z, C, S)
+        by_noise, f, among, C_by_noise = _by_noise(parts, residuals, C)
         gradient[s:] = by_noise
         # how the mean follows noise, and e^2 at constant local variances
         z_by_noise = -C @ f.T
-        CS = C @ S
-        among = among + 2 * f @ z_by_noise - np.einsum("aij,bji->ab", CS, CS)
+        among = among + 2 * f @ z_by_noise
         direct = np.zeros_like(of_size)
-        direct[:, s:] = np.einsum("aij,ji->ia", CS, C) + 2 * z[:, None] * z_by_noise
+        direct[:, s:] = C_by_noise + 2 * z[:, None] * z_by_noise
         information = np.where(own, 1 / v, 0.0)
         follows = C * (C + 2 * np.outer(z, z)) * information
         log_v = self._log_variances(of_size, direct, follows, size2, v)
@@ -345,7 +338,7 @@ class Evidence:
             v=v,
             slopes=of_z,
             own=precision,
-            noise=S,
+            parts=parts,
         )
 
     def optima(self, starts: Sequence[Array], accuracy: float = 1e-3, near: Point | None = None) -> list[Point]:
@@ -409,21 +402,42 @@ class Evidence:
         return np.flatnonzero(self.prior.heavy & ~self.prior.replaced)
 
     def _settled(
-        self, H: Array, h: Array, size2: Array, v: Array, accuracy: float
+        self, parts: Sequence[Whitened], size2: Array, v: Array, accuracy: float
     ) -> tuple[Array, Array, float, Array]:
-        """Return z, C, -ln|C| and v, which are solved jointly."""
+        """Return z, C, -ln|C| and v, which are solved jointly; curves are integrated out first."""
+        prior = self.prior
+        p = len(size2)
+        g = p if prior.spectrum is None else p - len(prior.spectrum.w2)
+        X = np.concatenate([part.X.reshape(-1, p) for part in parts])
+        y = np.concatenate([part.y.ravel() for part in parts])
+        regression, own, logdet = np.zeros((0, g + 1)), np.zeros((0, 0)), 0.0
+        equations = np.column_stack([X[:, :g], y])
+        if g < p:
+            information, regression, own, logdet = _eliminated(X[:, g:], equations, size2[g:])
+        else:
+            information = equations.T @ equations
+        rows = prior.rows[:, :g]
+        H = information[:g, :g] + rows.T @ rows
+        h = information[:g, g] + rows.T @ prior.values
+        z, C, more, v = self._known(H, h, size2[:g], v[:g], accuracy)
+        follow = regression[:, :g] @ C
+        whole = np.block([[C, -follow.T], [-follow, own + follow @ regression[:, :g].T]])
+        z = np.append(z, regression[:, g] - regression[:, :g] @ z)
+        return z, whole, logdet + more, np.append(v, size2[g:])
+
+    def _known(self, H: Array, h: Array, size2: Array, v: Array, accuracy: float) -> tuple[Array, Array, float, Array]:
+        """Return z, C, -ln|C| and v of all but curves, from their information matrix H and vector h."""
         heavy = self._heavy
         local = v[heavy]
         v = size2.copy()
-        own = np.where(self.prior.replaced, 0.0, 1.0)
+        own = np.where(self.prior.replaced[: len(v)], 0.0, 1.0)
         if len(heavy):
             # the others' variances stay: their share of the information is taken out once
             light = np.setdiff1d(np.arange(len(v)), heavy)
             S, g = H[heavy][:, heavy], h[heavy]
-            if len(light):  # by Cholesky's factor: an inverse loses all digits where frames are nearly free
-                factor, d = _factored(H[light][:, light], (own / v)[light])
-                right = np.column_stack([H[light][:, heavy], h[light]]) * d[:, None]
-                Y = solve_triangular(factor, right, lower=True, check_finite=False)
+            if len(light):
+                right = np.column_stack([H[light][:, heavy], h[light]])
+                Y = _half_solved(*_factored(H[light][:, light], (own / v)[light]), right)
                 S, g = S - Y[:, :-1].T @ Y[:, :-1], g - Y[:, :-1].T @ Y[:, -1]
             v[heavy] = self._local(S, g, size2[heavy], local, accuracy)
         return *_posterior(H, h, own / v), v
@@ -463,27 +477,39 @@ class Evidence:
         return found
 
 
-def _by_noise(
-    parts: Sequence[Whitened], residuals: Sequence[Array], z: Array, C: Array, S: Array
-) -> tuple[Array, Array, Array]:
-    """Return derivatives by logarithms of noise: the gradient (q,), X'R^-1 R_a u (q, p), and a part of the second's.
+def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -> tuple[Array, Array, Array, Array]:
+    """Return derivatives by logarithms of noise: the gradient (q,), X'R^-1 R_a u (q, p), and parts of the second's.
 
-    The last (q, q) leaves C as it is: 2 u'R_a R^-1 R_b u - tr(R^-1 R_a (R^-1 - 2 R^-1 X C X'R^-1) R_b).
+    Those are 2 u'R_a R^-1 R_b u - tr(P R_a P R_b) (q, q), but for what of u follows the noise, and the diagonals (p, q)
+    of C X'R^-1 R_a R^-1 X C. Products are with equations or with deviations, whichever are less work.
     """
-    q = len(S)
-    gradient = -np.einsum("aij,ji->a", S, C)
-    f = np.zeros((q, len(z)))
-    among = np.zeros((q, q))
+    q, p = len(parts[0].noise), len(C)
+    gradient, f, among, of_C = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), np.zeros((p, q))
     if not q:
-        return gradient, f, among
-    for part, residual in zip(parts, residuals, strict=True):
+        return gradient, f, among, of_C
+    rows = [part.X.reshape(-1, p) for part in parts]
+    by_equations = sum(map(len, rows)) < 2 * p
+    S = np.zeros((q, p, p))  # X'R^-1 R_a R^-1 X
+    products = []
+    for part, X, residual in zip(parts, rows, residuals, strict=True):
         moved = (part.noise @ residual[:, :, None]).reshape(q, -1)
-        gradient += np.einsum("ankk->a", part.noise) - moved @ residual.ravel()
-        f += moved @ part.X.reshape(-1, len(z))
-        blocks = part.X @ C @ part.X.transpose(0, 2, 1)
-        weighed = part.noise - 2 * blocks @ part.noise
+        f += moved @ X
+        XC = (X @ C).reshape(part.X.shape)  # one product: those of configurations take three times as long
+        weighed = part.noise - 2 * XC @ part.X.transpose(0, 2, 1) @ part.noise
+        gradient += np.einsum("ankk->a", part.noise + weighed) / 2 - moved @ residual.ravel()
         among += 2 * moved @ moved.T - part.noise.reshape(q, -1) @ weighed.reshape(q, -1).T
-    return gradient, f, among
+        if by_equations:
+            of_C += np.einsum("nki,anki->ia", XC, part.noise @ XC)
+            spread = XC.reshape(len(X), p) @ np.concatenate(rows).T
+            products.append((part.noise @ spread.reshape(*part.X.shape[:2], -1)).reshape(q, len(X), -1))
+        else:
+            S += X.T @ (part.noise @ part.X).reshape(q, -1, p)
+    if by_equations:
+        M = np.concatenate(products, axis=1)
+    else:
+        M = C @ S
+        of_C = np.einsum("aij,ji->ia", M, C)
+    return gradient, f, among - M.reshape(q, -1) @ M.transpose(0, 2, 1).reshape(q, -1).T, of_C
 
 
 # --- linear algebra ---------------------------------------------------------------------------------------------
@@ -503,15 +529,46 @@ def _factored(H: Array, precision: Array) -> tuple[Array, Array]:
     return factor, d
 
 
-def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, float]:
-    """Return z = M^-1 h, M^-1 and ln|M| of M = H + diag(precision), with M scaled to a diagonal of ones."""
-    factor, d = _factored(H, precision)
+def _half_solved(factor: Array, d: Array, right: Array) -> Array:
+    """Return Y with Y'Y = right'M^-1 right: an inverse loses all digits where frames are nearly free."""
+    return np.asarray(solve_triangular(factor, right * d[:, None], lower=True, check_finite=False))
+
+
+def _inverse(factor: Array, d: Array) -> tuple[Array, float]:
+    """Return M^-1 and ln|M| from Cholesky's factor, which is overwritten."""
     logdet = 2 * float(np.sum(np.log(factor.diagonal() / d)))
     lower, _ = _potri(factor, lower=1)  # its upper half is zero, as Cholesky's left it
     C = lower + lower.T
     C.flat[:: len(d) + 1] /= 2
     C *= d[:, None] * d
+    return C, logdet
+
+
+def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, float]:
+    """Return z = M^-1 h, M^-1 and ln|M| of M = H + diag(precision)."""
+    C, logdet = _inverse(*_factored(H, precision))
     return C @ h, C, logdet
+
+
+def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Array, float]:
+    """Integrate coefficients c ~ N(0, diag(v)) out of equations G ~ U c + e, e ~ N(0, I).
+
+    Return the information G'K^-1 G of the equations, K = I + U diag(v) U', the regression C U'G of the coefficients on
+    them, C = (U'U + diag(1 / v))^-1 and -ln|C|; by Cholesky's factor of K or of C^-1, whichever is smaller.
+    """
+    if len(U) < len(v):
+        root = np.sqrt(v)
+        scaled = U * root
+        L, d = _factored(scaled @ scaled.T, np.ones(len(U)))
+        W, G = _half_solved(L, d, scaled), _half_solved(L, d, equations)
+        C = np.diag(v) - np.outer(root, root) * (W.T @ W)
+        logdet = 2 * float(np.sum(np.log(L.diagonal() / d))) - float(np.sum(np.log(v)))
+        return G.T @ G, root[:, None] * (W.T @ G), C, logdet
+    right = U.T @ equations
+    factor, d = _factored(U.T @ U, 1 / v)
+    Y = _half_solved(factor, d, right)
+    C, logdet = _inverse(factor, d)
+    return equations.T @ equations - Y.T @ Y, C @ right, C, logdet
 
 
 def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:

@@ -129,13 +129,23 @@ def test_second_derivatives_and_slopes_are_differences(seed: int, noise: tuple[s
     assert np.allclose(found.falls(M), rises, rtol=1e-6, atol=1e-6 * np.abs(rises).max())
 
 
-def test_derivatives_beside_a_spectrum_are_differences() -> None:
-    plain = hierarchy([0, 0, 0, -1, -1, -1], [True, True, False, False, False, False], ("a",))
-    spectrum = Spectrum(np.array([1.0, 30.0, 900.0]), np.full(3, 2e-8))
-    evidence = Evidence(linearized(1, 6, 6), replace(plain, spectrum=spectrum), NOISE)
+@pytest.mark.parametrize("count", [3, 60])
+def test_posterior_and_derivatives_beside_a_spectrum(count: int) -> None:
+    """Of fewer coefficients than the 36 equations, and of more, which are integrated out in another way."""
+    plain = hierarchy([0, 0, 0] + [-1] * count, [True, True] + [False] * (1 + count), ("a",))
+    spectrum = Spectrum(np.geomspace(1.0, 900.0, count), np.full(count, 2e-8))
+    evidence = Evidence(linearized(1, 6, 3 + count), replace(plain, spectrum=spectrum), NOISE)
     logs = evidence.centre + 0.4 * np.random.default_rng(1).normal(size=7)
     sides = [(evidence.at(logs + s), evidence.at(logs - s)) for s in 1e-5 * np.eye(7)]
     found = evidence.at(logs)
+    R, y = dense(evidence, logs)
+    X = evidence.data.X
+    covariance = np.linalg.inv(X.T @ np.linalg.solve(R, X) + np.diag(1 / found.v))
+    assert np.allclose(found.C, covariance, rtol=1e-7, atol=1e-9 * np.abs(covariance).max())
+    assert np.allclose(found.z, covariance @ X.T @ np.linalg.solve(R, y), rtol=1e-7, atol=1e-9 * np.abs(found.z).max())
+    M = found.C @ found.C
+    rises = [np.trace(after.C - before.C) / 2e-5 for after, before in sides]
+    assert np.allclose(found.falls(M), rises, rtol=1e-5, atol=1e-6 * np.abs(rises).max())
     gradient = np.array([after.value - before.value for after, before in sides]) / 2e-5
     curvature = np.array([after.gradient - before.gradient for after, before in sides]) / 2e-5
     slopes = np.array([after.z - before.z for after, before in sides]).T / 2e-5

@@ -33,6 +33,7 @@ INTENDED = {
     # x counts from where registration puts the base, which is exact to the root of rounding
     "seven_axis": ("x",),
     "tracker": ("x",),
+    "scara": ("x",),  # 1.2e-9: derivatives by the noise are summed in another order
     "markers": ("x", "objective", "std", "hyperparameters"),  # one of three reflectors places the base, not all of them
     # residuals are whitened in one way, which rounds differently: where a search for the weight, or for hyperparameters
     # (to 1e-3), ends follows
