@@ -252,18 +252,21 @@ class Estimator:
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
         """Alternate hyperparameters and deviations to a fixed point, with a limited number of linearizations.
 
-        From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known.
+        From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known. Several optima are all
+        continued, since where few data leave frames far from their start, their order changes with the linearization.
         """
-        fit = self._once(problem, x, before, before is None, ITERATIONS)
-        several = any(np.abs(other.logs - fit.point.logs).max() > DISTINCT for other in fit.others)
-        for k in range(1, rounds):
-            again = self._once(problem, fit.x, fit.point.logs, k == 1 and several, ITERATIONS * 2**k)
-            moved = _distance(again.x, fit.x, again.laid)
-            resized = np.abs(again.point.logs - fit.point.logs).max(initial=0.0)
-            fit = replace(again, others=again.others or fit.others)
-            if resized <= SAME_SIZE and moved <= SAME_PLACE:
-                break
-        return fit
+        first = self._once(problem, x, before, before is None, ITERATIONS)
+        distinct = [other for other in first.others if np.abs(other.logs - first.point.logs).max() > DISTINCT]
+        fits = [first, *(self._once(problem, x, other.logs, False, ITERATIONS) for other in distinct)]
+        for i, fit in enumerate(fits):
+            for k in range(1, rounds):
+                again = self._once(problem, fit.x, fit.point.logs, False, ITERATIONS * 2**k)
+                moved = _distance(again.x, fit.x, again.laid)
+                resized = np.abs(again.point.logs - fit.point.logs).max(initial=0.0)
+                fit = fits[i] = again
+                if resized <= SAME_SIZE and moved <= SAME_PLACE:
+                    break
+        return min(fits, key=lambda fit: fit.point.value)
 
     def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, iterations: int) -> Fit:
         """Estimate hyperparameters at one linearization, starting from given values (s,) and from several starts."""
