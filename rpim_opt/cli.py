@@ -634,7 +634,7 @@ def design(
         from rpim_opt.basics.tables import columns_csv, read_columns
         from rpim_opt.calibration.diagnosis import measured_ranges
         from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
-        from rpim_opt.problem.workspace import postures_at, touched_place
+        from rpim_opt.problem.workspace import configurations_at, touched_place
         from rpim_opt.store.instances import load
 
         say("reading the problem")
@@ -644,7 +644,7 @@ def design(
             q = read_candidates(table, posed.robot)
         elif posed.data.blocks[0].measurement.touching:
             place = console.touched_point(point) or touched_place(posed)
-            q = postures_at(posed, np.tile(place, (candidates, 1)), seed)
+            q = configurations_at(posed, np.tile(place, (candidates, 1)), seed)
         else:
             limits = posed.robot.limits
             if augment:

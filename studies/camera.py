@@ -147,7 +147,7 @@ def _views(
 ) -> tuple[Dataset, Dataset]:
     """Return what the camera sees with noise, and views elsewhere without."""
     points = np.array(list(BOARD.values()))
-    q = ro.problem.postures_in_sight(problem, points, VIEWS + ELSEWHERE, rng, truth, share=0.6)
+    q = ro.problem.visible_configurations(problem, points, VIEWS + ELSEWHERE, rng, truth, share=0.6)
     kind = problem.data.blocks[0].measurement.name
     empty = np.zeros((len(q), len(BOARD), 2))
     uv = problem.on(ro.data.views(q, BOARD, empty, SIGMA, kind)).modelled(truth)[0].reshape(empty.shape)

@@ -90,12 +90,12 @@ def _touched(
 ) -> Dataset:
     names = np.repeat(list(places), count)
     targets = np.repeat(np.array(list(places.values())), count, axis=0)
-    return touches(_postures(arm, truth, targets, rng, sigma), names.tolist(), SIGMA)
+    return touches(_reached(arm, truth, targets, rng, sigma), names.tolist(), SIGMA)
 
 
-def _postures(arm: CalibrationProblem, truth: Array, targets: Array, rng: np.random.Generator, sigma: float) -> Array:
+def _reached(arm: CalibrationProblem, truth: Array, targets: Array, rng: np.random.Generator, sigma: float) -> Array:
     near = targets + sigma * rng.normal(size=targets.shape)
-    return ro.problem.postures_at(arm, near, rng, truth, SHARE)
+    return ro.problem.configurations_at(arm, near, rng, truth, SHARE)
 
 
 def _data(artefact: str, arm: CalibrationProblem, truth: Array, rng: np.random.Generator) -> Dataset:
@@ -145,12 +145,12 @@ def _datum_cubes(arm: CalibrationProblem, truth: Array, rng: np.random.Generator
             known.append(KnownDistance(opposite, SIDE, 5e-6))
             known.append(KnownAngle(opposite, parallel=True, sigma=2e-5))
             known.append(KnownAngle((f"{i}{axis}+", f"{i}{'xyz'[(k + 1) % 3]}+"), parallel=False, sigma=2e-5))
-    q = _postures(arm, truth, np.concatenate(targets), rng, SIGMA)
+    q = _reached(arm, truth, np.concatenate(targets), rng, SIGMA)
     return with_known(touches(q, names, SIGMA, planes=True), known)
 
 
 def _tracked(arm: CalibrationProblem, truth: Array, rng: np.random.Generator) -> CalibrationProblem:
-    """Return 60 positions of a tracker, in any postures, with the base to be found, too."""
+    """Return 60 positions of a tracker, in any configurations, with the base to be found, too."""
     q = ro.problem.random_candidates(arm.robot, 60, rng, SHARE)
     exact = arm.on(Dataset.of(q, np.zeros((60, 3)), SIGMA)).modelled(truth)[0]
     p = arm.parameters

@@ -93,12 +93,13 @@ def report(rows: list[dict[str, Any]]) -> Report:
     }
     text = (
         "Root mean square error on the validation rows [mm], mean over random draws of configurations. `learned` is "
-        "the default of `ro.calibrate`; with `model auto` that of the commands, it adds families that geometry lacks. "
-        "On the right its error over that of one weight by REML (geometric mean, worst draw), and the share of "
-        "coordinates of held-out readings inside their 95 % intervals. Over all rows it has "
+        "the default of `ro.calibrate`; with `model auto` that of the commands, it adds the model extensions that the "
+        "data support. On the right its error over that of one weight by REML (geometric mean, worst draw), and the "
+        "share of coordinates of held-out readings inside their 95 % intervals. Over all rows it has "
         f"{metrics['auto_over_least_squares']:.2f} times the error of least squares (weight 1e-6), "
-        f"{metrics['auto_over_reml']:.2f} times that of REML; without families {metrics['learned_over_reml']:.2f}. "
-        f"In the mean {100 * metrics['covers']:.0f} % of the readings are inside.\n\n"
+        f"{metrics['auto_over_reml']:.2f} times that of REML; without model extensions "
+        f"{metrics['learned_over_reml']:.2f}. In the mean {100 * metrics['covers']:.0f} % of the readings are "
+        "inside.\n\n"
     )
     head = ["set", "configurations", "draws", "nominal, frames fitted", *METHODS]
     head += ["over REML", "worst", "REML covers", "ours covers"]

@@ -80,7 +80,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
     if curved is not None:
         fit, trials, gain = curved
         problem = problem.with_transmission(fit.problem.robot.model.curves)
-    laid = problem.with_parameters(fit.laid.parameters).scattered(fit.laid.scatter)
+    laid = problem.with_parameters(fit.laid.parameters).with_repeatability(fit.laid.repeatability)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
         outliers = beyond_noise(laid, fit.x)
     if outliers:
@@ -111,7 +111,7 @@ def _without_outliers(
     outliers = suspects(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = explain(outliers)
     for _ in range(LOOKS):  # what extensions explain, and the worst outliers, stood before the smaller ones
-        if not outliers and not (trials and trials[0].families):
+        if not outliers and not (trials and trials[0].extensions):
             break
         more = suspects(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
         if not more.keys() - outliers.keys():

@@ -12,7 +12,7 @@ import scipy
 from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.problem.noise import Scatter, Stack
+from rpim_opt.problem.noise import Repeatability, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
 """Prior medians of the robot's repeatability [m, rad, rad], and of the factor on the instrument's noise."""
@@ -23,7 +23,7 @@ That of the waves is narrow: part of a joint's range hardly distinguishes them f
 """
 WAVES_LENGTH = 1.0
 """Length scale of the waves [rad]."""
-NOISE_SD, GEOMETRY_SD, FAMILY_SD = 2.0, 3.0, 2.0
+NOISE_SD, GEOMETRY_SD, EXTENSION_SD = 2.0, 3.0, 2.0
 """Prior standard deviations of the natural logarithms of the hyperparameters."""
 BASE_SD = 1.0
 """That of the base: wider, eight configurations take it for nearer than it is."""
@@ -139,7 +139,7 @@ class Hierarchy:
 
 def scale_covariance(geometry: np.ndarray, base: np.ndarray) -> Array:
     """Return the prior covariance (s, s) of logarithms of scales, some (s,) of the geometry or the base."""
-    covariance = np.diag(np.select([geometry, base], [GEOMETRY_SD, BASE_SD], FAMILY_SD) ** 2)
+    covariance = np.diag(np.select([geometry, base], [GEOMETRY_SD, BASE_SD], EXTENSION_SD) ** 2)
     own = RATIO_SD**2 / 2
     covariance[np.ix_(geometry, geometry)] = GEOMETRY_SD**2 - own + own * np.eye(int(geometry.sum()))
     return covariance
@@ -163,12 +163,12 @@ class Whitened(NamedTuple):
     logdet: float
 
 
-def whitened(data: Linearized, scatter: Scatter, noise: Mapping[str, float]) -> list[Whitened]:
+def whitened(data: Linearized, repeatability: Repeatability, noise: Mapping[str, float]) -> list[Whitened]:
     """Return whitened equations, with derivatives of the noise by the logarithms of its variance components."""
     found = []
     for stack in data.stacks:
         N, k = stack.index.shape
-        L = np.linalg.cholesky(stack.covariance(scatter))
+        L = np.linalg.cholesky(stack.covariance(repeatability))
         inverse = np.linalg.inv(L)
         slopes = []
         for kind, log in noise.items():  # what a unit of a noise adds to the covariances
@@ -227,7 +227,7 @@ class Evidence:
         y = X z + e
         z_j ~ t_nu(0, tau_g)     heavy ones: normal with own variance v_j = (nu tau^2 + z_j^2 + C_jj) / (nu + 1)
         z_j ~ N(0, tau_g^2)      other groups;    N(0, 1) without a group
-        e_c ~ N(0, R_c)          `Scatter`
+        e_c ~ N(0, R_c)          `Repeatability`
         C = (X'R^-1 X + diag(1/v))^-1,    z = C X'R^-1 y
         -2 ln L = |y - X z|^2_R + z'z/v + ln|R| - ln|C| + sum ln v
                   + sum over heavy of  (nu + 1) ln((nu tau^2 + z^2 + C) / (nu + 1)) - nu ln tau^2 - ln v
@@ -254,7 +254,7 @@ class Evidence:
     data: Linearized
     prior: Hierarchy
     noise: tuple[str, ...]
-    fixed: Scatter = field(default_factory=Scatter)
+    fixed: Repeatability = field(default_factory=Repeatability)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -275,7 +275,7 @@ class Evidence:
         precisions = [1 / CURVES[name][1] if name in CURVES else 1 / NOISE_SD for name in others]
         return np.asarray(block_diag(scales, np.diag(precisions)), dtype=float)
 
-    def scatter(self, logs: Array) -> Scatter:
+    def repeatability(self, logs: Array) -> Repeatability:
         """Return the noise at logarithms of hyperparameters (s,)."""
         sizes = np.exp(logs[len(logs) - len(self.noise) :])
         return replace(self.fixed, **dict(zip(self.noise, map(float, sizes), strict=True)))
@@ -286,7 +286,7 @@ class Evidence:
             return near
         prior = self.prior
         s = len(prior.hyperparameters)
-        parts = whitened(self.data, self.scatter(logs), dict(zip(self.noise, logs[s:], strict=True)))
+        parts = whitened(self.data, self.repeatability(logs), dict(zip(self.noise, logs[s:], strict=True)))
         size2, of_size, bend = prior.variances(logs)
         v = size2
         if near is not None:

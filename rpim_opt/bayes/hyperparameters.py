@@ -27,7 +27,7 @@ from rpim_opt.bayes.prior_terms import FIXED, Stated
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.noise import Scatter
+from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
@@ -64,7 +64,7 @@ class Size(NamedTuple):
 class Trial(NamedTuple):
     """A set of model extensions, and -2 ln of the restricted likelihood with them."""
 
-    families: tuple[str, ...]
+    extensions: tuple[str, ...]
     value: float
 
 
@@ -138,16 +138,16 @@ class Learned(Brief):
         return f"hyperparameters: {sizes}; {len(self.left_out)} rows excluded"
 
     @property
-    def families(self) -> tuple[str, ...]:
+    def extensions(self) -> tuple[str, ...]:
         """The extensions of the selected model."""
         if not self.trials:
             return ()
-        return self.trials[0].families
+        return self.trials[0].extensions
 
-    def gain(self, family: str) -> float | None:
+    def gain(self, extension: str) -> float | None:
         """Return the decrease of -2 ln L when an extension is added to the best model without it."""
-        having = [t.value for t in self.trials if family in t.families]
-        without = [t.value for t in self.trials if family not in t.families]
+        having = [t.value for t in self.trials if extension in t.extensions]
+        without = [t.value for t in self.trials if extension not in t.extensions]
         if not having or not without:
             return None
         return float(min(without) - min(having))
@@ -247,7 +247,7 @@ class Estimator:
         if any(stack.angle.any() for stack in stacks):
             have.add("orientation")
         noise = tuple(kind for kind in self.noise if kind in have)
-        return Evidence(data, hierarchy, noise, problem.scatter or Scatter())
+        return Evidence(data, hierarchy, noise, problem.repeatability or Repeatability())
 
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
         """Alternate hyperparameters and deviations to a fixed point, with a limited number of linearizations.
@@ -280,8 +280,8 @@ class Estimator:
             point, *others = evidence.optima(starts)
         scale = p.scale.copy()
         scale[p.identified] *= stated.scale * np.sqrt(point.v)
-        scatter = replace(evidence.scatter(point.logs), at=parameter_values(problem, x))
-        laid = replace(problem, parameters=replace(p, scale=scale), scatter=scatter)
+        repeatability = replace(evidence.repeatability(point.logs), at=parameter_values(problem, x))
+        laid = replace(problem, parameters=replace(p, scale=scale), repeatability=repeatability)
         mean = p.free.scale * (stated.centre + stated.scale * point.z)
         fit = Fit(problem, stated, evidence, point, others, laid, mean)
         if self.refit is None or _distance(mean, x, laid) <= CLOSE:  # near enough for one linearization
@@ -354,16 +354,16 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     stacks = evidence.data.stacks
     reads = [next(kind for kind in map(stack.of, ("length", "angle", "pixel")) if kind.any()) for stack in stacks]
     X = np.vstack([evidence.data.X[stack.index[read]] for stack, read in zip(stacks, reads, strict=True)])
-    scatter = evidence.scatter(point.logs)
+    repeatability = evidence.repeatability(point.logs)
 
-    def variance(scatter: Scatter) -> float:
-        parts = [np.einsum("nkk->nk", stack.covariance(scatter)) for stack in stacks]
+    def variance(repeatability: Repeatability) -> float:
+        parts = [np.einsum("nkk->nk", stack.covariance(repeatability)) for stack in stacks]
         return sum(float(np.sum(part[read])) for part, read in zip(parts, reads, strict=True))
 
     growth = point.falls(point.C @ (X.T @ X) @ point.C)
     for i, kind in enumerate(evidence.noise, len(growth) - len(evidence.noise)):  # R is a sum of squares of the noises
-        growth[i] += 2 * (variance(scatter) - variance(replace(scatter, **{kind: 0.0})))
-    growth = growth / (float(np.sum((X @ point.C) * X)) + variance(scatter))
+        growth[i] += 2 * (variance(repeatability) - variance(replace(repeatability, **{kind: 0.0})))
+    growth = growth / (float(np.sum((X @ point.C) * X)) + variance(repeatability))
     values = [Size(float(v), float(s)) for v, s in zip(np.exp(point.logs), spread, strict=True)]
     sizes, noise = len(prior.names), len(prior.hyperparameters)
     plain = np.delete(np.arange(len(values)), slice(sizes, noise))  # without the curves'

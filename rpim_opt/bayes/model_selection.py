@@ -18,7 +18,7 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Result
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.extensions import families, family_scales
+from rpim_opt.robot.extensions import extension_scales, model_extensions
 from rpim_opt.robot.parameters import EXPANSION, frame_of, of_session, own_name, session_prefix
 
 FIRST, SECOND, MOMENTS = "first harmonic", "second harmonic", "moments"
@@ -70,7 +70,7 @@ class Candidate(NamedTuple):
     """A candidate model: its price, its extensions, and its optimum."""
 
     price: float
-    families: tuple[str, ...]
+    extensions: tuple[str, ...]
     found: Any
 
 
@@ -86,19 +86,19 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
     known = set(problem.parameters.free.names)
     for robot, arm in problem.arms.items():
         travel = np.ptp(problem.alone(robot).joint_values, axis=0)
-        for family, names in families(arm).items():
-            if family in TURNED:
-                turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[family]}
+        for extension, names in model_extensions(arm).items():
+            if extension in TURNED:
+                turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[extension]}
                 names = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
-            found.setdefault(family, []).extend(problem.parameters.called(robot, name) for name in names)
+            found.setdefault(extension, []).extend(problem.parameters.called(robot, name) for name in names)
     prefixes = {session_prefix(name) for name in problem.data.sessions}
     if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions differ from configurations
         found[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
     grows = [n for n in problem.parameters.names if own_name(n) == EXPANSION]
     if grows and np.ptp(problem.data.temperatures) > 0:
         found[WARMTH] = grows
-    new = {family: tuple(dict.fromkeys(n for n in names if n not in known)) for family, names in found.items()}
-    return {family: names for family, names in new.items() if names}
+    new = {extension: tuple(dict.fromkeys(n for n in names if n not in known)) for extension, names in found.items()}
+    return {extension: names for extension, names in new.items() if names}
 
 
 def extended(problem: CalibrationProblem, names: Sequence[str]) -> CalibrationProblem:
@@ -111,7 +111,7 @@ def extended(problem: CalibrationProblem, names: Sequence[str]) -> CalibrationPr
     for name, robot in problem.arms.items():
         own = [i for i in p.places_of(name) if i in index]
         mine = [i for i in own if not of_session(p.names[i]) and own_name(p.names[i]) != EXPANSION]
-        scale[mine] = family_scales(robot, [own_name(p.names[i]) for i in mine])
+        scale[mine] = extension_scales(robot, [own_name(p.names[i]) for i in mine])
     return problem.with_parameters(replace(p, identified=identified, scale=scale))
 
 
@@ -140,19 +140,21 @@ class Models:
     ) -> None:
         self.problem = problem
         self.own = problem.parameters.free.names
-        self.extensions = {family: names for family, names in identifiable(problem).items() if family not in skip}
+        self.extensions = {
+            extension: names for extension, names in identifiable(problem).items() if extension not in skip
+        }
         self.whole = extended(problem, self.added(self.extensions))
         self.names = np.array(self.whole.parameters.free.names)
         self.x = deviations(self.whole, known)
         self.columns = estimator.evidence(self.whole, self.x)
 
-    def added(self, families: Iterable[str]) -> list[str]:
+    def added(self, extensions: Iterable[str]) -> list[str]:
         """Return the parameters of some extensions."""
-        return [name for family in families for name in self.extensions[family]]
+        return [name for extension in extensions for name in self.extensions[extension]]
 
-    def members(self, families: Iterable[str]) -> np.ndarray:
+    def members(self, extensions: Iterable[str]) -> np.ndarray:
         """Return which parameters (p,) the model with some extensions has."""
-        return np.isin(self.names, [*self.own, *self.added(families)])
+        return np.isin(self.names, [*self.own, *self.added(extensions)])
 
     def compared(self, price: Callable[[tuple[str, ...]], Candidate]) -> list[Candidate]:
         """Return the candidate models in the order of ``price``.
@@ -161,17 +163,19 @@ class Models:
         the best one each condition is asked for.
         """
         conditions = tuple(condition for condition in CONDITIONS if condition in self.extensions)
-        possible = [tuple(family for family in candidate if family in self.extensions) for candidate in CANDIDATES]
+        possible = [
+            tuple(extension for extension in candidate if extension in self.extensions) for candidate in CANDIDATES
+        ]
         found = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
         best = min(found, key=lambda each: each.price)
         further = FURTHER if len(np.unique(self.problem.data.configuration)) >= MANY else {}
-        for family, beside in further.items():
-            if family in self.extensions:
-                more = (*best.families, beside, family)
+        for extension, beside in further.items():
+            if extension in self.extensions:
+                more = (*best.extensions, beside, extension)
                 arm = [each for each in ARM if each in more and each in self.extensions]
                 found.append(price((*arm, *conditions)))
                 best = min(best, found[-1], key=lambda each: each.price)
-        kept = tuple(family for family in best.families if family not in conditions)
+        kept = tuple(extension for extension in best.extensions if extension not in conditions)
         for count in range(len(conditions)):
             found += [price((*kept, *some)) for some in combinations(conditions, count)]
         return found
@@ -193,17 +197,17 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
         return Candidate(point.value + GAIN * questions(candidate), candidate, point)
 
     found = sorted(models.compared(price), key=lambda each: each.price)
-    trials = tuple(Trial(each.families, each.found.value) for each in found)
-    if not found[0].families:
+    trials = tuple(Trial(each.extensions, each.found.value) for each in found)
+    if not found[0].extensions:
         return fit, trials
-    whole = extended(fit.problem, models.added(found[0].families))
+    whole = extended(fit.problem, models.added(found[0].extensions))
     return estimator.fit(whole, deviations(whole, deviation), found[0].found.logs, ROUNDS), trials
 
 
-def questions(families: Sequence[str]) -> int:
+def questions(extensions: Sequence[str]) -> int:
     """Return the complexity of a model: one for all of `CANDIDATES` that it has, one for every other extension."""
-    others = sum(family in FURTHER or family in CONDITIONS for family in families)
-    return others + (len(families) > others)
+    others = sum(extension in FURTHER or extension in CONDITIONS for extension in extensions)
+    return others + (len(extensions) > others)
 
 
 def _hyperparameters(evidence: Evidence, point: Point) -> dict[str, float]:
@@ -228,7 +232,7 @@ def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
 class Judged:
     """A candidate model: its extensions beyond the result's parameters, all its parameters, and its optimum."""
 
-    families: tuple[str, ...]
+    extensions: tuple[str, ...]
     names: tuple[str, ...]
     evidence: Evidence
     point: Point
@@ -246,7 +250,7 @@ class Comparison(Models):
         if result.learned is not None:
             more = ("instrument",) if "instrument" in result.learned.noise else ()
             estimator = Estimator(KNOWN, NOISE + more)
-        problem = sampled(result.problem.scattered(None))  # in memory, without noise estimates
+        problem = sampled(result.problem.with_repeatability(None))  # in memory, without noise estimates
         labels = {label: i for i, label in enumerate(problem.labels)}
         rows = np.array([labels[flag.label] for flag in result.flagged if flag.label in labels], dtype=int)
         if 0 < len(rows) <= len(labels) / 4:  # without flagged rows unless their neighbours are
@@ -286,19 +290,19 @@ class Comparison(Models):
         found = [self._price(()), *self.compared(self._price)]
         return min(found, key=lambda each: each.price).found
 
-    def _price(self, families: tuple[str, ...]) -> Candidate:
+    def _price(self, extensions: tuple[str, ...]) -> Candidate:
         model = self.plain
-        if families:
-            model = self._fitted(families, self.members(families))
-        return Candidate(model.point.value + SPEAK * len(families), families, model)
+        if extensions:
+            model = self._fitted(extensions, self.members(extensions))
+        return Candidate(model.point.value + SPEAK * len(extensions), extensions, model)
 
     def rise_without(self, members: np.ndarray) -> float:
         """Return the increase of -2 ln L without a subset of the result's own parameters (n,)."""
         keep = np.isin(self.names, np.array(self.own)[~members])
         return self._fitted((), keep).point.value - self.plain.point.value
 
-    def _fitted(self, families: tuple[str, ...], keep: np.ndarray) -> Judged:
+    def _fitted(self, extensions: tuple[str, ...], keep: np.ndarray) -> Judged:
         """Return a model at its hyperparameters, looked for from those of the result's."""
         evidence = self.columns.restricted(keep)
         start = _starts(evidence, _hyperparameters(self.plain.evidence, self.plain.point))[:1]
-        return Judged(families, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])
+        return Judged(extensions, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])

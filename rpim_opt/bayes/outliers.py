@@ -10,7 +10,7 @@ from scipy.special import chdtrc, chdtri, fdtrc, pdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.quadratic import Quadratic, ridge
-from rpim_opt.convex.trust import RARE, kept_equations
+from rpim_opt.convex.robust_loss import RARE, kept_equations
 from rpim_opt.data.dataset import Block
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
@@ -24,7 +24,7 @@ SPARE = 0.4
 """Part of the equations that must be left over: errors that the fit has swallowed tell nothing."""
 WELL_DETERMINED = 10.0
 """Equations a parameter from which on no single row can pull the fit to itself."""
-TRUSTED, STEPS = 1.5, 50
+FULL_WEIGHT, STEPS = 1.5, 50
 """Medians up to which a resistant fit gives a row its full weight; reweighted fits, at most."""
 KINDS = {"angle": 1, "pixel": 2}
 """Numbers of the dimensions whose errors are compared with their own medians; 0 for all others."""
@@ -88,7 +88,7 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     Huber's loss of the rows' errors over their own median, by reweighted squares of the linearization at x, with prior
     scales (n,) [SI]::
 
-        minimize    sum_i w_i |e_i|^2 / median^2 + |x / scale|^2,    w_i = min(1, TRUSTED median / |e_i|)
+        minimize    sum_i w_i |e_i|^2 / median^2 + |x / scale|^2,    w_i = min(1, FULL_WEIGHT median / |e_i|)
     """
     residual, jacobian = problem.slopes(x)
     X = jacobian * scale
@@ -108,7 +108,7 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
             unit[kind] = max(float(np.sqrt(np.median(mean[count > 0]))), 1e-12)
         size = np.sqrt(np.bincount(rows, (e / unit) ** 2) / np.bincount(rows))
         before = weight
-        weight = np.minimum(1.0, TRUSTED / np.maximum(size, 1e-12))
+        weight = np.minimum(1.0, FULL_WEIGHT / np.maximum(size, 1e-12))
         weighed = X * (weight[rows] / unit**2)[:, None]
         H = weighed.T @ X + np.eye(len(z))
         d = 1 / np.sqrt(H.diagonal())

@@ -26,7 +26,7 @@ BASE = "base"
 
 Tools and other frames are stated by hand or unknown: their scale is not estimated.
 """
-_FAMILY = re.compile(r"(ecc2|ecc|[a-z]+)")
+_KIND = re.compile(r"(ecc2|ecc|[a-z]+)")
 _GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
 
 
@@ -273,7 +273,7 @@ class Prior:
             elif is_joint_offset(name):
                 keys.append(OFFSETS)
             else:
-                keys.append(f"{MDH_DIMENSION[found[1]]}s" if found else family_of(name))
+                keys.append(f"{MDH_DIMENSION[found[1]]}s" if found else kind_of(name))
         of_base = np.array([own_name(name).startswith(f"{BASE}_") for name in parameters.names])
         fixed = (parameters.placed & (known | ~of_base))[parameters.identified]
         names = tuple(dict.fromkeys(key for key, alone in zip(keys, fixed, strict=True) if not alone))
@@ -281,7 +281,7 @@ class Prior:
         return np.array(numbers, dtype=int), names
 
 
-def family_of(name: str) -> str:
+def kind_of(name: str) -> str:
     """Return the model extension of a non-geometric parameter: ``ecc`` for ``ecc_cos3``."""
-    found = _FAMILY.match(own_name(name))
+    found = _KIND.match(own_name(name))
     return found[1] if found else own_name(name)

@@ -16,10 +16,10 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import phase
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
-from rpim_opt.bayes.model_selection import GAIN as FAMILY_GAIN
+from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
 from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, extended, named, questions
 from rpim_opt.bayes.prior_terms import FIXED
-from rpim_opt.problem.noise import Scatter, Stack
+from rpim_opt.problem.noise import Repeatability, Stack
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
@@ -83,26 +83,26 @@ def admitted(
     before = named(fit.problem, fit.point.v)
     with phase("selection"):
         given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
-        start = np.log([max(getattr(fit.laid.scatter, kind), LEAST) for kind in models.columns.noise])
+        start = np.log([max(getattr(fit.laid.repeatability, kind), LEAST) for kind in models.columns.noise])
         plain = given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
         found = _most_likely(given, models, plain)
         if found is None:
             return None
         point, curves, columns = found
         rest = _integrated(models.columns, columns, point)
-        kept = {"gravity"}.intersection(trials[0].families)
+        kept = {"gravity"}.intersection(trials[0].extensions)
 
-        def price(families: tuple[str, ...]) -> Candidate:
-            model = rest.restricted(models.members(families))
+        def price(extensions: tuple[str, ...]) -> Candidate:
+            model = rest.restricted(models.members(extensions))
             best = model.optima(model.starts()[:1])[0]
-            price = FAMILY_GAIN * questions(families) + (MOMENTS_GAIN - FAMILY_GAIN) * (MOMENTS in families)
-            if not kept.issubset(families):
+            price = EXTENSION_GAIN * questions(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
+            if not kept.issubset(extensions):
                 price = np.inf
-            return Candidate(best.value + price, families, best)
+            return Candidate(best.value + price, extensions, best)
 
         compared = sorted(models.compared(price), key=lambda each: each.price)
     best = compared[0]
-    problem = extended(bare, models.added(best.families))
+    problem = extended(bare, models.added(best.extensions))
     prior = estimator.prior.stated(problem.parameters)
     geometry = problem.parameters.free.scale * (prior.centre + prior.scale * best.found.z)
     x = np.append(geometry, point.z[len(point.z) - columns.shape[1] :])
@@ -110,7 +110,7 @@ def admitted(
     joint = replace(estimator, curves=curves).fit(problem.with_transmission(curves), x, logs, ROUNDS)
     gain = plain.value - point.value
     shift = trials[0].value - gain - best.found.value
-    with_curves = [Trial((*each.families, TRANSMISSION), each.found.value + shift) for each in compared]
+    with_curves = [Trial((*each.extensions, TRANSMISSION), each.found.value + shift) for each in compared]
     return joint, (*with_curves, *trials), gain
 
 
@@ -182,4 +182,4 @@ def _integrated(evidence: Evidence, columns: Array, point: Point) -> Evidence:
     m = len(R)
     every = np.ones((m, 1), dtype=bool)
     stack = Stack(np.arange(m)[:, None], np.ones((m, 1, 1)), every, ~every, np.zeros((m, 1, 0)))
-    return replace(evidence, data=Linearized(R[:, :-1], R[:, -1], [stack]), noise=(), fixed=Scatter())
+    return replace(evidence, data=Linearized(R[:, :-1], R[:, -1], [stack]), noise=(), fixed=Repeatability())

@@ -191,7 +191,7 @@ class Acceptance:
         Why, a sentence each; empty where it is accepted.
     workspace
         Expanded uncertainties at configurations of the region.
-    scatter
+    repeatability
         The largest of them if all parameters were known: the repeatability's part [m].
     held_out
         Errors on held-out rows and coverage of their intervals, a document [mm] with its ``sentence``.
@@ -207,7 +207,7 @@ class Acceptance:
     verdict: Verdict
     reasons: tuple[str, ...]
     workspace: Workspace | None = None
-    scatter: float | None = None
+    repeatability: float | None = None
     held_out: Mapping[str, Any] | None = None
 
     @property
@@ -242,7 +242,7 @@ class Acceptance:
         box = None
         if r.box is not None:
             box = {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
-        lengths = {"bound": self.bound, "typical": found and found.typical, "scatter": self.scatter}
+        lengths = {"bound": self.bound, "typical": found and found.typical, "repeatability": self.repeatability}
         return {
             "verdict": self.verdict,
             "limit_mm": 1e3 * r.limit,
@@ -296,7 +296,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     except InputError as error:
         reasons = (*against, *lacking, f"No bound: {error}")
         return Acceptance(requirement, "rejected" if against else "undecided", reasons, held_out=held_out)
-    scatter, least = scatter_bounds(result, region, mapped.q[-1], requirement.confidence)
+    repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
         against.append(
@@ -309,21 +309,21 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
             "Lacking: measurements that identify the parameter combinations that neither data nor penalty determine."
         )
     elif mapped.largest > limit:
-        if scatter > limit:
+        if repeatability > limit:
             lacking.append(
-                f"Lacking: a more precise repeatability. Its upper bound, {1e3 * scatter:.3f} mm, may exceed the "
+                f"Lacking: a more precise repeatability. Its upper bound, {1e3 * repeatability:.3f} mm, may exceed the "
                 "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
             )
         else:
             lacking.append(
                 f"Lacking: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
-                f"robot's repeatability would leave {1e3 * scatter:.3f} mm of it. `rpim-opt design PROBLEM --augment "
-                "--count 10` names the configurations that help most."
+                f"robot's repeatability would leave {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
+                "--augment --count 10` names the configurations that help most."
             )
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "undecided"
-    return Acceptance(requirement, verdict, tuple(against or lacking), mapped, scatter, held_out)
+    return Acceptance(requirement, verdict, tuple(against or lacking), mapped, repeatability, held_out)
 
 
 def _held_out(
@@ -407,17 +407,17 @@ def _any_inside(result: Calibration, region: Region) -> bool:
     return False
 
 
-def scatter_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
+def repeatability_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
     """Return the bounds [m] at q (dof,) if all parameters were known, for the estimated and the smallest repeatability.
 
     Zero where it is not known apart from the noise; at the least where the data know no more than an upper end.
     """
     results = [result]
-    scatter = result.problem.scatter
-    if scatter is not None:
+    repeatability = result.problem.repeatability
+    if repeatability is not None:
         learned = {} if result.learned is None else result.learned.noise
         least = {k: 0.0 if s.spread > VAGUE else s.value * float(np.exp(-2 * s.spread)) for k, s in learned.items()}
-        results.append(replace(result, problem=result.problem.scattered(replace(scatter, **least))))
+        results.append(replace(result, problem=result.problem.with_repeatability(replace(repeatability, **least))))
     found = [0.0, 0.0]
     for i, each in enumerate(results):
         mean, reached = (each.predict(q[None], region.marker, of=of).covariance for of in ("mean", "reached"))

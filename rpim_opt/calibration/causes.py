@@ -51,7 +51,7 @@ def likely_causes(result: Outcome) -> list[str]:
     """Return the likely causes of a poor fit, one sentence each; empty if the fit is good.
 
     A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
-    does not distrust, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
+    does not downweight, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
     without value, exchanged rows, rounded joints and a base that moved are looked for.
 
     Parameters

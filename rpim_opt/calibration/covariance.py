@@ -31,8 +31,8 @@ class Spread:
     ``linear``, ``form`` and ``weight`` are the equations that the fit rests on, their closed form with the penalty, and
     its weight; ``z`` (n,) the solution in units of the scales, ``factor`` the weight that a robust loss gives to the
     equations, against squared residuals in sigmas. ``level`` is the noise's variance in units of the equations', where
-    it was estimated with the scatter, ``drift`` (n, k) what estimated hyperparameters and heavy tails add: D with D D'
-    a covariance of the deviations [SI].
+    it was estimated with the repeatability, ``drift`` (n, k) what estimated hyperparameters and heavy tails add: D with
+    D D' a covariance of the deviations [SI].
     """
 
     linear: LinearModel
@@ -105,7 +105,7 @@ class Spread:
 # --- noise of readings ------------------------------------------------------------------------------------------------
 
 
-class Scattered(NamedTuple):
+class NoiseCovariances(NamedTuple):
     """Covariances added to that of the rows' model, block by block (N, k, k) [SI].
 
     ``robot`` is the robot's repeatability, ``reading`` this and the instrument's noise, with ``session``, the offset of
@@ -117,20 +117,20 @@ class Scattered(NamedTuple):
     session: list[Array]
 
 
-def scattered(problem: CalibrationProblem, level: float) -> Scattered:
+def noise_covariances(problem: CalibrationProblem, level: float) -> NoiseCovariances:
     """Return the covariances that robot and instrument add to the model of some measurements.
 
     A problem whose repeatability was estimated knows its parts. Of another one the robot's is what the residuals show
     beyond the stated noise, (level - 1) Sigma, with ``level`` the noise's variance over the stated one, at least 1.
     """
     session = unknown_sessions(problem)
-    if problem.scatter is not None:
+    if problem.repeatability is not None:
         robot = problem.covariances(reading=False)
         reading = problem.covariances()
     else:
         robot = [(level - 1) * V for V in problem.covariances()]
         reading = [level * V for V in problem.covariances()]
-    return Scattered(robot, [V + more for V, more in zip(reading, session, strict=True)], session)
+    return NoiseCovariances(robot, [V + more for V, more in zip(reading, session, strict=True)], session)
 
 
 def position_noise(source: Source) -> Array:

@@ -12,7 +12,7 @@ from scipy.special import chdtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.trust import RARE, outlying
+from rpim_opt.convex.robust_loss import RARE, outlying
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
 

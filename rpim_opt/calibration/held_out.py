@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import sessions_spread
 from rpim_opt.bayes.outliers import by_block
-from rpim_opt.calibration.covariance import coverage_factor, row_freedom, scattered
+from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, row_freedom
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
@@ -46,7 +46,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
     known = np.isfinite(np.diag(C))
     C = np.where(np.outer(known, known), C, 0.0)
-    added = scattered(problem, result.variance_factor)
+    added = noise_covariances(problem, result.variance_factor)
     for (block, part), reading, session in zip(parts, added.reading, added.session, strict=True):
         k = len(block.measurement.components)
         r, A = part[:, :, 0], part[:, :, 1:]

@@ -71,7 +71,7 @@ def calibrate(
     Without a weight, hyperparameters are estimated from the data first, by marginal likelihood (`Evidence` has the
     formulas): prior scales of the deviations, with heavy tails, joint offsets three times as large, frames nearly free;
     and the robot's repeatability beside the stated measurement noise. Any formulation then solves the problem with
-    these scales and noise (`Scatter`) at weight 1.
+    these scales and noise (`Repeatability`) at weight 1.
 
     Every iteration linearizes at the current deviations and solves for the *total* deviation; a curved step follows the
     curve of the residual (geodesic acceleration), and where the nonlinear objective falls by less than a quarter of
@@ -140,7 +140,7 @@ def calibrate(
     if noise not in NOISE:
         raise InputError("noise", f"'{noise}'", choices(noise, NOISE))
     kinds = NOISE[noise]
-    if model == "geometry":  # without the families joints would take gravity for noise
+    if model == "geometry":  # without the extensions joints would take gravity for noise
         kinds = tuple(kind for kind in kinds if kind != "joint")
     require_affordable(problem)
     require_finite(*(block.y for block in problem.sample().data.blocks))

@@ -17,7 +17,7 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import sampled
 from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Comparison, Judged
 from rpim_opt.bayes.outliers import by_block
-from rpim_opt.bayes.prior import family_of
+from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.formulation import tikhonov
@@ -43,7 +43,7 @@ NOTABLE = 0.5
 SURE = 3.0
 """Standard deviations by which a compliance is below zero before a joint is said to bend upwards."""
 RARE = 1e-3
-"""Probability that residuals exceed the scatter of repeated readings by chance."""
+"""Probability that residuals exceed the standard deviation of repeated readings by chance."""
 PERMUTATIONS = 300
 """Permutations that an autocorrelation is compared with."""
 FEWEST_NEIGHBOURS = 8
@@ -152,10 +152,10 @@ class LackOfFit:
             if self.joint > NEGLIGIBLE * self.robot:
                 parts[-1] += f", including {_size(self, self.joint)} from the joints"
         lines = [f"{rms} ({', '.join(parts)})."]
-        for family, gain in self.present.items():
-            lines.append(f"{EXTENSIONS[family].effect}: -2 ln L falls by {gain:.0f}.")
+        for extension, gain in self.present.items():
+            lines.append(f"{EXTENSIONS[extension].effect}: -2 ln L falls by {gain:.0f}.")
         if self.missing:
-            what = joined([EXTENSIONS[family].name for family in self.missing])
+            what = joined([EXTENSIONS[extension].name for extension in self.missing])
             lines.append(
                 f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (-2 ln L "
                 f'falls by {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
@@ -230,15 +230,15 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     after = _parts(compared, best)
     total = sum(part**2 for part in _parts(compared, compared.plain).values())  # the variance of a row
     share = 0.0
-    if best.families:
+    if best.extensions:
         share = max(total - sum(part**2 for part in after.values()), 0.0) / total
-    group = [family_of(name) for name in compared.own]
+    group = [kind_of(name) for name in compared.own]
     present = {}
-    for family, terms in OWNED.items():
+    for extension, terms in OWNED.items():
         members = np.isin(group, terms)
         gain = compared.rise_without(members) if members.any() else 0.0
         if gain > SPEAK:
-            present[family] = gain
+            present[extension] = gain
     again, freedom = _repeated(problem, result.x, dimension)
     excess = 0.0
     if again is not None:
@@ -255,8 +255,8 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
         position=after["position"],
         joint=after["joint"],
         repeatable=float(np.sqrt(share * total)),
-        missing=best.families,
-        parameters=tuple(p for family in best.families for p in EXTENSIONS[family].identify),
+        missing=best.extensions,
+        parameters=tuple(p for extension in best.extensions for p in EXTENSIONS[extension].identify),
         gain=compared.plain.point.value - best.point.value,
         share=share,
         present=present,
@@ -291,15 +291,15 @@ def foreseen(problem: Source) -> LackOfFit | None:
 
 def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
     """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
-    scatter = model.evidence.scatter(model.point.logs)
-    only = replace(scatter, instrument=0.0, joint=0.0)
-    own = scatter.orientation if compared.dimension == "angle" else scatter.position
+    repeatability = model.evidence.repeatability(model.point.logs)
+    only = replace(repeatability, instrument=0.0, joint=0.0)
+    own = repeatability.orientation if compared.dimension == "angle" else repeatability.position
     squares = {"instrument": 0.0, "position": 0.0, "joint": 0.0}
     for stack in model.evidence.data.stacks:
         which = stack.of(compared.dimension)
         stated = np.einsum("nkk->nk", stack.instrument)
-        squares["instrument"] += scatter.instrument**2 * float(np.sum(stated[which]))
-        squares["joint"] += scatter.joint**2 * float(np.sum(np.sum(stack.joint**2, axis=2)[which]))
+        squares["instrument"] += repeatability.instrument**2 * float(np.sum(stated[which]))
+        squares["joint"] += repeatability.joint**2 * float(np.sum(np.sum(stack.joint**2, axis=2)[which]))
         if compared.dimension == "pixel":
             squares["position"] += float(np.sum(np.einsum("nkk->nk", stack.covariance(only))[which]))
         else:
@@ -313,12 +313,12 @@ def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ..
     # signs of measured torques are the table's, and numbers of joints would not say of which robot
     if measured_torques(compared.problem.data) or len(compared.problem.arms) > 1:
         return ()
-    if "gravity" not in {*model.families, *present}:
+    if "gravity" not in {*model.extensions, *present}:
         return ()
     z = model.point.z
     sd = np.sqrt(np.diag(model.point.C))
     moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
-    joint = {i: int(name[10:]) for i, name in enumerate(model.names) if family_of(name) == "compliance"}
+    joint = {i: int(name[10:]) for i, name in enumerate(model.names) if kind_of(name) == "compliance"}
     largest = max((moves[i] for i in joint), default=0.0)
     return tuple(k for i, k in joint.items() if z[i] < -SURE * sd[i] and moves[i] > NOTABLE * largest)
 
@@ -345,13 +345,13 @@ def _residual_autocorrelation(compared: Comparison, model: Judged) -> Autocorrel
     """Return that of a model's residuals in units of their noise; None where points were touched."""
     if compared.problem.touches is not None:
         return None
-    scatter = model.evidence.scatter(model.point.logs)
+    repeatability = model.evidence.repeatability(model.point.logs)
     stacks = model.evidence.data.stacks
     residual = model.evidence.data.y - model.evidence.data.X @ model.point.z
     widest = max(stack.index.shape[1] for stack in stacks)
     errors, kinds, first = [], [], []
     for kind, stack in enumerate(stacks):
-        e = residual[stack.index] / np.sqrt(np.einsum("nkk->nk", stack.covariance(scatter)))
+        e = residual[stack.index] / np.sqrt(np.einsum("nkk->nk", stack.covariance(repeatability)))
         errors.append(np.pad(e, ((0, 0), (0, widest - e.shape[1]))))
         kinds.append(np.full(len(e), kind))
         first.append(compared.row[stack.index[:, 0]])

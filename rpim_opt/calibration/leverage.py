@@ -14,7 +14,7 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.convex.trust import Squares
+from rpim_opt.convex.robust_loss import Squares
 from rpim_opt.data.record import CONFIDENCE
 from rpim_opt.problem.blocks import in_parts
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel

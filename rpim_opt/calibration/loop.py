@@ -16,9 +16,9 @@ from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.weight_choice import WeightChoice, weight_choice
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
+from rpim_opt.convex.robust_loss import Squares, inliers_of
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.structure import in_blocks
-from rpim_opt.convex.trust import Squares, trusted
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, around
@@ -185,10 +185,10 @@ class Loop:
         if not state.choice.robust:
             return state.program
         if self.reweigh is None:
-            return state.program.on_squares(state.program.trusted(state.z))
+            return state.program.on_squares(state.program.inlier_model(state.z))
         x = self.scale * state.z
-        trust = trusted(self.formulation, *self.source.configuration_errors(x))
-        return state.program.on(around(self.source.linearize(x, trust), *self.about))
+        inliers = inliers_of(self.formulation, *self.source.configuration_errors(x))
+        return state.program.on(around(self.source.linearize(x, inliers), *self.about))
 
     # --- one step --------------------------------------------------------------------------------------------
 

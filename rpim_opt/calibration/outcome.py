@@ -22,11 +22,11 @@ from rpim_opt.calibration.covariance import (
     Interval,
     NoiseTest,
     Spread,
+    noise_covariances,
     noise_test,
     position_noise,
     require_interval,
     row_freedom,
-    scattered,
 )
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPrice
 from rpim_opt.calibration.loop import Iteration
@@ -34,8 +34,8 @@ from rpim_opt.convex.constraints import Parsed
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
+from rpim_opt.convex.robust_loss import inliers_of
 from rpim_opt.convex.select import Selection
-from rpim_opt.convex.trust import trusted
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
@@ -219,7 +219,7 @@ class Outcome:
         problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
         covariance = self.spread.of_positions(J)
-        added = scattered(problem, self.variance_factor)
+        added = noise_covariances(problem, self.variance_factor)
         if of == "reached":
             covariance = covariance + added.robot[0]
         freedom: float | Array = self.freedom
@@ -307,7 +307,7 @@ class Outcome:
         scale = p.scale.copy()
         scale[p.identified] = learned.stated
         identified = p.identified & ~np.isin(p.names, learned.added)
-        bare = self.problem.scattered(None)
+        bare = self.problem.with_repeatability(None)
         bare = bare.with_parameters(replace(p, scale=scale, identified=identified))
         return bare if learned.curves is None else bare.with_transmission(())
 
@@ -336,19 +336,19 @@ class Outcome:
         program = self.program
         source = in_parts(self.problem)
         if source.keeps_rows or program.formulation is self.formulation:
-            trust = program.trust(self.z)
+            inliers = program.inliers(self.z)
         else:
-            trust = trusted(self.formulation, *source.configuration_errors(self.x))
-        if trust is None:
+            inliers = inliers_of(self.formulation, *source.configuration_errors(self.x))
+        if inliers is None:
             form = program.loss_form
             return program.squared, 1.0 if form is None else form.size
         if source.keeps_rows:
-            return trust(program.model, self.z)[0], trust.factor
-        return source.linearize(self.x, trust), trust.factor
+            return inliers(program.model, self.z)[0], inliers.factor
+        return source.linearize(self.x, inliers), inliers.factor
 
     @cached_property
     def linear(self) -> LinearModel:
-        """The final linearization, of the rows that a robust loss keeps (`Program.trusted`)."""
+        """The final linearization, of the rows that a robust loss keeps (`Program.inlier_model`)."""
         return self._squares[0]
 
     @cached_property
@@ -383,13 +383,13 @@ class Outcome:
         'Residuals agree with the stated measurement noise (ratio 1.02).'
         """
         linear, factor = self._squares
-        scatter = self.problem.scatter
-        if scatter is None:
+        repeatability = self.problem.repeatability
+        if repeatability is None:
             squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / factor
             return noise_test(squares, self.spread.spare)
-        bare = self.problem.scattered(None)
+        bare = self.problem.with_repeatability(None)
         squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
-        return noise_test(squares, self.spread.spare, True, scatter.instrument)
+        return noise_test(squares, self.spread.spare, True, repeatability.instrument)
 
     @property
     def freedom(self) -> float:
@@ -415,7 +415,7 @@ class Outcome:
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:
-        """Outliers, the worst first: rows above `trust.outlying` for the noise that the other rows show.
+        """Outliers, the worst first: rows above `robust_loss.outlying` for the noise that the other rows show.
 
         After a robust loss those of them that a fit without them contradicts, because it may sacrifice half of few rows
         to the other half. After a squared loss outliers may hide behind each other: a robust loss finds them.

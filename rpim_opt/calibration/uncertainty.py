@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration.covariance import coverage_factor, position_noise, scattered
+from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, position_noise
 from rpim_opt.calibration.outcome import Outcome, Prediction
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.terms import transmission
@@ -125,7 +125,7 @@ def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dic
     J = there.jacobian(result.x).reshape(len(q), 3, -1)
     prior = np.einsum("nij,jk,nik->n", J, spread.prior, J)
     drift = np.zeros(len(q)) if spread.drift is None else np.sum((J @ spread.drift) ** 2, axis=(1, 2))
-    robot = np.trace(scattered(there, result.variance_factor).robot[0], axis1=1, axis2=2)
+    robot = np.trace(noise_covariances(there, result.variance_factor).robot[0], axis1=1, axis2=2)
     return {
         "measurement noise in the parameters": np.einsum("nij,jk,nik->n", J, spread.noise, J),
         "prior, in combinations that the data hardly identify": prior - drift,

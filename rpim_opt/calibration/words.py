@@ -259,14 +259,14 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         _said("Thermal expansion", expansion),
     ]
     if learned.trials:
-        gains = {family: learned.gain(family) for trial in learned.trials for family in trial.families}
-        supported = [f"{family} {gain:.0f}" for family, gain in gains.items() if gain is not None and gain >= 0.5]
+        gains = {extension: learned.gain(extension) for trial in learned.trials for extension in trial.extensions}
+        supported = [f"{extension} {gain:.0f}" for extension, gain in gains.items() if gain is not None and gain >= 0.5]
         evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
         model = f"Model: the data support no extension{evidence}."
-        if learned.families:
+        if learned.extensions:
             model = (
-                f"Model: geometry with {joined(learned.families)}{evidence}. `compensate` uses the whole model; files "
-                "of controllers hold geometry alone, and `export` states the error of what it writes."
+                f"Model: geometry with {joined(learned.extensions)}{evidence}. `compensate` uses the whole model; "
+                "files of controllers hold geometry alone, and `export` states the error of what it writes."
             )
         lines.append(model)
     ratio = np.abs(z) * learned.local
@@ -361,7 +361,7 @@ def camera_remarks(result: Outcome) -> list[str]:
 # --- contacts ---------------------------------------------------------------------------------------------------------
 
 
-def scatter(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str, Any], ...]:
+def touch_errors(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str, Any], ...]:
     """Return the distances [mm] of touches from their point or plane, the worst first, from errors (N,) [m].
 
     By its name: how many, their RMS before and after calibration, and the largest.
@@ -385,7 +385,7 @@ def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
         yield name, np.array(of)
 
 
-def scatter_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
+def touch_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
     """Return the rows of the table [mm] under `HEADER`: the worst points, and the number of the others."""
     rows = []
     for each in found[:MOST_POINTS]:

@@ -19,11 +19,11 @@ from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
+from rpim_opt.convex.robust_loss import Inliers, inliers_of
 from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box_sides, nearest
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import Warm, minimum
 from rpim_opt.convex.structure import Structure, structure
-from rpim_opt.convex.trust import Trusted, trusted
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
 FEASIBLE = 1e-7
@@ -289,23 +289,23 @@ class Program(Brief):
         except Unsolved:
             return None
 
-    def trust(self, z: Array) -> Trusted | None:
+    def inliers(self, z: Array) -> Inliers | None:
         """Return the equations that a robust loss keeps at z (n,); None for a squared loss.
 
         InputError for a loss without a slope, or one that rests on few equations (minimax).
         """
         if self.loss_form is not None:
             return None
-        return trusted(self.formulation, self.norms(z), self.model.members[1], self.structure.answers.loss)
+        return inliers_of(self.formulation, self.norms(z), self.model.members[1], self.structure.answers.loss)
 
-    def trusted(self, z: Array) -> LinearModel:
+    def inlier_model(self, z: Array) -> LinearModel:
         """Return the equivalent squared-loss model of a robust fit: the rows kept at z (n,), downweighted.
 
         Degrees of freedom, likelihoods and covariances of a robust estimate are those of this model, and it is what
-        every rule for the weight sees. With a squared loss it is that loss's. InputError as for `trust`.
+        every rule for the weight sees. With a squared loss it is that loss's. InputError as for `inliers`.
         """
-        trust = self.trust(z)
-        return self.squared if trust is None else trust(self.model, z)[0]
+        inliers = self.inliers(z)
+        return self.squared if inliers is None else inliers(self.model, z)[0]
 
     # --- solutions -----------------------------------------------------------------------------------------------
 

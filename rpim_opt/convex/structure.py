@@ -36,9 +36,9 @@ from rpim_opt.convex.expressions import (
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
+from rpim_opt.convex.robust_loss import Squares, separable
 from rpim_opt.convex.solvers.conic import Canonical
 from rpim_opt.convex.solvers.separable import Loss
-from rpim_opt.convex.trust import Squares, separable
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.robot.parameters import Parameters
 

@@ -10,7 +10,7 @@ from .diagnosis import Inspection as Inspection
 from .diagnosis import inspect as inspect
 from .linear import LinearModel as LinearModel
 from .multi_robot import together as together
-from .noise import Scatter as Scatter
+from .noise import Repeatability as Repeatability
 from .problem import CalibrationProblem as CalibrationProblem
 from .registration.camera import view_pose as view_pose
 from .registration.certified import CertifiedStart as CertifiedStart
@@ -19,5 +19,5 @@ from .registration.closed_forms import register as register
 from .registration.frames import fitted_frames as fitted_frames
 from .registration.frames import problem_from as problem_from
 from .registration.frames import starting_parameters as starting_parameters
-from .workspace import postures_at as postures_at
-from .workspace import postures_in_sight as postures_in_sight
+from .workspace import configurations_at as configurations_at
+from .workspace import visible_configurations as visible_configurations

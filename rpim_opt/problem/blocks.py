@@ -101,7 +101,9 @@ class PartitionedProblem(RobotModel):
 
     @cached_property
     def _first(self) -> CalibrationProblem:
-        return CalibrationProblem(self.robots, self.parameters, self.first, asked=self.asked, scatter=self.scatter)
+        return CalibrationProblem(
+            self.robots, self.parameters, self.first, asked=self.asked, repeatability=self.repeatability
+        )
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements, in memory."""
@@ -184,7 +186,12 @@ def in_parts(problem: Source) -> Source:
         return problem
     parts = [partial(Dataset.take, problem.data, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
     return PartitionedProblem(
-        problem.robots, problem.parameters, problem.data, parts, asked=problem.asked, scatter=problem.scatter
+        problem.robots,
+        problem.parameters,
+        problem.data,
+        parts,
+        asked=problem.asked,
+        repeatability=problem.repeatability,
     )
 
 

@@ -287,7 +287,7 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: n
     noise = touches.noise(where)
     own = np.ones(touches.equations, dtype=bool)
     for tie in touches.ties:
-        own[tie.equations] = False  # its touches scatter, and not what is stated
+        own[tie.equations] = False  # its touches vary, and not what is stated
     found: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
     for stack in stacks:
         for n, index in enumerate(stack.index):

@@ -109,8 +109,8 @@ def choose(
         A   minimize tr M^-1
         V   minimize the mean variance of the candidates' positions, the axes' sum [m^2]
 
-    Of a problem whose rows touch points, the candidates are postures at one point (`postures_at`); V counts positions
-    of the tool.
+    Of a problem whose rows touch points, the candidates are configurations at one point (`configurations_at`); V counts
+    positions of the tool.
 
     The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
     any set can reach. The largest weights are rounded and improved by exchanges (Fedorov 1972).

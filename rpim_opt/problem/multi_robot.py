@@ -36,8 +36,8 @@ def together(
     """Combine problems: two arms and one tracker, one robot in two campaigns, one tool on two robots.
 
     A problem like any other: `calibrate` takes it with any formulation and selector, or learns its sizes, one for each
-    kind of parameter of all robots, and one scatter. Parameters are called ``name.parameter``, ``left.a2``, but those
-    that are shared keep their name; configurations of different problems are never the same.
+    kind of parameter of all robots, and one repeatability. Parameters are called ``name.parameter``, ``left.a2``, but
+    those that are shared keep their name; configurations of different problems are never the same.
 
     The problems are in memory, of one robot each; called ``A``, ``B``, ..., or by name: ``left=problem``. ``shared``
     are patterns of the parameters that are one and the same in all problems that have them, ``["tool_*"]``; their
@@ -46,8 +46,8 @@ def together(
     where chains branch, too, with ``read_urdf(..., origins=True)``.
 
     InputError for fewer than two problems, a pattern that matches no parameter that several have, shared parameters
-    that are stated differently, scatter (it is stated of the whole, or learned), data in blocks, and touches of a point
-    that is elsewhere for another robot.
+    that are stated differently, repeatability (it is stated of the whole, or learned), data in blocks, and touches of a
+    point that is elsewhere for another robot.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -69,8 +69,8 @@ def together(
             raise InputError(where, type(part).__name__, "a CalibrationProblem, in memory")
         if len(part.arms) > 1:
             raise InputError(where, "several robots", "one; give all problems in one call")
-        if part.scatter is not None:
-            accepted = "none: it is estimated, or stated for the whole problem by .scattered()"
+        if part.repeatability is not None:
+            accepted = "none: it is estimated, or stated for the whole problem by .with_repeatability()"
             raise InputError(where, "the robot's repeatability", accepted)
     common = _common(parts, shared)
     tables = []
@@ -163,10 +163,10 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     kept = np.flatnonzero(~np.isin(p.names, list(like)))
     entries = np.array([p.names.index(name) for name in like.values()])
     more = replace(p.take(entries), names=tuple(like), nominal=np.zeros(len(like)))
-    scatter = problem.scatter
-    if scatter is not None and scatter.at is not None:
-        scatter = replace(scatter, at=np.append(scatter.at[kept], more.nominal))
-    return replace(problem, parameters=_concatenated([p.take(kept), more]), scatter=scatter)
+    repeatability = problem.repeatability
+    if repeatability is not None and repeatability.at is not None:
+        repeatability = replace(repeatability, at=np.append(repeatability.at[kept], more.nominal))
+    return replace(problem, parameters=_concatenated([p.take(kept), more]), repeatability=repeatability)
 
 
 def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
@@ -176,7 +176,7 @@ def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
         return [np.zeros((1, 1, 1)) for _ in problem.data.blocks]
     p = whole.parameters
     added = p.identified & ~np.isin(p.names, problem.parameters.free.names)
-    alone = replace(whole, parameters=replace(p, identified=added), scatter=None)
+    alone = replace(whole, parameters=replace(p, identified=added), repeatability=None)
     T = alone.jacobian(np.zeros(int(added.sum()))) * p.scale[added]
     return [T[index] @ T[index].transpose(0, 2, 1) for index in equation_numbers(problem.data)]
 

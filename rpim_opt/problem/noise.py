@@ -12,8 +12,8 @@ from rpim_opt.data.dataset import Dataset
 
 
 @dataclass(frozen=True, eq=False)
-class Scatter:
-    """Repeatability of a robot: the scatter of positions, orientations and joints about its model.
+class Repeatability:
+    """Repeatability of a robot: standard deviations of positions, orientations and joints about its model.
 
     The covariance of all that was measured in one configuration is::
 
@@ -40,8 +40,8 @@ class Stack:
 
     ``index`` (N, k) numbers of the equations; ``instrument`` (N, k, k) covariance as the rows state it [SI]; ``length``
     and ``angle`` (N, k) which are such; ``joint`` (N, k, dof) slopes by the revolute joints' angles [SI], dof columns a
-    stop of the joints, none where not requested; ``unit`` (N, k, k) covariance of a unit scatter of every measured
-    position where equations mix several, or a camera sees several points of one, else None: 1 for lengths.
+    stop of the joints, none where not requested; ``unit`` (N, k, k) covariance of a unit standard deviation of every
+    measured position where equations mix several, or a camera sees several points of one, else None: 1 for lengths.
     """
 
     index: np.ndarray
@@ -59,19 +59,19 @@ class Stack:
             return self.angle
         return ~(self.length | self.angle)
 
-    def covariance(self, scatter: Scatter, reading: bool = True) -> Array:
+    def covariance(self, repeatability: Repeatability, reading: bool = True) -> Array:
         """Return the covariances (N, k, k) [SI] of the residuals; without the instrument's part if not of a reading."""
         k = self.index.shape[1]
-        own = scatter.orientation**2 * self.angle
+        own = repeatability.orientation**2 * self.angle
         if self.unit is None:
-            own = scatter.position**2 * self.length + own
+            own = repeatability.position**2 * self.length + own
         found = own[:, :, None] * np.eye(k)
         if self.unit is not None:
-            found += scatter.position**2 * self.unit
-        if scatter.joint > 0:
-            found += scatter.joint**2 * self.joint @ self.joint.transpose(0, 2, 1)
+            found += repeatability.position**2 * self.unit
+        if repeatability.joint > 0:
+            found += repeatability.joint**2 * self.joint @ self.joint.transpose(0, 2, 1)
         if reading:
-            found += scatter.instrument**2 * self.instrument
+            found += repeatability.instrument**2 * self.instrument
         return found
 
 

@@ -21,7 +21,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import READY
 from rpim_opt.problem.contact import Things, Touches, contrasted, of_rows
 from rpim_opt.problem.linear import LinearModel, Reweigh
-from rpim_opt.problem.noise import Equations, Scatter, Stack, equation_numbers
+from rpim_opt.problem.noise import Equations, Repeatability, Stack, equation_numbers
 from rpim_opt.problem.row_functions import (
     Functions,
     Kept,
@@ -62,7 +62,7 @@ class RobotModel(Tabled):
     robots: Robot | Mapping[str, Robot]
     parameters: Parameters
     asked: Kept | None = field(default=None, repr=False, kw_only=True)
-    scatter: Scatter | None = field(default=None, kw_only=True)
+    repeatability: Repeatability | None = field(default=None, kw_only=True)
 
     def sample(self) -> CalibrationProblem:
         """Return rows enough to place frames by: all of them, of measurements in blocks the first block."""
@@ -111,9 +111,9 @@ class RobotModel(Tabled):
         """Return the same problem with other parameters identified, (P,) true or false."""
         return replace(self, parameters=replace(self.parameters, identified=identified))
 
-    def scattered(self, scatter: Scatter | None) -> Self:
+    def with_repeatability(self, repeatability: Repeatability | None) -> Self:
         """Return the same problem with another repeatability of the robot, or none."""
-        return replace(self, scatter=scatter)
+        return replace(self, repeatability=repeatability)
 
     def with_model(self, model: Model, identify: Iterable[str] = ("*",)) -> Self:
         """Return the same problem with the terms of a model added to the arm.
@@ -142,7 +142,7 @@ class RobotModel(Tabled):
         former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
         p = self.parameters.take(np.array([i for i, name in enumerate(self.parameters.names) if name not in former]))
         p = replace(p, terms=tuple(name for name in p.terms if name not in former))
-        bare = replace(self, robots=replace(self.robot, model=Model(own)), parameters=p, scatter=None)
+        bare = replace(self, robots=replace(self.robot, model=Model(own)), parameters=p, repeatability=None)
         if not curves:
             return bare
         return bare.with_model(Model([transmission(curve) for curve in curves]))
@@ -167,7 +167,7 @@ class CalibrationProblem(RobotModel):
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand in the order
     of the data's blocks. ``asked`` are the functions that `frozen` keeps, None where every call asks the measurement
-    models anew; ``scatter`` is the robot's repeatability, None for the instrument's noise alone. InputError when
+    models anew; ``repeatability`` is the robot's repeatability, None for the instrument's noise alone. InputError when
     nothing is identified, or the data do not fit the robot or the parameters.
 
     >>> import numpy as np
@@ -220,10 +220,10 @@ class CalibrationProblem(RobotModel):
         others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared among other robots
         kept = np.flatnonzero([name not in others for name in p.names])
         p = replace(p.take(kept), terms=tuple(name for name in p.terms if name not in others))
-        scatter = self.scatter
-        if scatter is not None and scatter.at is not None:
-            scatter = replace(scatter, at=scatter.at[self.parameters.places_of(robot)[kept]])
-        return CalibrationProblem(arm, p, self.data.of_robot(robot), scatter=scatter)
+        repeatability = self.repeatability
+        if repeatability is not None and repeatability.at is not None:
+            repeatability = replace(repeatability, at=repeatability.at[self.parameters.places_of(robot)[kept]])
+        return CalibrationProblem(arm, p, self.data.of_robot(robot), repeatability=repeatability)
 
     @property
     def joint_values(self) -> Array:
@@ -515,11 +515,11 @@ class CalibrationProblem(RobotModel):
     @cached_property
     def _inverses(self) -> list[tuple[np.ndarray, Array]]:
         """The numbers (N, k) of equations that share noise, and L^-1 (N or 1, k, k) of its covariances L L'."""
-        scatter = self.scatter or Scatter()
-        if self.scatter is None and self.touches is None:  # every row by itself
+        repeatability = self.repeatability or Repeatability()
+        if self.repeatability is None and self.touches is None:  # every row by itself
             return list(zip(equation_numbers(self.data), self._whitening, strict=True))
-        stacks = self.stacks(joints=scatter.joint > 0, at=scatter.at)
-        return [(stack.index, _inverse_root(stack.covariance(scatter))) for stack in stacks]
+        stacks = self.stacks(joints=repeatability.joint > 0, at=repeatability.at)
+        return [(stack.index, _inverse_root(stack.covariance(repeatability))) for stack in stacks]
 
     def stacks(self, joints: bool = True, at: Array | None = None) -> list[Stack]:
         """Return the equations by configuration, with what divides their noise.
@@ -551,12 +551,12 @@ class CalibrationProblem(RobotModel):
 
         ``reading``: of a reading; otherwise without the instrument's part, the robot's repeatability alone.
         """
-        scatter = self.scatter
-        if scatter is None:
+        repeatability = self.repeatability
+        if repeatability is None:
             found = [block.covariance * reading for block in self.data.blocks]
         else:
-            stacks = self._stacked(equation_numbers(self.data), scatter.joint > 0, scatter.at)
-            found = [stack.covariance(scatter, reading) for stack in stacks]
+            stacks = self._stacked(equation_numbers(self.data), repeatability.joint > 0, repeatability.at)
+            found = [stack.covariance(repeatability, reading) for stack in stacks]
         if self.touches is None:
             return found
         return of_rows(self.touches, self.data, found, self.touched, reading)

@@ -19,7 +19,7 @@ from rpim_opt.robot.extensions import Statics
 from rpim_opt.robot.kinematics import FRAME, chain, placed, product, translation
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameters import EXPANSION, REFERENCE, Parameters, of_term, tool_prefix
-from rpim_opt.robot.terms import SYMBOLS, Dependencies, Posture, Symbol, Term, Weight, dependencies
+from rpim_opt.robot.terms import SYMBOLS, Configuration, Dependencies, Symbol, Term, Weight, dependencies
 
 Functions = Mapping[str, ca.Function]
 """``residual``, ``jacobian``, ``modelled``, ``metres`` of one row; inputs are deviations, nominal values, the row."""
@@ -147,14 +147,14 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     # every point's reflector in the frame that measures
     transforms = []
     for point, marker in enumerate(of.markers):
-        posture = of.loads.posture(of.joint_types, p.start, stated, point)
+        configuration = of.loads.configuration(of.joint_types, p.start, stated, point)
         factors = []
         if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
             factors += p.frame("base_")
         if of.sessions:
             factors += p.chosen(of.sessions, session)
-        flange = chain(of.joint_types, posture, p.value, of.terms)
-        temperature = posture.columns.get("temperature")
+        flange = chain(of.joint_types, configuration, p.value, of.terms)
+        temperature = configuration.columns.get("temperature")
         if temperature is not None:  # all lengths have grown: the flange is as far again from the base
             growth = p.value(EXPANSION) * (temperature - p.value(REFERENCE))
             factors.append(translation(*ca.vertsplit(growth * product(flange)[:3, 3])))
@@ -208,9 +208,9 @@ class Loads(NamedTuple):
         }  # fmt: skip
         return {name: ca.SX.sym(name, size) for name, size in sizes.items() if size}
 
-    def posture(
+    def configuration(
         self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: Stated, point: int = 0
-    ) -> Posture:
+    ) -> Configuration:
         """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
         dof = len(joint_types)
         at = slice(point * dof, (point + 1) * dof)
@@ -222,7 +222,7 @@ class Loads(NamedTuple):
         if self.gravity is not None:
             payload = stated.get("payload", self.gravity.payload)
             weight = Statics(payload, joint_types=joint_types, q=parts["q"], nominal=nominal, gravity=self.gravity)
-        return Posture(parts["q"], torque, parts.get("approach"), weight, self.named(stated))
+        return Configuration(parts["q"], torque, parts.get("approach"), weight, self.named(stated))
 
     def named(self, stated: Stated) -> dict[str, Symbol]:
         """Return the symbols of columns by name."""

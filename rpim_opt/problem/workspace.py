@@ -126,7 +126,7 @@ DAMPING = 1e-9  # square of the slopes [m^2] at which a step is half as long: a 
 THERE = 1e-11  # largest distance [m] of a configuration from its target; one more step then leaves rounding alone
 
 
-def postures_at(
+def configurations_at(
     problem: CalibrationProblem,
     points: Array,
     seed: int | np.random.Generator = 0,
@@ -139,12 +139,12 @@ def postures_at(
     From random configurations, as `random_candidates` draws them, by Newton's steps (`Target`), all the way within the
     joints' limits. Of the problem robot, tools and what the joints bear count. ``points`` are (N, 3) in the robot's
     base frame [m]; ``x`` (n,) deviations of the identified parameters [SI], nominal by default; ``marker`` the tool,
-    that of the data's first row by default. InputError for a point that none of `DRAWS` random postures leads to.
+    that of the data's first row by default. InputError for a point that none of `DRAWS` random configurations leads to.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
-    >>> q = ro.problem.postures_at(problem, np.tile([0.4, 0.1, 0.2], (3, 1)))
+    >>> q = ro.problem.configurations_at(problem, np.tile([0.4, 0.1, 0.2], (3, 1)))
     >>> touching = problem.on(ro.data.touches(q, ["A"] * 3, sigma=1e-4))
     >>> bool(touching.errors(np.zeros(len(problem.parameters.free))).max() < 1e-10)  # the same point
     True
@@ -245,7 +245,7 @@ UPRIGHT = 0.5
 """Least cosine between line of sight and the board's normal: corners of a board that leans more are not found."""
 
 
-def postures_in_sight(
+def visible_configurations(
     problem: CalibrationProblem,
     points: Array,
     count: int,
@@ -263,12 +263,12 @@ def postures_in_sight(
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> points = np.array(list(ro.data.grid_board(7, 5, 0.03).values()))
-    >>> ro.problem.postures_in_sight(ro.load("camera").problem, points, 12).shape
+    >>> ro.problem.visible_configurations(ro.load("camera").problem, points, 12).shape
     (12, 6)
     """
     blocks = camera_blocks(problem.data)
     if not blocks:
-        raise InputError("postures_in_sight", "no row of a camera", "a problem with eye_in_hand or eye_to_hand")
+        raise InputError("visible_configurations", "no row of a camera", "a problem with eye_in_hand or eye_to_hand")
     block = blocks[0]
     p = problem.parameters
     values = p.nominal.copy()
@@ -303,5 +303,5 @@ def postures_in_sight(
             return found[:count]
     found_text = f"{len(found)} of {count} views in which the board is in sight"
     raise InputError(
-        "postures_in_sight", found_text, "frames, a share and an image with which it is visible more often"
+        "visible_configurations", found_text, "frames, a share and an image with which it is visible more often"
     )

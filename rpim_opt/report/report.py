@@ -28,8 +28,8 @@ from rpim_opt.calibration.words import (
     curve_columns,
     noise_sentence,
     rotated,
-    scatter,
-    scatter_rows,
+    touch_errors,
+    touch_rows,
     turned_frames,
     weight_lines,
 )
@@ -182,10 +182,10 @@ def _accuracy(content: Content) -> Iterator[Block]:
     if angles:
         yield "table", Table("Orientation error [mrad]", head, summary.cells(angles, "mrad"))
     for name, data in summary.sets(result).items():
-        touched = scatter(data, result.nominal_errors(data), result.errors(data))
+        touched = touch_errors(data, result.nominal_errors(data), result.errors(data))
         if touched:
             caption = f"{name.capitalize()}, distance of touches from their point [mm]"
-            yield "table", Table(caption, HEADER, scatter_rows(touched))
+            yield "table", Table(caption, HEADER, touch_rows(touched))
     name, data = next(iter(summary.sets(result).items()))
     yield "figures", [_error_figure(result, name, data)]
     if content.map is not None:
@@ -200,8 +200,10 @@ def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
         values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]
         named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
         lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
-    if found.scatter is not None and not found.reasons:
-        lines.append(f"Repeatability alone, with all parameters known: {1e3 * found.scatter:.3f} mm of the maximum U.")
+    if found.repeatability is not None and not found.reasons:
+        lines.append(
+            f"Repeatability alone, with all parameters known: {1e3 * found.repeatability:.3f} mm of the maximum U."
+        )
     return lines
 
 

@@ -62,8 +62,8 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
                 rows += _both_models(result, what, data, dimension, np.array(at))
         if name == "identification" and result.flagged:
             flagged = {flag.label for flag in result.flagged}
-            trusted = result.errors(data)[[label not in flagged for label in data.label]]
-            rows.append(_figures("identification, rows not flagged", trusted))
+            others = result.errors(data)[[label not in flagged for label in data.label]]
+            rows.append(_figures("identification, rows not flagged", others))
     held = result.record.held_out
     if held is not None:
         what = f"held out, from {held.used} rows"

@@ -1,9 +1,9 @@
 from .chain import Described as Described
 from .chain import without_beta as without_beta
 from .extensions import bend_names as bend_names
-from .extensions import families as families
-from .extensions import family_scales as family_scales
+from .extensions import extension_scales as extension_scales
 from .extensions import gravity_torques as gravity_torques
+from .extensions import model_extensions as model_extensions
 from .extensions import moment_slopes as moment_slopes
 from .formats.tables import read_robot as read_robot
 from .formats.tables import write_robodk as write_robodk
@@ -21,9 +21,9 @@ from .mdh import Gravity as Gravity
 from .mdh import Robot as Robot
 from .parameters import Parameters as Parameters
 from .parameters import model_parameters as model_parameters
+from .terms import Configuration as Configuration
 from .terms import Curve as Curve
 from .terms import Joint as Joint
 from .terms import Model as Model
-from .terms import Posture as Posture
 from .terms import Term as Term
 from .terms import transmission as transmission

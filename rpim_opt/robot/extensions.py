@@ -14,13 +14,13 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.robot.kinematics import call_rows, table_symbols, transforms
 from rpim_opt.robot.mdh import MDH, STANDARD, Gravity, Robot
-from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Posture, Symbol, Weight
+from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Configuration, Symbol, Weight
 
 GUESS = ((5.0, None), (10.0, 4))
 """Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
 AXES = "xyz"
 EXPECTED = 1e-4
-"""Expected size of a family's deflection [rad] at the configuration where it is largest."""
+"""Expected size of an extension's deflection [rad] at the configuration where it is largest."""
 DRAWS = 300
 SAME = 1e-2
 """Columns that differ by less, relatively, say the same: far from rounding, and from tilts of some milliradians."""
@@ -64,7 +64,7 @@ class Statics(Weight):
         def value(name: str) -> Symbol:
             return self.nominal(name) if name.rstrip("0123456789") in MDH else 0.0
 
-        return transforms(self.joint_types, Posture(self.q), value)
+        return transforms(self.joint_types, Configuration(self.q), value)
 
     def _axis(self, i: int) -> ca.SX:
         """Return the unit vector about which joint i turns: z before the link's Rot(y, beta)."""
@@ -185,7 +185,7 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
     return tuple(names)
 
 
-def families(robot: Robot) -> dict[str, tuple[str, ...]]:
+def model_extensions(robot: Robot) -> dict[str, tuple[str, ...]]:
     """Return the parameters of all model extensions of a robot, by effect.
 
     Compliances are those of the joints whose torque of gravity changes with the configuration.
@@ -193,7 +193,7 @@ def families(robot: Robot) -> dict[str, tuple[str, ...]]:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> found = ro.robot.families(ro.load("paper_arm").problem.robot)
+    >>> found = ro.robot.model_extensions(ro.load("paper_arm").problem.robot)
     >>> found["gravity"]
     ('compliance2', 'compliance3', 'compliance4', 'compliance5')
     >>> {name: len(names) for name, names in found.items()}
@@ -210,10 +210,10 @@ def families(robot: Robot) -> dict[str, tuple[str, ...]]:
     }
 
 
-def family_scales(robot: Robot, names: Iterable[str]) -> Array:
+def extension_scales(robot: Robot, names: Iterable[str]) -> Array:
     """Return the expected sizes (n,) [SI] of parameters beyond the table: a deflection of 0.1 mrad where it is largest.
 
-    Largest over random joint values, not over measured ones: what a family may do does not depend on the data. One
+    Largest over random joint values, not over measured ones: what an extension may do does not depend on the data. One
     that moves nothing, the compliance of a vertical axis for instance, has the usual size of its kind.
     """
     q = _draws(robot)

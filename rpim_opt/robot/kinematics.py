@@ -18,7 +18,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import SYMBOLS, Place, Posture, Symbol, Term, displacement, motion
+from rpim_opt.robot.terms import SYMBOLS, Configuration, Place, Symbol, Term, displacement, motion
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -125,34 +125,34 @@ def frame_numbers(T: Array) -> Array:
 
 
 def transforms(
-    joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
+    joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> list[ca.SX]:
     """Return the transforms from the robot's base to the frame after every joint; the last is the flange's."""
-    products = [product(factors) for factors in _by_joint(joint_types, posture, value, terms)]
+    products = [product(factors) for factors in _by_joint(joint_types, configuration, value, terms)]
     return list(itertools.accumulate(products, operator.matmul))
 
 
 def chain(
-    joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
+    joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> list[ca.SX]:
     """Return the factors of the transform from the robot's base to its flange; arguments as for `transforms`."""
-    factors = list(itertools.chain.from_iterable(_by_joint(joint_types, posture, value, terms)))
-    return factors + _displaced("tool", len(joint_types), joint_types, posture, value, terms)
+    factors = list(itertools.chain.from_iterable(_by_joint(joint_types, configuration, value, terms)))
+    return factors + _displaced("tool", len(joint_types), joint_types, configuration, value, terms)
 
 
 def _by_joint(
-    joint_types: Sequence[str], posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term]
+    joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term]
 ) -> Iterator[list[ca.SX]]:
     """Yield the factors up to every joint's frame from the one before."""
-    before = _displaced("base", 1, joint_types, posture, value, terms)
+    before = _displaced("base", 1, joint_types, configuration, value, terms)
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
-        moved = motion(joint_types, i, posture, value, terms)
+        moved = motion(joint_types, i, configuration, value, terms)
         if kind == "revolute":
             theta = theta + moved
         else:
             d = d + moved
-        after = _displaced("link", i, joint_types, posture, value, terms)
+        after = _displaced("link", i, joint_types, configuration, value, terms)
         yield [*before, *link(alpha, a, theta, d, beta), *after]
         before = []
 
@@ -161,12 +161,12 @@ def _displaced(
     at: Place,
     i: int,
     joint_types: Sequence[str],
-    posture: Posture,
+    configuration: Configuration,
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> list[ca.SX]:
     """Return the factors by which terms displace a frame; none where none does."""
-    by = displacement(at, joint_types, i, posture, value, terms)
+    by = displacement(at, joint_types, i, configuration, value, terms)
     return [] if by is None else placed((0,) * 6, ca.vertsplit(by))
 
 
@@ -183,7 +183,7 @@ def _flange(joint_types: tuple[str, ...]) -> ca.Function:
     dof = len(joint_types)
     table, value = table_symbols(dof)
     q = ca.SX.sym("q", dof)
-    T = product(chain(joint_types, Posture(ca.vertsplit(q)), lambda name: value.get(name, 0.0)))
+    T = product(chain(joint_types, Configuration(ca.vertsplit(q)), lambda name: value.get(name, 0.0)))
     return ca.Function("flange", [table, q], [T])
 
 

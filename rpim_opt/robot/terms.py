@@ -54,7 +54,7 @@ class Weight:
 
 
 @dataclass(frozen=True, eq=False)
-class Posture:
+class Configuration:
     """State of an arm in one configuration."""
 
     q: Sequence[Symbol]  # of the model [rad or m]
@@ -71,59 +71,59 @@ class Joint:
     Examples
     --------
     >>> import rpim_opt as ro
-    >>> posture = ro.robot.Posture(q=[0.1, 0.5], torque=[3.0, 7.0], approach=[-1, 1], columns={"hours": 8.0})
-    >>> elbow = ro.robot.Joint(2, posture)
+    >>> at = ro.robot.Configuration(q=[0.1, 0.5], torque=[3.0, 7.0], approach=[-1, 1], columns={"hours": 8.0})
+    >>> elbow = ro.robot.Joint(2, at)
     >>> elbow.q, elbow.every_q, elbow.torque, elbow.approach, elbow.gravity, elbow.column("hours")
     (0.5, [0.1, 0.5], 7.0, 1, 0.0, 8.0)
     """
 
     number: int
-    posture: Posture
+    configuration: Configuration
 
     @property
     def q(self) -> Symbol:
         """Joint value of the model [rad or m]."""
-        return self.posture.q[self.number - 1]
+        return self.configuration.q[self.number - 1]
 
     @property
     def every_q(self) -> Sequence[Symbol]:
         """Joint values of all joints [rad or m]."""
-        return self.posture.q
+        return self.configuration.q
 
     @property
     def torque(self) -> Symbol:
         """Measured torque [Nm] where the data have torques, that of gravity elsewhere."""
-        return self.gravity if self.posture.torque is None else self.posture.torque[self.number - 1]
+        return self.gravity if self.configuration.torque is None else self.configuration.torque[self.number - 1]
 
     @property
     def gravity(self) -> Symbol:
         """Torque of gravity about the joint [Nm] on the nominal arm, positive the way it turns the joint."""
-        return self.posture.weight.torque(self.number)
+        return self.configuration.weight.torque(self.number)
 
     @property
     def down(self) -> Symbol:
         """Where gravity points in the frame after the joint, of the nominal arm: a unit vector (3, 1)."""
-        return self.posture.weight.down(self.number)
+        return self.configuration.weight.down(self.number)
 
     @property
     def payload(self) -> Symbol:
         """Mass at the flange [kg]."""
-        return self.posture.weight.payload
+        return self.configuration.weight.payload
 
     @property
     def approach(self) -> Symbol:
         """Direction of the joint's last movement, -1, 0 or +1; 0 where it is not known."""
-        return 0.0 if self.posture.approach is None else self.posture.approach[self.number - 1]
+        return 0.0 if self.configuration.approach is None else self.configuration.approach[self.number - 1]
 
     def moment(self, k: int, axis: str) -> Symbol:
         """Return z_i . (R_k e_a x g_hat), the derivative of the torque by the first moment of link k along ``axis``."""
-        return self.posture.weight.moment(self.number, k, axis)
+        return self.configuration.weight.moment(self.number, k, axis)
 
     def column(self, name: str) -> Symbol:
         """Return a column of the data [SI] by its name, which must be in the term's ``columns``."""
-        if name not in self.posture.columns:
+        if name not in self.configuration.columns:
             raise InputError("term", f"column '{name}'", f"columns={{'{name}': ...}} of the term, with its dimension")
-        return self.posture.columns[name]
+        return self.configuration.columns[name]
 
 
 # Terms
@@ -177,7 +177,7 @@ class Term:
     >>> import casadi as ca
     >>> import rpim_opt as ro
     >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1})
-    >>> third.names(2), float(third.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, ca.pi / 3])), 2e-4))
+    >>> third.names(2), float(third.moves(ro.robot.Joint(2, ro.robot.Configuration(q=[0.0, ca.pi / 3])), 2e-4))
     (('third2',), -0.0002)
     """
 
@@ -316,7 +316,7 @@ def transmission(curve: Curve) -> Term:
     >>> term = ro.robot.transmission(ro.robot.Curve(joint=2, centre=0.0, period=math.pi, harmonics=2))
     >>> term.names(2)[:3]
     ('transmission2_c1', 'transmission2_c2', 'transmission2_c3')
-    >>> float(term.moves(ro.robot.Joint(2, ro.robot.Posture(q=[0.0, 0.1])), 0, 0, 0, 0, 0, 1e-3))  # sin(4 q)
+    >>> float(term.moves(ro.robot.Joint(2, ro.robot.Configuration(q=[0.0, 0.1])), 0, 0, 0, 0, 0, 1e-3))  # sin(4 q)
     0.00038941834...
     """
     keys = [f"transmission{{}}_{wave}{k}_rad" for wave in "cs" for k in range(1, curve.waves + curve.harmonics + 1)]
@@ -415,11 +415,11 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             if isinstance(term.made_of, Curve):
                 continue  # of its own joint's angle, and long to write down
             seen = {name: columns[name] for name in term.columns}
-            posture = Posture(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), gravity, seen)
+            configuration = Configuration(ca.vertsplit(q), ca.vertsplit(torque), ca.vertsplit(approach), gravity, seen)
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    more = moved(term, Joint(i, posture), ca.SX.sym)
+                    more = moved(term, Joint(i, configuration), ca.SX.sym)
                     if more is not None:
                         moves = ca.vertcat(moves, more)
         return Dependencies(
@@ -456,26 +456,30 @@ def terms_of(dof: int) -> tuple[Term, ...]:
 
 
 def motion(
-    joint_types: Sequence[str], i: int, posture: Posture, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
+    joint_types: Sequence[str],
+    i: int,
+    configuration: Configuration,
+    value: Callable[[str], Symbol],
+    terms: Sequence[Term] = (),
 ) -> Symbol:
     """Return the joint value of joint i with all its terms, q + ratio q + ecc_cos cos q + ... [rad or m].
 
     ``value("ratio2")`` gives the parameters; ``terms`` are added besides those of every arm.
     """
-    more = displacement("joint", joint_types, i, posture, value, (*terms_of(len(posture.q)), *terms))
-    return posture.q[i - 1] if more is None else posture.q[i - 1] + more
+    more = displacement("joint", joint_types, i, configuration, value, (*terms_of(len(configuration.q)), *terms))
+    return configuration.q[i - 1] if more is None else configuration.q[i - 1] + more
 
 
 def displacement(
     at: Place,
     joint_types: Sequence[str],
     i: int,
-    posture: Posture,
+    configuration: Configuration,
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> ca.SX | None:
     """Return the sum of the motions of all terms of joint or link i; None without any."""
     own = [term for term in terms if term.at == at and i in term.places(joint_types)]
-    parts = [moved(term, Joint(i, posture), value) for term in own]
+    parts = [moved(term, Joint(i, configuration), value) for term in own]
     parts = [part for part in parts if part is not None]
     return sum(parts[1:], parts[0]) if parts else None

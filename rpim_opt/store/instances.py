@@ -44,7 +44,7 @@ from rpim_opt.store.problem_file import (
     named_formulation,
     named_weight,
     read_problem,
-    stated_scatter,
+    stated_repeatability,
 )
 from rpim_opt.store.statements import place_fixtures, stated_details, stated_prior, stated_requirement
 
@@ -157,7 +157,7 @@ def load(
         fixtures = place_fixtures(stated.placed, rows)
         parameters = starting_parameters(stated.robot, rows, stated.base, tools, fixtures, temperature)
         problem = CalibrationProblem(stated.robot, stated.chosen(parameters, rows), rows)
-        problem = problem.scattered(stated_scatter(table, path))
+        problem = problem.with_repeatability(stated_repeatability(table, path))
         if validation is not None:
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(stated, problem)
@@ -198,7 +198,7 @@ def load(
         weight=named_weight(table.selector, path),
         prior=prior,
         model=table.model,
-        noise=table.scatter if isinstance(table.scatter, str) else "declared",
+        noise=table.repeatability if isinstance(table.repeatability, str) else "declared",
         record=record,
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()},

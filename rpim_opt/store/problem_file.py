@@ -20,7 +20,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import Board, grid_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.noise import Scatter
+from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import identifiable
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -101,7 +101,7 @@ class FrameTable(Table):
     rz: Angle = 0.0
 
 
-class ScatterTable(Table):
+class RepeatabilityTable(Table):
     """Known repeatability of the robot."""
 
     position: Length = Field(default=0.0, ge=0)
@@ -203,7 +203,7 @@ class ProblemTable(Table):
     """learned (prior scales), the name of a selection rule, or a number."""
     model: Model = "geometry"
     """auto: model extensions by evidence; geometry: none."""
-    scatter: str | dict[str, Any] = "robot"
+    repeatability: str | dict[str, Any] = "robot"
     """Variance components to estimate (robot, free, level, declared), or the repeatability."""
     noise: dict[str, Any] = Field(default_factory=dict)
     """Measurement noise of rows that state none."""
@@ -372,15 +372,15 @@ def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]
     return merged
 
 
-def stated_scatter(table: ProblemTable, path: Path) -> Scatter | None:
+def stated_repeatability(table: ProblemTable, path: Path) -> Repeatability | None:
     """Return the stated repeatability, or None."""
-    if isinstance(table.scatter, str):
-        if table.scatter not in LEARNED_NOISE:
-            accepted = choices(table.scatter, LEARNED_NOISE) + ", or a table"
-            raise InputError("key scatter", f"'{table.scatter}'", accepted, path)
+    if isinstance(table.repeatability, str):
+        if table.repeatability not in LEARNED_NOISE:
+            accepted = choices(table.repeatability, LEARNED_NOISE) + ", or a table"
+            raise InputError("key repeatability", f"'{table.repeatability}'", accepted, path)
         return None
-    found = part(ScatterTable, table.scatter, "key scatter", path)
-    return Scatter(found.position, found.orientation, found.joint)
+    found = part(RepeatabilityTable, table.repeatability, "key repeatability", path)
+    return Repeatability(found.position, found.orientation, found.joint)
 
 
 def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:

@@ -25,14 +25,14 @@ from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, lost
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.quadratic import Quadratic
+from rpim_opt.convex.robust_loss import kept_equations
 from rpim_opt.convex.rules.selection import Selection, Selector
 from rpim_opt.convex.select import SELECTORS
-from rpim_opt.convex.trust import kept_equations
 from rpim_opt.data.dataset import Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import READY
 from rpim_opt.data.record import Record
-from rpim_opt.problem.noise import Scatter
+from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import CalibrationProblem, around
 from rpim_opt.problem.registration.global_start import JointMapping
 from rpim_opt.robot.chain import Carried, carried_by, displaced
@@ -173,7 +173,7 @@ class OwnTerm(NamedTuple):
         return f"a term of the {self.at} ({', '.join([*self.parameters, *columns]) or 'without parameters'})"
 
 
-class Trust(NamedTuple):
+class StoredInliers(NamedTuple):
     """Equations that a script's loss kept, and their factor."""
 
     factor: float
@@ -219,7 +219,7 @@ class Stored:
     """Deviations of the identified parameters [SI]."""
     certificate: Certificate
     """Optimality gap and violation."""
-    trust: Trust | None
+    inliers: StoredInliers | None
     """Equations that a script's loss downweighted or left out."""
     active_bounds: tuple[ActiveBound, ...]
     """Parameters at an active bound."""
@@ -237,7 +237,7 @@ class Stored:
     """All parameters: nominal, prior scale, tolerance, identified."""
     data: dict[str, Dataset]
     """Identification and validation data."""
-    scatter: Scatter | None
+    repeatability: Repeatability | None
     """Repeatability of the robot."""
     learned: Learned | None
     """Estimated prior scales and noise with their evidence."""
@@ -266,7 +266,7 @@ def content(result: Calibration) -> dict[str, Any]:
         definition=stated,
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
         x=result.x,
-        trust=None if solvable else _trust(result),
+        inliers=None if solvable else _inliers(result),
         active_bounds=result.active_bounds,
         shadow_prices=result.shadow_prices,
         robots=dict(result.problem.arms),
@@ -275,7 +275,7 @@ def content(result: Calibration) -> dict[str, Any]:
         origins={name: carried_by(robot.model.terms) for name, robot in result.problem.arms.items()},
         model=result.problem.parameters,
         data=_sets(result),
-        scatter=result.problem.scatter,
+        repeatability=result.problem.repeatability,
         record=result.record,
         causes=result.causes,
         rows=_rows(result),
@@ -355,20 +355,20 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
     return terms
 
 
-def _trust(result: Calibration) -> Trust | None:
+def _inliers(result: Calibration) -> StoredInliers | None:
     """Return the equations that a script's loss kept; a ready loss recomputes them."""
     if result.kept is not None:  # an earlier file said it
         if result.kept.linear is None:
             return None
-        return Trust(float(np.sqrt(result.kept.factor)), list(result.kept.left_out))
+        return StoredInliers(float(np.sqrt(result.kept.factor)), list(result.kept.left_out))
     try:
-        trust = result.program.trust(result.z)
+        inliers = result.program.inliers(result.z)
     except InputError:  # a loss that no squared one stands for
         return None
-    if trust is None:
+    if inliers is None:
         return None
-    left_out = np.flatnonzero(~trust.keeps(result.program.model, result.z))
-    return Trust(float(np.sqrt(trust.factor)), left_out.tolist())
+    left_out = np.flatnonzero(~inliers.keeps(result.program.model, result.z))
+    return StoredInliers(float(np.sqrt(inliers.factor)), left_out.tolist())
 
 
 # --- formulations by the names of ready functions ----------------------------------------------------------------
@@ -430,7 +430,9 @@ def _function(stated: Any, name: str) -> Any:
 def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models) -> Calibration:
     robots = {name: _robot(name, file, models) for name in file.robots}
     data = {name: _with_measurements(part, known, f"key data.{name}") for name, part in file.data.items()}
-    problem = CalibrationProblem(robots.get("", robots), file.model, data["identification"], scatter=file.scatter)
+    problem = CalibrationProblem(
+        robots.get("", robots), file.model, data["identification"], repeatability=file.repeatability
+    )
     validation = data.get("validation")
     if validation is not None:
         problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
@@ -495,10 +497,10 @@ def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: s
 
 def _kept(file: Stored, program: Program) -> Kept:
     """Return the values of a script's functions as they were saved; they cannot be called again."""
-    if file.trust is None:
+    if file.inliers is None:
         return Kept(file.active_bounds, None, shadow_prices=file.shadow_prices)
     keep = np.ones(len(program.model.b), dtype=bool)
-    keep[file.trust.left_out] = False
-    factor = file.trust.factor**2
+    keep[file.inliers.left_out] = False
+    factor = file.inliers.factor**2
     equations = kept_equations(program.model, keep, factor)
-    return Kept(file.active_bounds, equations, factor, tuple(file.trust.left_out), file.shadow_prices)
+    return Kept(file.active_bounds, equations, factor, tuple(file.inliers.left_out), file.shadow_prices)

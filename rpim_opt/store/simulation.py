@@ -24,7 +24,7 @@ from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.workspace import Target, postures_at, postures_in_sight
+from rpim_opt.problem.workspace import Target, configurations_at, visible_configurations
 from rpim_opt.robot.parameters import Parameters, model_parameters
 from rpim_opt.store.problem_file import Observation, ProblemFile, read_problem
 from rpim_opt.store.statements import place_fixtures
@@ -309,7 +309,7 @@ class _Table:
         world = CalibrationProblem(stated.robot, self.parameters, one)
         width, height = plan.image_px
         points = np.array(list(board.values()))
-        q = postures_in_sight(world, points, count, self.rng, self.x, plan.joint_share, (width, height))
+        q = visible_configurations(world, points, count, self.rng, self.x, plan.joint_share, (width, height))
         table: Columns = {"label": [f"v{k}/{name}" for k in range(count) for name in names], "point": names * count}
         table |= self._joints(np.repeat(q, len(names), axis=0)[:, None], CAMERA_DIGITS)
         empty = {name: ["0"] * len(table["label"]) for name in ("u_px", "v_px")}
@@ -336,7 +336,7 @@ class _Table:
         for k, marker in enumerate(markers):
             mine = turn == k
             share = self.plan.joint_share
-            q[mine] = postures_at(problem, targets[mine], self.rng, self.x, share, marker)
+            q[mine] = configurations_at(problem, targets[mine], self.rng, self.x, share, marker)
         return table | self._joints(q[:, None], EXACT_DIGITS)
 
     def _things(self) -> tuple[str, dict[str, Array]]:

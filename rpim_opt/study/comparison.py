@@ -55,7 +55,7 @@ def compare(
     ----------
     problems
         A folder, a name that comes with the package, ``ro.load(...)``, a problem, a pair of a problem and validation
-        data, a folder of problem folders, a family (a function of a seed that returns one of these, or a
+        data, a folder of problem folders, a generator (a function of a seed that returns one of these, or a
         `SimulatedArm`); or several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``.
     formulations
         Ready ones by name, objects, ``"folder"`` for the folder's own; one or several, or by names of your own.
@@ -74,7 +74,7 @@ def compare(
     noise
         Factors, 1 or more, on the noise of the data to fit: the missing part is added, and declared.
     seeds
-        How many, or which: of families, of splits, of draws and of noise. What no seed changes is there once.
+        How many, or which: of generated problems, of splits, of draws and of noise. What no seed changes is there once.
     metrics
         Of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``, ``"fit_rms_mm"``
         (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or functions of a
@@ -164,8 +164,8 @@ def compare(
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
     }
     asked = {name: ", ".join(values) for name, values in axes.items() if values}
-    families = frozenset(label for label, source in sources.items() if source.drawn)
-    return Comparison(tuple(rows), tuple(figured), families, asked, made)
+    generated = frozenset(label for label, source in sources.items() if source.drawn)
+    return Comparison(tuple(rows), tuple(figured), generated, asked, made)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:

@@ -177,8 +177,8 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
 
     Replicates of one problem have the problem in common. The mean is over problems, of each one's mean; and with five
     problems or more it is they that are drawn anew (cluster bootstrap), so that the interval speaks of other problems
-    like these. With fewer, what is independent within each is: the arms of a family, the seeds or else the folds of a
-    measured one; then it speaks of other such arms, seeds or folds. Percentiles are those of Hesterberg (2015, The
+    like these. With fewer, what is independent within each is: the arms of a generator, the seeds or else the folds of
+    a measured one; then it speaks of other such arms, seeds or folds. Percentiles are those of Hesterberg (2015, The
     American Statistician 69), wider for few.
     """
     if not ratios:
@@ -217,8 +217,12 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         problems = {row["problem"] for row in rows}
         scope = f"other problems like these {len(problems)}"
         if len(problems) < ENOUGH:
-            of_family = problems <= drawn
-            scope = "other arms of the same family" if of_family else "these problems alone, with other seeds or folds"
+            of_generator = problems <= drawn
+            scope = (
+                "other arms of the same generator"
+                if of_generator
+                else "these problems alone, with other seeds or folds"
+            )
         text = f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1."
         if compared > 1:
             chance = (1 - CONFIDENCE) * compared

@@ -17,7 +17,7 @@ from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import joint_columns
-from rpim_opt.calibration.covariance import position_noise, scattered
+from rpim_opt.calibration.covariance import noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
@@ -407,10 +407,10 @@ class _Cell(NamedTuple):
             stated, found = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
             moved = np.linalg.inv(stated) @ found
         measured = result.problem.sample().alone(which) if which else result.problem
-        scatter = measured.scatter
-        if scatter is not None and tooled.stated:
-            scatter = replace(scatter, at=values)
-        problem = CalibrationProblem(robot, p, measured.data, scatter=scatter)
+        repeatability = measured.repeatability
+        if repeatability is not None and tooled.stated:
+            repeatability = replace(repeatability, at=values)
+        problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability)
         require_same_torques(robot, p, measured_torques(problem.data), torques)
         loads = loads_on(robot, p, problem.data, torques)
         prefix = tool_prefix(tooled.marker)
@@ -472,7 +472,7 @@ class _Cell(NamedTuple):
         known = np.isfinite(np.diag(self.covariance))
         C = np.where(np.outer(known, known), self.covariance, 0.0)
         variance = np.sum((J @ C) * J, axis=1).reshape(len(q), 3).sum(axis=1)
-        variance += np.trace(scattered(problem, self.level).robot[0], axis1=1, axis2=2)
+        variance += np.trace(noise_covariances(problem, self.level).robot[0], axis1=1, axis2=2)
         unknown = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
         return np.where(unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
 

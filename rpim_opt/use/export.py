@@ -183,7 +183,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
     said = (
-        f"Files hold no {joined(result.learned.families)}: written is the geometry that the same measurements give "
+        f"Files hold no {joined(result.learned.extensions)}: written is the geometry that the same measurements give "
         f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
     )
     return alone, [said]

@@ -49,10 +49,10 @@ class Arm(NamedTuple):
         def value(name: str) -> float:
             return values.get(name, 0.0)
 
-        posture = loads.posture(robot.joint_types, nominal.__getitem__, command)
+        configuration = loads.configuration(robot.joint_types, nominal.__getitem__, command)
         terms = robot.model.terms
-        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, posture, value, terms)]
-        flange = chain(robot.joint_types, posture, value, terms)
+        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, configuration, value, terms)]
+        flange = chain(robot.joint_types, configuration, value, terms)
         T = product([ca.SX(ca.DM(before)), *flange, *placed([value(tool + c) for c in FRAME])])
         joints = list(enumerate(robot.joint_types, start=1))
         twists = []  # how point and orientation of T move with a joint
@@ -63,7 +63,7 @@ class Arm(NamedTuple):
             )  # z before Rot(y, beta), through the origin
             turn = ca.vertcat(ca.cross(axis, T[:3, 3] - link[:3, 3]), axis)
             twists.append(ca.vertcat(axis, 0, 0, 0) if moves == "prismatic" else turn)
-        moved = ca.vertcat(*(motion(robot.joint_types, i, posture, value, terms) for i, _ in joints))
+        moved = ca.vertcat(*(motion(robot.joint_types, i, configuration, value, terms) for i, _ in joints))
         # gravity bends a joint by the values of all of them
         J = (ca.horzcat(*twists) @ ca.jacobian(moved, command["q"]))[: len(kind.components), :]
         modelled = kind.model(T)

@@ -15,7 +15,7 @@ from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.causes import misread
-from rpim_opt.calibration.covariance import scattered
+from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.convex.quadratic import Quadratic, identity
@@ -236,7 +236,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     C[n:, n:] = np.diag(own**2)
     m = np.zeros(len(C))
     residual, slopes = problem.slopes(previous_deviations(result, problem))
-    readings = scattered(problem, result.variance_factor).reading
+    readings = noise_covariances(problem, result.variance_factor).reading
     rows: dict[int, tuple[Array, Array]] = {}
     for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
         for row, equations, of_row in zip(block.row, part, np.broadcast_to(V, (len(part), *V.shape[1:])), strict=True):

@@ -16,7 +16,7 @@ from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import REACH, arm_length, worse_sentence, worse_than_nominal
-from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, scatter, scatter_rows
+from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import shared_rows
 
@@ -106,7 +106,7 @@ class Validation:
             rows.append([name, str(of["count"]), *(f"{of[f'{key}_{unit}']:.4f}" for key in ("mean", "rms", "max"))])
         tables = [table(["error [mm]", "rows", "mean", "RMS", "max"], rows)]
         if self.touched:
-            tables.append(table(HEADER, scatter_rows(self.touched)))
+            tables.append(table(HEADER, touch_rows(self.touched)))
         worse = [worse_sentence(self.nominal, self.error)] if self.worse else []
         largest = ""
         if np.isfinite(self.error).any():
@@ -144,7 +144,7 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     problem = result.problem.sample()
     nominal = result.nominal_errors(data)
     error = result.errors(data)
-    touched = scatter(data, nominal, error)
+    touched = touch_errors(data, nominal, error)
     remarks = list(shared_rows(problem.data, data))
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")

@@ -21,8 +21,8 @@ FILES = {
 """File, the class that reads or writes it, and what it is."""
 
 MEMBERS = {
-    "CalibrationProblem": "identify, on, without, measuring, with_parameters, with_model, scattered, residual, errors, "
-    "jacobian, linearize, modelled, robot",
+    "CalibrationProblem": "identify, on, without, measuring, with_parameters, with_model, with_repeatability, "
+    "residual, errors, jacobian, linearize, modelled, robot",
 }
 """Members of large classes that a user calls; the others serve the loop."""
 ATTRIBUTES = (("calibration", "Calibration"), ("calibration", "Prediction"), ("calibration", "Uncertainty"),

@@ -49,11 +49,11 @@ def linearized(seed: int, configurations: int, p: int, k: int = 6) -> Linearized
 
 def dense(evidence: Evidence, logs: Array) -> tuple[Array, Array]:
     """Return the covariance (m, m) of the data apart from the deviations, and the data in its order."""
-    scatter = evidence.scatter(logs)
+    repeatability = evidence.repeatability(logs)
     m = len(evidence.data.y)
     R = np.zeros((m, m))
     for stack in evidence.data.stacks:
-        for index, block in zip(stack.index, stack.covariance(scatter), strict=True):
+        for index, block in zip(stack.index, stack.covariance(repeatability), strict=True):
             R[np.ix_(index, index)] = block
     return R, evidence.data.y
 
@@ -232,14 +232,14 @@ def test_a_blunder_does_not_widen_local_variances_beyond_what_rounding_leaves() 
     assert (X @ point.z)[:5] == pytest.approx(y[:5], rel=1e-3)
 
 
-def test_statements_are_measurements_without_scatter() -> None:
+def test_statements_are_measurements_without_repeatability() -> None:
     data = linearized(6, 5, 3)
     rows = np.array([[1.0, -1.0, 0.0], [0.0, 3.0, 1.0]])
     values = np.array([0.4, -0.2])
     plain = hierarchy([0, 0, 0], [False] * 3, ("a",))
     stated = Evidence(data, replace(plain, rows=rows, values=values), ("position",))
     stack = data.stacks[0]
-    # the same as two more configurations, each of one equation of unit noise that no scatter reaches
+    # the same as two more configurations, each of one equation of unit noise that no repeatability reaches
     one = np.zeros((2, 1), dtype=bool)
     more = Stack(np.array([[30], [31]]), np.ones((2, 1, 1)), one, one, np.zeros((2, 1, 2)))
     longer = Linearized(np.vstack([data.X, rows]), np.concatenate([data.y, values]), [stack, more])
@@ -320,7 +320,7 @@ def test_a_gibbs_sampler_agrees() -> None:
     y = few.residual(result.x) + result.problem.jacobian(result.x) @ result.x
     R = np.zeros((len(y), len(y)))
     for stack in result.problem.stacks(False):
-        for index, block in zip(stack.index, stack.covariance(result.problem.scatter), strict=True):
+        for index, block in zip(stack.index, stack.covariance(result.problem.repeatability), strict=True):
             R[np.ix_(index, index)] = block
     sizes = np.append([size.value for size in result.learned.sizes.values()], 1.0)
     size = sizes[stated.group]

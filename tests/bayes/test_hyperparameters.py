@@ -16,15 +16,15 @@ POSITION = ro.load("position").problem
 
 
 def measured(
-    problem: ro.CalibrationProblem, x: Array, seed: int, scatter: float = 0.0, joint: float = 0.0
+    problem: ro.CalibrationProblem, x: Array, seed: int, repeatability: float = 0.0, joint: float = 0.0
 ) -> ro.CalibrationProblem:
-    """Return the problem with positions of a robot that deviates by x, instrument noise and a scatter of its own."""
+    """Return the problem with positions of a robot that deviates by x, instrument noise and its own repeatability."""
     rng = np.random.default_rng(seed)
     blocks = []
     T = problem.joint_slopes()
     for block, y in zip(problem.data.blocks, problem.modelled(x), strict=True):
         e = np.einsum("nij,nj->ni", np.linalg.cholesky(block.covariance), rng.normal(size=y.shape))
-        e = e + scatter * rng.normal(size=y.shape)
+        e = e + repeatability * rng.normal(size=y.shape)
         angles = joint * rng.normal(size=(len(y), T.shape[1]))
         e += np.einsum("nij,nj->ni", T.reshape(*y.shape, -1), angles)
         blocks.append(replace(block, y=y + e))
@@ -78,7 +78,7 @@ def test_what_was_stated_comes_back() -> None:
     stated = result.stated
     assert np.array_equal(stated.parameters.scale, POSITION.parameters.scale)
     assert np.array_equal(stated.parameters.identified, POSITION.parameters.identified)
-    assert stated.scatter is None
+    assert stated.repeatability is None
 
 
 def test_refitting_learns_anew_from_the_stated_scales() -> None:
@@ -114,7 +114,7 @@ def test_sizes_come_out_as_they_were_put_in() -> None:
     logs = []
     base = []
     for seed in range(6):
-        result = ro.calibrate(measured(POSITION, drawn(seed), seed, scatter=8e-5))
+        result = ro.calibrate(measured(POSITION, drawn(seed), seed, repeatability=8e-5))
         learned = result.learned
         assert learned is not None
         sizes = [learned.sizes[name].value / 0.5 for name in ("angles", "lengths", "joint offsets")]
@@ -126,7 +126,7 @@ def test_sizes_come_out_as_they_were_put_in() -> None:
     assert np.exp(np.mean(np.log(base))) == pytest.approx(1.3 / 20, rel=0.2)
 
 
-def test_scatter_of_joints_is_told_from_that_of_positions() -> None:
+def test_repeatability_of_joints_is_told_from_that_of_positions() -> None:
     wide = [measured(POSITION, drawn(seed), seed, joint=2e-4) for seed in range(2)]
     for problem in wide:
         learned = ro.calibrate(problem, model="auto").learned
@@ -156,7 +156,7 @@ def test_scales_declared_wrong_by_10_hardly_matter(factor: float) -> None:
 
 
 @pytest.mark.parametrize("factor", [0.1, 10.0])
-def test_deviations_are_not_taken_for_scatter_because_lengths_and_angles_differ(factor: float) -> None:
+def test_deviations_are_not_taken_for_repeatability_because_lengths_and_angles_differ(factor: float) -> None:
     """Seven axes, ten configurations: with one size for both all of it was noise, 18 times worse than least squares."""
     arm = ro.study.simulated_arm(seed=1004, count=10, offset=np.radians(1.0 * ((1004 // 3) % 2)))
     p = arm.problem.parameters
@@ -255,7 +255,7 @@ def test_many_configurations_are_sampled() -> None:
     assert len(sampled(POSITION).data) == len(POSITION.data)
 
 
-# --- families ----------------------------------------------------------------------------------------------------
+# --- extensions ----------------------------------------------------------------------------------------------------
 
 
 def bent(seed: int, size: float) -> ro.CalibrationProblem:
@@ -276,11 +276,11 @@ def test_gravity_is_found_where_it_bends_and_nowhere_else() -> None:
         light = ro.calibrate(bent(seed, 0.0), model="auto")
         assert heavy.learned is not None
         assert light.learned is not None
-        assert "gravity" in heavy.learned.families
+        assert "gravity" in heavy.learned.extensions
         gain = heavy.learned.gain("gravity")
         assert gain is not None
         assert gain > 20
-        assert light.learned.families == ()
+        assert light.learned.extensions == ()
         assert "geometry with gravity" in heavy.weight_sentence()
         assert "geometry alone" in light.weight_sentence()
         plain = ro.calibrate(bent(seed, 8e-6))
@@ -289,10 +289,10 @@ def test_gravity_is_found_where_it_bends_and_nowhere_else() -> None:
         assert heavy.errors().mean() < 0.7 * plain.errors().mean()
 
 
-def test_a_weight_takes_the_families_alone() -> None:
+def test_a_weight_takes_the_extensions_alone() -> None:
     result = ro.calibrate(bent(0, 8e-6), ro.tikhonov, "reml", model="auto")
     assert result.learned is None
-    assert result.problem.scatter is None
+    assert result.problem.repeatability is None
     assert any(name.startswith("compliance") for name in result.problem.parameters.free.names)
     geometry = ~np.isin(result.problem.parameters.names, ["compliance2", "compliance3", "compliance4", "compliance5"])
     assert np.array_equal(result.problem.parameters.scale[geometry], POSITION.parameters.scale[geometry])
@@ -368,7 +368,7 @@ def test_a_suspect_that_the_model_explains_comes_back() -> None:
     result = ro.calibrate(POSITION)
     labels = {POSITION.data.label[0]: 7.0, POSITION.data.label[1]: 8.0}
     wrong = spoiled(POSITION, [1], 3e-3)
-    kept = unexplained(wrong.scattered(result.problem.scatter), result.x, result.covariance, labels)
+    kept = unexplained(wrong.with_repeatability(result.problem.repeatability), result.x, result.covariance, labels)
     assert kept == {POSITION.data.label[1]: 8.0}
 
 
@@ -411,9 +411,9 @@ def test_sizes_agree_with_the_deviations_that_they_lead_to() -> None:
     assert np.linalg.eigvalsh(fit.covariance / np.outer(*2 * [fit.laid.parameters.free.scale])).min() > 0
 
 
-def test_a_reading_scatters_as_surely_as_its_noise_is_known() -> None:
+def test_a_reading_repeatability_as_surely_as_its_noise_is_known() -> None:
     """V = tr(X C X' + R) goes with the square of the noise, but for what the prior holds: var(ln V) = 4 var(ln s)."""
-    problem = measured(POSITION, drawn(3), 3, scatter=3e-4)
+    problem = measured(POSITION, drawn(3), 3, repeatability=3e-4)
     learned = ro.calibrate(problem).learned
     assert learned is not None
     names = list(learned.sizes)

@@ -1,8 +1,8 @@
 """What a fleet's prior brings to the next arm of its type, and that it does no harm to an arm of another kind.
 
 Simulated: arms of `position` with lengths and angles off by their scales, of whose mean square deviation 80 % is what
-all have in common; positions scatter by 0.1 mm, where 0.03 are declared; the fleet is six arms of 25 configurations.
-Errors are those of the model without noise at 200 other configurations.
+all have in common; positions repeat to 0.1 mm, where 0.03 are declared; the population is six arms of 25
+configurations. Errors are those of the model without noise at 200 other configurations.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ pytestmark = pytest.mark.slow
 POSITION = ro.load("position").problem
 FREE = POSITION.parameters.free
 STATED = ro.bayes.Prior().stated(POSITION.parameters)
-DECLARED, SCATTER = 3e-5, 1e-4
+DECLARED, REPEATABILITY = 3e-5, 1e-4
 SHARED, FRAMES = 0.8, 0.02
 FLEETS, ARMS, NEXT = 8, 6, 2
 OTHERS = {"alike": True, "of another kind": False}
@@ -58,14 +58,14 @@ def ratios(seed: int) -> dict[tuple[str, int], list[float]]:
         return own * unit
 
     fleet = ro.bayes.Prior.from_population(
-        [ro.calibrate(measured(arm(True), 25, SCATTER, (seed, k))) for k in range(ARMS)]
+        [ro.calibrate(measured(arm(True), 25, REPEATABILITY, (seed, k))) for k in range(ARMS)]
     )
     for kind, alike in OTHERS.items():
         for k in range(NEXT):
             truth = arm(alike)
             validation = measured(truth, 200, 0.0, (seed, k, 2))
             for count in (6, 10):
-                problem = measured(truth, count, SCATTER, (seed, k, count))
+                problem = measured(truth, count, REPEATABILITY, (seed, k, count))
                 plain, told = (ro.calibrate(problem, prior=prior).x for prior in (None, fleet))
                 found.setdefault((kind, count), []).append(error(validation, plain) / error(validation, told))
     return found

@@ -92,7 +92,7 @@ def geometric(problem: ro.CalibrationProblem) -> ro.Calibration:
 def test_the_evidence_takes_sessions_and_says_how_they_differ(automatic: ro.Calibration) -> None:
     learned = automatic.learned
     assert learned is not None
-    assert learned.families == ("sessions",)
+    assert learned.extensions == ("sessions",)
     assert learned.gain("sessions") > 100
     for kind, true in (("shifts", SHIFT), ("turns", TURN)):  # twelve draws each
         size = learned.sizes[f"sessions' {kind}"]
@@ -124,7 +124,7 @@ def test_sessions_that_do_not_differ_are_not_taken_and_do_no_harm() -> None:
     same = in_sessions(SEED, DAYS, size=0.0)
     learned = ro.calibrate(same, model="auto").learned
     assert learned is not None
-    assert "sessions" not in learned.families
+    assert "sessions" not in learned.extensions
     seen = ro.study.simulated_arm(SEED, len(DAYS))
     explicit = ro.calibrate(with_sessions(same))
     assert off(explicit, seen) < 1.02 * off(ro.calibrate(same), seen)
@@ -137,7 +137,7 @@ def test_sessions_that_do_not_differ_are_rarely_taken() -> None:
     for seed in range(300, 340):
         learned = ro.calibrate(in_sessions(seed, DAYS, size=0.0), model="auto").learned
         assert learned is not None
-        taken.append("sessions" in learned.families)
+        taken.append("sessions" in learned.extensions)
     assert sum(taken) <= 1
 
 
@@ -158,7 +158,7 @@ def test_one_session_and_sessions_of_one_configuration_are_harmless(names: list[
     problem = in_sessions(SEED, names)
     learned = ro.calibrate(problem, model="auto").learned
     assert learned is not None
-    assert "sessions" not in learned.families
+    assert "sessions" not in learned.extensions
     explicit = ro.calibrate(with_sessions(problem))
     assert explicit.converged
     assert np.isfinite(explicit.x).all()

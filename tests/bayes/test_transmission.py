@@ -54,7 +54,7 @@ def rms(errors):
 
 def test_ripple_is_found_and_predicts_other_rows(rippled):
     result, others = rippled
-    assert result.learned.families[-1] == "transmission error"
+    assert result.learned.extensions[-1] == "transmission error"
     assert (
         0.3 * SIZE < result.learned.curves.size.value < 3 * SIZE
     )  # of a sine whose RMS is 0.58 of that over all joints
@@ -95,7 +95,7 @@ def test_a_curve_stays_at_its_ends_beyond_its_period() -> None:
     np.testing.assert_allclose(columns[5, [0, 1, 2, 6]], [*np.cos([5, 10, 15]), np.sin(5)])
     symbolic = transmission(curve).moves
     for at, row in zip(q[:, 0], columns, strict=True):
-        joint = ro.robot.Joint(1, ro.robot.Posture(q=[at]))
+        joint = ro.robot.Joint(1, ro.robot.Configuration(q=[at]))
         np.testing.assert_allclose([float(symbolic(joint, *unit)) for unit in np.eye(12)], row, atol=1e-12)
 
 
@@ -168,7 +168,7 @@ def test_commands_are_corrected_for_curves(rippled):
 
 def test_an_arm_without_ripple_gets_no_curves():
     problem, _ = measured(0.0, 60, seed=1)
-    assert "transmission error" not in ro.calibrate(problem, model="auto").learned.families
+    assert "transmission error" not in ro.calibrate(problem, model="auto").learned.extensions
 
 
 def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
@@ -193,4 +193,4 @@ def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
 def test_curves_stand_beside_any_noise(noise):
     problem, _ = measured(SIZE, configurations=80)
     result = ro.calibrate(problem, noise=noise, model="auto")
-    assert "transmission error" in result.learned.families
+    assert "transmission error" in result.learned.extensions

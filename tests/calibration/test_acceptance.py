@@ -71,7 +71,7 @@ def test_the_bound_holds_at_true_positions_as_often_as_it_says() -> None:
         there = problem.on(ro.Dataset.of(q, np.zeros((len(q), 3)), 1.0))
         miss = np.linalg.norm(there.modelled(truth)[0] - found.forward(q)[:, :3, 3], axis=1)
         kept.append(np.mean(miss <= reaching(found, region, q, 0.95)[1]))
-    # the simulated robot does not scatter, and some scatter is always allowed for
+    # the simulated robot repeats exactly, and some repeatability is always allowed for
     assert np.mean(kept) > 0.95
     assert min(kept) > 0.8
 
@@ -128,12 +128,12 @@ def test_the_three_verdicts(result) -> None:
     assert "repeatability" in few.reasons[0]
 
 
-def test_a_scatter_that_is_known_rejects_what_no_calibration_can_keep() -> None:
+def test_a_repeatability_that_is_known_rejects_what_no_calibration_can_keep() -> None:
     problem, _ = simulated(noise=5e-4)  # ten times what the instrument has
     found = accept(ro.calibrate(problem), Requirement(2e-4))
     assert found.verdict == "rejected"
     assert "the robot's repeatability alone contributes" in found.reasons[0]
-    assert found.scatter > 2e-4
+    assert found.repeatability > 2e-4
 
 
 def test_the_mean_of_the_errors_does_not_decide(result) -> None:

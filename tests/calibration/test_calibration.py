@@ -114,7 +114,7 @@ def test_the_bounds_hold_and_some_are_active() -> None:
 
 
 def test_weights_of_the_data_act() -> None:
-    """A row trusted a thousand times less hardly moves the answer when it is wrong."""
+    """A row of a thousand times smaller weight hardly moves the answer when it is wrong."""
     problem, _ = simulated(noise=5e-5)
     data = problem.data
     y, covariance = data.blocks[0].y.copy(), np.tile(data.blocks[0].covariance, (len(data), 1, 1))

@@ -91,7 +91,7 @@ def test_the_sentence_is_in_the_output(tmp_path: Path) -> None:
 
 def boards_in_two_places(shared: list[str]) -> ro.CalibrationProblem:
     """Return the same views in halves, of which the second shows a board that stands 30 mm further along x."""
-    problem = replace(calibrated()[1].problem, scatter=None)
+    problem = replace(calibrated()[1].problem, repeatability=None)
     rng = np.random.default_rng(4)
     second = problem.data.configuration > np.median(problem.data.configuration)
     parts = {}
@@ -238,7 +238,7 @@ def test_two_cameras_on_the_flange_are_told_apart(tmp_path: Path) -> None:
         base = STUDY.PLACES["on the flange"][1]
         p = ro.problem.starting_parameters(robot, empty, base, {"": (x, 0, 0.04, 0, 0, 0)}, camera).identify(["a2"])
         problem = ro.CalibrationProblem(robot, p, empty)
-        q = ro.problem.postures_in_sight(problem, np.array(list(STUDY.BOARD.values())), 12, rng, share=0.6)
+        q = ro.problem.visible_configurations(problem, np.array(list(STUDY.BOARD.values())), 12, rng, share=0.6)
         seen = problem.on(ro.data.views(q, STUDY.BOARD, np.zeros((12, 20, 2)), 0.1))
         cells = np.column_stack([np.degrees(seen.data.blocks[0].q[:, 0]), seen.modelled(np.array([4e-4]))[0]])
         points = seen.data.blocks[0].point[:, 0]

@@ -282,7 +282,7 @@ def test_misread_orientations_are_named() -> None:
     assert any("the other way round" in text for text in causes), causes
 
 
-def test_a_scattering_arm_with_a_joint_on_one_side_is_not_accused() -> None:
+def test_an_arm_of_poor_repeatability_with_a_joint_on_one_side_is_not_flagged() -> None:
     problem = simulated_arm("ur5e", count=80)
     (block,) = problem.data.blocks
     one_side = problem.on(problem.data.take(np.flatnonzero(block.q[:, 0, 1] > 0)))
@@ -333,7 +333,7 @@ def test_rows_that_were_left_out_together_are_an_instrument_that_moved() -> None
     assert any("did the instrument or the robot's base move" in text for text in causes), causes
 
 
-def test_many_scattered_outliers_are_no_instrument_that_moved() -> None:
+def test_many_single_outliers_are_no_instrument_that_moved() -> None:
     """Of 5,000 in 50,000 rows some dozens follow each other by chance."""
     rng = np.random.default_rng(0)
     out = rng.uniform(size=50_000) < 0.1

@@ -106,7 +106,7 @@ def test_new_recognises_what_was_touched(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("problem", ["contact", "datum_cube"])
 def test_errors_of_touches_are_told_point_by_point(problem: str, tmp_path: Path) -> None:
-    """A table needs no word of what a drawing knows, and the scatter is about the mean of a point's own touches."""
+    """A table needs no word of what a drawing knows, and errors are counted from the mean of a point's own touches."""
     instance = ro.load(problem)
     result = instance.calibrate(weight=1.0, model="geometry")
     folder = Path(__file__).parents[2] / "problems" / problem

@@ -1,4 +1,4 @@
-"""What a fit says of its data: which rows it distrusts and by how many sigmas, and what bounds cost."""
+"""Diagnostics of a fit: flagged rows and their standardized residuals, and multipliers of bounds."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from scipy.stats import chi2
 import rpim_opt as ro
 from rpim_opt.bayes.outliers import error_vectors
 from rpim_opt.calibration.diagnosis import Flag, flagged
-from rpim_opt.convex.trust import limits
+from rpim_opt.convex.robust_loss import limits
 from tests.simulate import simulated
 
 COUNT = np.array([3, 3, 1, 3, 6, 3, 3, 3])
@@ -36,7 +36,7 @@ def test_a_good_fit_flags_nothing() -> None:
 
 @pytest.mark.parametrize("noise", [0.5, 1.0, 6.0])
 def test_flags_are_told_in_sigmas_of_the_noise_that_the_others_show(noise: float) -> None:
-    """Declared noise at least: a norm of 60 declared sigmas is 60 of them, or 10 where the others scatter by 6."""
+    """Declared noise at least: a norm of 60 declared sigmas is 60 of them, or 10 where the others vary by 6."""
     norms = noise * MEDIANS
     norms[[2, 6]] = (60.0, 90.0)
     found = flags(norms)
@@ -123,9 +123,9 @@ def test_the_factor_of_a_loss_is_its_weight_against_squares() -> None:
     assert results["Tikhonov"].spread.factor == 1.0
     assert results["tripled"].spread.factor == pytest.approx(3.0, rel=1e-9)
     robust = results["Huber"]
-    trust = robust.program.trust(robust.z)
-    assert trust is not None
-    assert robust.spread.factor == trust.factor
+    inliers = robust.program.inliers(robust.z)
+    assert inliers is not None
+    assert robust.spread.factor == inliers.factor
 
 
 @pytest.mark.parametrize("name", ["mixed", "markers", "pose"])

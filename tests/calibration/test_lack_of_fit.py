@@ -22,8 +22,8 @@ ROOT3 = np.sqrt(3)
 LISTED = (*ALL, "compliance[23]")
 
 
-def arm(seed, n=25, compliance=0.0, scatter=0.0, joints=0.0, repeats=1, identify=ALL, mounting=-1.0):
-    """Return a problem of an arm with errors of table size, gravity in joints 2 and 3, and scatter [m, rad]."""
+def arm(seed, n=25, compliance=0.0, repeatability=0.0, joints=0.0, repeats=1, identify=ALL, mounting=-1.0):
+    """Return a problem of an arm with errors of table size, gravity in joints 2 and 3, and repeatability [m, rad]."""
     rng = np.random.default_rng([seed, 1])
     problem, truth = simulated(ALL, n, seed=seed, sigma=NOISE)
     q = np.repeat(problem.data.q, repeats, axis=0)
@@ -31,7 +31,7 @@ def arm(seed, n=25, compliance=0.0, scatter=0.0, joints=0.0, repeats=1, identify
     told = q + joints * rng.normal(size=q.shape)
     told[:, 1:3] += compliance * ro.robot.gravity_torques(robot, q)[:, 1:3]
     exact = problem.on(ro.Dataset.of(told, np.zeros((len(q), 3)), NOISE))
-    y = exact.modelled(truth)[0] + np.hypot(NOISE, scatter) * rng.normal(size=(len(q), 3))
+    y = exact.modelled(truth)[0] + np.hypot(NOISE, repeatability) * rng.normal(size=(len(q), 3))
     problem = problem.on(ro.Dataset.of(q, y, NOISE))
     return problem.with_parameters(problem.parameters.identify(identify))
 
@@ -73,11 +73,11 @@ def test_gravity_is_found_whatever_the_weight(weight):
     text = str(found)
     assert f"explain {found.share:.0%} of the mean square residual" in text
     assert "add compliance?" in text
-    # what it would explain is no longer the robot's scatter
+    # what it would explain is no longer the robot's repeatability
     assert found.repeatable > 2 * found.robot
 
 
-def test_division_adds_up_to_what_the_model_without_the_family_leaves():
+def test_division_adds_up_to_what_the_model_without_the_extension_leaves():
     found = lack_of_fit(learned(1, compliance=BENT))
     total = found.instrument**2 + found.robot**2 + found.repeatable**2
     assert found.repeatable**2 / total == pytest.approx(found.share, rel=1e-9)
@@ -95,7 +95,7 @@ def test_model_that_has_gravity_says_so():
     assert stated.present["gravity"] > 10
 
 
-def test_family_that_is_listed_in_vain_is_not_praised():
+def test_extension_that_is_listed_in_vain_is_not_praised():
     found = lack_of_fit(ro.calibrate(arm(3, identify=LISTED), ro.tikhonov, ro.reml))
     assert found.present == {}
     assert not found.alarming
@@ -109,24 +109,24 @@ def test_wrong_mounting_bends_upwards():
     assert not lack_of_fit(learned(4, compliance=BENT)).upward
 
 
-def test_scatter_is_no_lack_and_is_told_by_its_size():
-    found = lack_of_fit(learned(5, n=60, scatter=2e-4))
+def test_repeatability_is_no_lack_and_is_told_by_its_size():
+    found = lack_of_fit(learned(5, n=60, repeatability=2e-4))
     assert not found.alarming
     assert found.robot == pytest.approx(ROOT3 * 2e-4, rel=0.2)
     assert "Repeat five configurations" in str(found)
 
 
-def test_scatter_of_joints_is_told_from_that_in_position():
+def test_repeatability_of_joints_is_told_from_that_in_position():
     found = lack_of_fit(learned(6, n=150, joints=3e-4))
     assert not found.alarming
     assert found.joint > 2 * found.position
 
 
-def test_repeated_readings_tell_scatter_from_what_comes_again():
-    scattered = lack_of_fit(learned(7, n=30, repeats=2, scatter=2e-4))
-    assert scattered.repeated == pytest.approx(ROOT3 * np.hypot(2e-4, NOISE), rel=0.2)
-    assert scattered.excess == 0.0
-    assert "limits the result, by its repeatability, backlash or drift" in str(scattered)
+def test_repeated_readings_tell_repeatability_from_what_comes_again():
+    noisy = lack_of_fit(learned(7, n=30, repeats=2, repeatability=2e-4))
+    assert noisy.repeated == pytest.approx(ROOT3 * np.hypot(2e-4, NOISE), rel=0.2)
+    assert noisy.excess == 0.0
+    assert "limits the result, by its repeatability, backlash or drift" in str(noisy)
     bent = lack_of_fit(learned(7, n=30, repeats=2, compliance=BENT))
     assert bent.repeated == pytest.approx(ROOT3 * NOISE, rel=0.2)
     assert bent.excess > bent.repeated
@@ -148,7 +148,7 @@ def test_noise_declared_far_too_large_is_said():
     assert "Repeat one reading ten times" in str(found)
 
 
-def test_gross_errors_are_no_scatter():
+def test_gross_errors_are_no_repeatability():
     rough = LackOfFit(60, 180, 150.0, "length", left=0.07, instrument=1e-4, position=0.07)
     assert "units, signs, frames" in str(rough)
     assert "Repeat five" not in str(rough)
@@ -235,7 +235,7 @@ def test_the_report_says_it():
 
 
 def test_no_alarm_of_clean_arms_and_one_of_each_that_bends():
-    clean = [arm(100, n=15), arm(101, joints=1e-4), arm(102, scatter=1e-4), arm(103, n=45)]
+    clean = [arm(100, n=15), arm(101, joints=1e-4), arm(102, repeatability=1e-4), arm(103, n=45)]
     assert not any(lack_of_fit(ro.calibrate(problem, ro.tikhonov, ro.reml)).alarming for problem in clean)
     bent = [arm(200 + seed, compliance=BENT / 2) for seed in range(3)]
     assert all(lack_of_fit(ro.calibrate(problem, ro.tikhonov, ro.reml)).missing for problem in bent)
@@ -246,7 +246,7 @@ def test_no_cry_of_wolf_and_no_gravity_overlooked():
     alarms = 0
     for seed in range(150):
         kind = seed % 3
-        clean = arm(1000 + seed, scatter=1e-4 * (kind == 1), joints=1e-4 * (kind == 2))
+        clean = arm(1000 + seed, repeatability=1e-4 * (kind == 1), joints=1e-4 * (kind == 2))
         alarms += lack_of_fit(ro.calibrate(clean)).alarming
     assert alarms <= 1
     seen = sum(bool(lack_of_fit(learned(2000 + seed, compliance=BENT / 2)).missing) for seed in range(30))

@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, scatter_bounds
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, repeatability_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.covariance import require_interval as interval
 from rpim_opt.calibration.lack_of_fit import Autocorrelation, LackOfFit, autocorrelation
@@ -38,7 +38,7 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
         "Region: joints within the measured ranges.",
         "Lacking: rows.",
     ]
-    assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "scatter", "box")] == [None] * 4
+    assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "repeatability", "box")] == [None] * 4
     free = Acceptance(LIMIT, "undecided", (), expanded(500, np.inf, 5e-5), 2e-5)
     assert "The position reached" not in str(free)
     assert free.content()["bound_mm"] is None
@@ -54,11 +54,11 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     assert whole.content()["checked"] == {"rows": 4}
 
 
-def test_a_share_of_scatter_that_is_not_known_is_zero() -> None:
+def test_a_share_of_repeatability_that_is_not_known_is_zero() -> None:
     """Of a calibration whose noise's level stands for it."""
     problem = ro.load("paper_arm").problem
     region: Any = SimpleNamespace(marker="")
-    found = scatter_bounds(ro.calibrate(problem, ro.tikhonov, 1.0), region, problem.data.q[0], 0.95)
+    found = repeatability_bounds(ro.calibrate(problem, ro.tikhonov, 1.0), region, problem.data.q[0], 0.95)
     assert found == (0.0, 0.0)
 
 
@@ -154,7 +154,7 @@ def said(found: Learned) -> list[str]:
 
 def test_what_was_learned_is_said_and_nothing_else() -> None:
     assert said(learned()) == []
-    assert learned().families == ()
+    assert learned().extensions == ()
     assert learned().gain("gravity") is None
     sized = learned({"lengths": Size(2.0, 0.1), "angles": Size(1.0, 0.1)}, {"position": Size(5e-5, 0.1)})
     assert said(sized) == [
@@ -163,7 +163,7 @@ def test_what_was_learned_is_said_and_nothing_else() -> None:
     ]
 
 
-def test_parts_of_the_scatter_that_are_not_worth_a_word() -> None:
+def test_parts_of_the_repeatability_that_are_not_worth_a_word() -> None:
     """Beside the largest; a size that is hardly known has an upper end."""
     only = said(learned(noise={"position": Size(1e-3, 0.1), "joint": Size(1e-6, 0.1)}))
     assert len(only) == 1
@@ -173,10 +173,10 @@ def test_parts_of_the_scatter_that_are_not_worth_a_word() -> None:
     assert "at most 2.7 mm (95 % confidence)" in vague
 
 
-def test_families_are_compared_with_the_best_model_without_them() -> None:
+def test_extensions_are_compared_with_the_best_model_without_them() -> None:
     trials = (Trial(("gravity",), 10.0), Trial((), 40.0), Trial(("gravity", "moments"), 12.0))
     found = learned(trials=trials)
-    assert found.families == ("gravity",)
+    assert found.extensions == ("gravity",)
     assert found.gain("gravity") == 30.0
     assert found.gain("moments") == -2.0
     assert found.gain("compliance") is None

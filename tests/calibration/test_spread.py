@@ -140,7 +140,7 @@ def test_predictions_propagate() -> None:
     assert wide.expanded == pytest.approx(Uncertainty(RESULT, 0.99).coverage_factor * wide.standard, rel=1e-12)
 
 
-def test_draws_scatter_as_the_noise() -> None:
+def test_draws_repeatability_as_the_noise() -> None:
     draws = ro.calibration.monte_carlo(RESULT, draws=400, seed=1)
     assert draws.shape == (400, len(SCALE))
     stated = np.sqrt(np.diag(RESULT.spread.noise))

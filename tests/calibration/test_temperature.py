@@ -70,7 +70,7 @@ def test_all_lengths_grow_alike(problem: ro.CalibrationProblem) -> None:
 def test_the_evidence_takes_it_and_finds_the_coefficient(automatic: ro.Calibration) -> None:
     learned = automatic.learned
     assert learned is not None
-    assert learned.families == ("temperature",)
+    assert learned.extensions == ("temperature",)
     i = automatic.problem.parameters.free.names.index(EXPANSION)
     sd = np.sqrt(automatic.covariance[i, i])
     assert sd < 2e-6
@@ -93,7 +93,7 @@ def test_it_is_not_taken_where_nothing_grows() -> None:
     steady = warmed(0.0)
     learned = ro.calibrate(steady, model="auto").learned
     assert learned is not None
-    assert "temperature" not in learned.families
+    assert "temperature" not in learned.extensions
     explicit = steady.with_parameters(steady.parameters.identify([*steady.parameters.free.names, EXPANSION]))
     assert off(ro.calibrate(explicit)) < 1.02 * off(ro.calibrate(steady))
 

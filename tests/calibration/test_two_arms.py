@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.words import scatter
+from rpim_opt.calibration.words import touch_errors
 from rpim_opt.problem.registration.frames import met
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 
@@ -34,7 +34,7 @@ def touched(
     T = numeric_frame(base)
     there = MIDDLE + (np.array(list(places.values())) - 0.5) * SIZE
     local = np.repeat((there - T[:3, 3]) @ T[:3, :3], count, axis=0)
-    q = ro.problem.postures_at(arm, local + sigma * rng.normal(size=local.shape), rng, x, 0.9)
+    q = ro.problem.configurations_at(arm, local + sigma * rng.normal(size=local.shape), rng, x, 0.9)
     return ro.data.touches(q, np.repeat(list(places), count).tolist(), SIGMA)
 
 
@@ -106,7 +106,7 @@ def test_a_point_is_in_one_fold_whoever_touched_it(cell) -> None:
     problem, _ = cell
     data = problem.data
     assert len(np.unique(data.configuration)) == len(SOCKETS)
-    found = scatter(data, np.zeros(len(data)), np.ones(len(data)))
+    found = touch_errors(data, np.zeros(len(data)), np.ones(len(data)))
     assert sorted(each["name"] for each in found) == sorted(SOCKETS)
     assert {each["count"] for each in found} == {8}
 

@@ -72,7 +72,7 @@ def test_what_active_bounds_do_is_said() -> None:
         ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.tikhonov, 1.0), confidence=95)
 
 
-def test_a_robust_fit_is_as_certain_as_one_of_the_rows_it_trusts() -> None:
+def test_a_robust_fit_is_as_certain_as_one_of_the_rows_it_keeps() -> None:
     instance = ro.load("blunders")
     robust = ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.robust, 1.0))
     clean = ro.calibration.Uncertainty(ro.calibrate(robust.result.without_flagged().problem, ro.tikhonov, 1.0))

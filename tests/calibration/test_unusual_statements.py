@@ -122,7 +122,7 @@ def test_a_mean_square_means_the_same_of_measurements_in_parts(problem: Any) -> 
 
 
 def test_the_norm_of_the_residual_has_a_spread(problem: Any) -> None:
-    """It is posed on a triangle, and trusts equations all the same."""
+    """It is posed on a triangle, and keeps equations all the same."""
     result = ro.calibrate(problem, ro.Formulation("norm", cp.norm2, cp.sum_squares), 0.1)
     assert result.converged
     assert 0.8 < result.spread.noise_variance < 1.4

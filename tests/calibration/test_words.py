@@ -83,8 +83,8 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
 
 def test_points_beyond_a_table_are_counted_with_the_largest_of_their_errors() -> None:
     found = [{"name": f"p{k}", "count": 2, "nominal_rms_mm": 1.0, "rms_mm": 0.1, "max_mm": 1e-3 * k} for k in range(23)]
-    assert words.scatter_rows(found)[20:] == [["3 others", "6", "", "", "0.022"]]
-    assert len(words.scatter_rows(found[:20])) == 20
+    assert words.touch_rows(found)[20:] == [["3 others", "6", "", "", "0.022"]]
+    assert len(words.touch_rows(found[:20])) == 20
 
 
 def test_what_a_file_could_not_hold_is_said() -> None:

@@ -126,7 +126,7 @@ def test_the_squares_of_a_robust_loss_are_squares_for_a_stated_solver_too() -> N
     """What rules see of a robust loss, where its own solver fails and CVXPY's stands in."""
     problem = ro.load("blunders").problem
     program = ro.convex.pose(ro.robust, problem.linearize(np.zeros(len(problem.parameters.free))))
-    squares = program.on_squares(program.trusted(program.solve(1.0).z))
+    squares = program.on_squares(program.inlier_model(program.solve(1.0).z))
     found, stated = squares.solve(1.0), squares.solve(1.0, solver="CLARABEL")
     assert stated.loss == pytest.approx(found.loss, rel=1e-6)
     np.testing.assert_allclose(stated.z, found.z, atol=1e-5)

@@ -162,18 +162,18 @@ def test_what_mixes_configurations_is_one() -> None:
     assert (ro.convex.pose(FORMULATIONS["shifted"], MODEL).squared.group == MODEL.group).all()
 
 
-def test_what_is_trusted_is_told_by_the_norms() -> None:
+def test_inliers_follow_from_the_norms() -> None:
     b = MODEL.b.copy()
     b[4] += 1e4
     program = ro.convex.pose(ro.robust, MODEL.with_values(b))
     z = program.solve(1.0).z
-    trusted = program.trusted(z)
-    assert set(MODEL.group.tolist()) - set(trusted.group.tolist()) == {1}
-    assert ro.convex.pose(ro.tikhonov, MODEL).trust(Z) is None
+    kept = program.inlier_model(z)
+    assert set(MODEL.group.tolist()) - set(kept.group.tolist()) == {1}
+    assert ro.convex.pose(ro.tikhonov, MODEL).inliers(Z) is None
     by_equation = ro.convex.pose(FORMULATIONS["huber"], MODEL.with_values(b))
-    trust = by_equation.trust(by_equation.solve(1.0).z)
-    assert trust is not None
-    assert 0 < trust.factor <= 1
+    inliers = by_equation.inliers(by_equation.solve(1.0).z)
+    assert inliers is not None
+    assert 0 < inliers.factor <= 1
 
 
 def test_a_damped_step_of_what_nothing_holds_is_the_shortest() -> None:

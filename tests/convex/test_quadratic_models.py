@@ -11,8 +11,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.expressions import SQUARES
+from rpim_opt.convex.robust_loss import Squares, separable
 from rpim_opt.convex.structure import in_blocks
-from rpim_opt.convex.trust import Squares, separable
 from tests.convex.test_formulation import model
 
 MODEL = model(condition=30.0).scaled(np.geomspace(0.3, 30.0, 30))

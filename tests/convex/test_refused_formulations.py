@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.prior import Prior, family_of
+from rpim_opt.bayes.prior import Prior, kind_of
 from rpim_opt.convex.tolerances import combination
 from tests.convex.test_formulation import model
 
@@ -90,8 +90,8 @@ def test_a_prior_and_something_else_are_no_prior() -> None:
     assert Prior(centre={"d5_mm": 1.0}) & Prior(centre={"d5_mm": 1.0}) == Prior(centre={"d5_mm": 1.0})
 
 
-def test_a_parameter_of_no_family_is_its_own() -> None:
-    assert family_of("_anchor") == "_anchor"
+def test_a_parameter_of_no_kind_is_its_own() -> None:
+    assert kind_of("_anchor") == "_anchor"
 
 
 def test_a_statement_without_a_unit_is_in_si() -> None:

@@ -159,11 +159,11 @@ def test_a_corner_at_an_edge_is_none(best: int, said: str, monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("rule", [ro.l_curve, ro.corner, ro.gcv, ro.k_fold])
-def test_every_rule_sees_a_robust_loss_as_the_squares_that_it_trusts(rule: Any) -> None:
+def test_every_rule_sees_a_robust_loss_as_the_squares_of_its_inliers(rule: Any) -> None:
     model = simulated(configurations=30, noise=1e-4, seed=3)[0].linearize(np.zeros(34))
     program = ro.convex.pose(ro.robust, model)
     chosen = rule(program)
-    squares = ro.convex.pose(ro.tikhonov, program.trusted(program.solve(chosen.weight).z))
+    squares = ro.convex.pose(ro.tikhonov, program.inlier_model(program.solve(chosen.weight).z))
     assert abs(np.log(rule(squares).weight / chosen.weight)) < 0.03  # the rounds end within 2 %
 
 
@@ -183,16 +183,16 @@ def blundered() -> LinearModel:
 
 @pytest.mark.parametrize("rule", [ro.reml, ro.gcv])
 @pytest.mark.parametrize("price", [1.0, np.geomspace(1.0, 50.0, 12)])
-def test_a_robust_choice_is_that_of_what_it_trusts(rule: Any, price: Any) -> None:
-    """A fixed point: the squares that are trusted at the chosen weight choose the same again."""
+def test_a_robust_choice_is_that_of_its_inliers(rule: Any, price: Any) -> None:
+    """A fixed point: the squares of the inliers at the chosen weight choose the same again."""
 
     def penalty(z: Any) -> Any:
         return cp.sum_squares(cp.multiply(price, z))
 
     program = ro.convex.pose(replace(ro.robust, penalty=penalty), blundered())
     chosen = rule(program)
-    trusted = program.trusted(program.solve(chosen.weight).z)
-    again = rule(ro.convex.pose(replace(ro.tikhonov, penalty=penalty), trusted))
+    kept = program.inlier_model(program.solve(chosen.weight).z)
+    again = rule(ro.convex.pose(replace(ro.tikhonov, penalty=penalty), kept))
     assert chosen.interior
     assert abs(np.log(again.weight / chosen.weight)) < 0.05
     without = rule(ro.convex.pose(ro.tikhonov, blundered()))

@@ -13,7 +13,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics import threads
 from rpim_opt.calibration import words
-from rpim_opt.convex.trust import Squares, trusted
+from rpim_opt.convex.robust_loss import Squares, inliers_of
 from rpim_opt.problem import blocks as parts_module
 from rpim_opt.problem.blocks import PartitionedProblem, in_parts, whole_configurations
 
@@ -183,14 +183,14 @@ def test_robust_losses_take_few_passes_more(name: str, variant: str | None, form
 
 
 @pytest.mark.usefixtures("too_many")
-def test_what_a_robust_loss_trusts_is_the_same_in_parts(whole: ro.CalibrationProblem) -> None:
+def test_inliers_of_a_robust_loss_are_the_same_in_blocks(whole: ro.CalibrationProblem) -> None:
     there, here = ro.calibrate(whole, ro.robust, 1.0), ro.calibrate(apart(whole), ro.robust, 1.0)
     assert here.linear.equations == there.linear.equations
     assert here.spread.noise_variance == pytest.approx(there.spread.noise_variance, rel=1e-5)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=0, atol=1e-5 * np.abs(there.covariance).max())
     chosen = ro.calibrate(apart(whole), ro.robust, ro.reml)
-    trust = trusted(ro.robust, *whole.configuration_errors(chosen.x))
-    squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, trust))
+    inliers = inliers_of(ro.robust, *whole.configuration_errors(chosen.x))
+    squared = ro.convex.pose(ro.tikhonov, whole.linearize(chosen.x, inliers))
     # the weight stays from where steps are shorter than a thousandth of the solution
     assert chosen.weight == pytest.approx(ro.reml(squared).weight, rel=1e-2)
 

@@ -1,4 +1,4 @@
-"""Pixels as measurements: projection, starts, what scatter does to them, and what a board leaves open."""
+"""Pixels as measurements: projection, starts, what the robot's repeatability does to them, what a board leaves open."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def world(kind: str, views: int = 12) -> ro.CalibrationProblem:
     empty = ro.data.views(np.zeros((1, 6)), BOARD, np.zeros((1, 12, 2)), SIGMA, kind)
     parameters = ro.problem.starting_parameters(robot, empty, base, {"": tool}, own).identify(EVERYTHING)
     problem = ro.CalibrationProblem(robot, parameters, empty)
-    q = ro.problem.postures_in_sight(problem, POINTS, views, seed=3, share=0.6)
+    q = ro.problem.visible_configurations(problem, POINTS, views, seed=3, share=0.6)
     return at(problem, q, np.zeros(len(parameters.free)))
 
 
@@ -165,12 +165,12 @@ def test_homographies_show_the_camera() -> None:
         starting_camera(few, few.blocks[0])
 
 
-def test_scatter_of_the_robot_moves_a_view_together() -> None:
+def test_repeatability_of_the_robot_moves_a_view_together() -> None:
     problem = world("eye_in_hand", views=12)
     sigma = 1e-4
-    shaken = replace(problem, scatter=ro.problem.Scatter(position=sigma))
+    shaken = replace(problem, repeatability=ro.problem.Repeatability(position=sigma))
     (stack,) = shaken.stacks(joints=False)
-    V = stack.covariance(shaken.scatter)[0]
+    V = stack.covariance(shaken.repeatability)[0]
     p = problem.parameters
     base = np.array([name in ("base_x", "base_y", "base_z") for name in p.names])
     J = problem.identifying(base).jacobian(np.zeros(3))[stack.index[0]]
@@ -254,9 +254,9 @@ def test_a_board_that_is_never_in_sight_is_said(monkeypatch) -> None:
     far = problem.with_parameters(replace(problem.parameters, nominal=away))
     monkeypatch.setattr(sight, "TIMES", 2)
     with pytest.raises(ro.InputError, match="0 of 5 views"):
-        ro.problem.postures_in_sight(far, POINTS, 5)
+        ro.problem.visible_configurations(far, POINTS, 5)
     with pytest.raises(ro.InputError, match="no row of a camera"):
-        ro.problem.postures_in_sight(ro.load("pose").problem, POINTS, 5)
+        ro.problem.visible_configurations(ro.load("pose").problem, POINTS, 5)
 
 
 @pytest.mark.parametrize(

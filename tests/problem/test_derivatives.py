@@ -17,7 +17,7 @@ STEP = 3e-3
 """Of the differences, in prior standard deviations."""
 
 
-def scattered(joint: float) -> ro.CalibrationProblem:
+def noisy(joint: float) -> ro.CalibrationProblem:
     """Return the faces of a cube, touched with noise [mrad] of the joints."""
     problem = ro.load("datum_cube").problem
     rng = np.random.default_rng(1)
@@ -41,7 +41,7 @@ def differences(problem: ro.CalibrationProblem, x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", [*(pytest.param(name, marks=LONG.get(name, ())) for name in NAMES), 3.0])
 def test_every_column_of_the_jacobian_is_the_derivative(name: str | float) -> None:
-    problem = ro.load(name).problem if isinstance(name, str) else scattered(name)
+    problem = ro.load(name).problem if isinstance(name, str) else noisy(name)
     scale = problem.parameters.free.scale
     x = 0.2 * np.random.default_rng(0).normal(size=len(scale)) * scale
     J = problem.jacobian(x) * scale
@@ -52,7 +52,7 @@ def test_every_column_of_the_jacobian_is_the_derivative(name: str | float) -> No
 
 
 def test_no_optimizer_finds_a_lower_objective() -> None:
-    problem = scattered(1.0)
+    problem = noisy(1.0)
     scale = problem.parameters.free.scale
     z = ro.calibrate(problem, ro.tikhonov, weight=1.0).x / scale
 

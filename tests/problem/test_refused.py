@@ -18,7 +18,7 @@ from rpim_opt.data.noise import declared_noise
 from rpim_opt.problem.blocks import partitions
 from rpim_opt.problem.registration.camera import posed, starting_camera
 from rpim_opt.problem.registration.frames import locate
-from rpim_opt.problem.workspace import postures_at, touched_place, within
+from rpim_opt.problem.workspace import configurations_at, touched_place, within
 from rpim_opt.report.console import touched_point
 from tests.problem.test_camera import BOARD, LENS, SIGMA, world
 from tests.simulate import ARM
@@ -91,7 +91,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: within(ro.load("position").problem, 50.0 + np.eye(3)[:, :2]), "no configuration of the joint ranges"
     ),
     "a point out of reach": (
-        lambda: postures_at(ro.load("position").problem, np.array([[9.0, 0, 0]])), "(9000, 0, 0) mm, out of reach"
+        lambda: configurations_at(ro.load("position").problem, np.array([[9.0, 0, 0]])), "(9000, 0, 0) mm, out of reach"
     ),
     "a point that is a word": (lambda: touched_point("here"), "--point: found 'here'"),
     "a point of two numbers": (lambda: touched_point("1,2"), "x,y,z [mm]"),

@@ -11,13 +11,13 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.blocks import reduced
 from rpim_opt.problem.linear import reduced_rows
-from rpim_opt.problem.noise import Scatter
+from rpim_opt.problem.noise import Repeatability
 
-SCATTER = Scatter(position=4e-5, orientation=1e-4, joint=7e-5, instrument=0.8)
+REPEATABILITY = Repeatability(position=4e-5, orientation=1e-4, joint=7e-5, instrument=0.8)
 NAMES = ("position", "pose", "markers", "mixed", "cable", "distance")
 
 
-def dense(problem: ro.CalibrationProblem, scatter: Scatter) -> Array:
+def dense(problem: ro.CalibrationProblem, repeatability: Repeatability) -> Array:
     """Return the covariance (m, m) of all equations, written down one by one."""
     groups, lengths, angles, V = [], [], [], []
     for block in problem.data.blocks:
@@ -32,21 +32,21 @@ def dense(problem: ro.CalibrationProblem, scatter: Scatter) -> Array:
     R = np.zeros((m, m))
     at = 0
     for C in V:
-        R[at : at + len(C), at : at + len(C)] = scatter.instrument**2 * C
+        R[at : at + len(C), at : at + len(C)] = repeatability.instrument**2 * C
         at += len(C)
-    R += np.diag(scatter.position**2 * np.array(lengths) + scatter.orientation**2 * np.array(angles))
-    T = problem.joint_slopes(scatter.at)
+    R += np.diag(repeatability.position**2 * np.array(lengths) + repeatability.orientation**2 * np.array(angles))
+    T = problem.joint_slopes(repeatability.at)
     same = np.equal.outer(groups, groups)
-    return R + scatter.joint**2 * np.where(same, T @ T.T, 0.0)
+    return R + repeatability.joint**2 * np.where(same, T @ T.T, 0.0)
 
 
 @pytest.mark.parametrize("name", NAMES)
 def test_whitened_equations_have_the_covariance(name: str) -> None:
     problem = ro.load(name).problem
-    scattered = problem.scattered(SCATTER)
+    noisy = problem.with_repeatability(REPEATABILITY)
     x = 0.3 * problem.parameters.free.scale
-    model = scattered.linearize(x)
-    R = dense(problem, SCATTER)
+    model = noisy.linearize(x)
+    R = dense(problem, REPEATABILITY)
     A = problem.jacobian(x) * problem.parameters.free.scale
     b = problem.residual(x) + problem.jacobian(x) @ x
     assert np.allclose(model.A.T @ model.A, A.T @ np.linalg.solve(R, A), rtol=1e-8, atol=1e-8 * np.abs(model.A).max())
@@ -56,7 +56,7 @@ def test_whitened_equations_have_the_covariance(name: str) -> None:
 
 @pytest.mark.parametrize("name", NAMES)
 def test_residual_and_norms_agree_with_the_model(name: str) -> None:
-    problem = ro.load(name).problem.scattered(SCATTER)
+    problem = ro.load(name).problem.with_repeatability(REPEATABILITY)
     x = 0.3 * problem.parameters.free.scale
     model = problem.linearize(x)
     r = problem.whitened_residual(x)
@@ -68,23 +68,25 @@ def test_residual_and_norms_agree_with_the_model(name: str) -> None:
 
 def test_a_rows_norm_is_by_its_own_covariance() -> None:
     problem = ro.load("markers").problem
-    scattered = problem.scattered(SCATTER)
+    noisy = problem.with_repeatability(REPEATABILITY)
     x = np.zeros(len(problem.parameters.free))
-    norms, _ = scattered.whitened_errors(x)
-    alone = problem.on(problem.data.take([4])).scattered(SCATTER)
+    norms, _ = noisy.whitened_errors(x)
+    alone = problem.on(problem.data.take([4])).with_repeatability(REPEATABILITY)
     assert norms[4] == pytest.approx(np.linalg.norm(alone.whitened_residual(x)), rel=1e-9)
 
 
 @pytest.mark.parametrize("name", ["position", "markers", "mixed"])
 def test_triangles_and_parts_are_the_same_squares(name: str) -> None:
-    problem = ro.load(name).problem.scattered(SCATTER)
+    problem = ro.load(name).problem.with_repeatability(REPEATABILITY)
     x = 0.2 * problem.parameters.free.scale
     model = problem.linearize(x)
     want = reduced_rows(np.column_stack([model.A, model.b]))
     small = np.column_stack([reduced(problem, x).A, reduced(problem, x).b])
     assert np.allclose(small.T @ small, want.T @ want, rtol=1e-9, atol=1e-7 * np.abs(want).max() ** 2)
     parts = [lambda rows=rows: problem.data.take(rows) for rows in np.array_split(np.arange(len(problem.data)), 1)]
-    split = ro.problem.PartitionedProblem(problem.robot, problem.parameters, problem.data, parts).scattered(SCATTER)
+    split = ro.problem.PartitionedProblem(problem.robot, problem.parameters, problem.data, parts).with_repeatability(
+        REPEATABILITY
+    )
     joined = np.column_stack([split.linearize(x).A, split.linearize(x).b])
     assert np.allclose(joined.T @ joined, want.T @ want, rtol=1e-9, atol=1e-7 * np.abs(want).max() ** 2)
 
@@ -92,7 +94,7 @@ def test_triangles_and_parts_are_the_same_squares(name: str) -> None:
 def test_without_a_size_nothing_changes() -> None:
     problem = ro.load("mixed").problem
     x = 0.1 * problem.parameters.free.scale
-    plain, bare = problem.linearize(x), problem.scattered(Scatter()).linearize(x)
+    plain, bare = problem.linearize(x), problem.with_repeatability(Repeatability()).linearize(x)
     assert np.allclose(plain.A.T @ plain.A, bare.A.T @ bare.A, rtol=1e-9)
     assert np.array_equal(np.sort(plain.group), np.sort(bare.group))
 
@@ -111,7 +113,7 @@ def test_slopes_by_the_joints_are_differences() -> None:
         assert np.allclose(-(moved[0] - moved[1]) / (2 * h), slopes, atol=1e-7)
 
 
-def test_slopes_are_taken_where_the_scatter_says() -> None:
+def test_slopes_are_taken_where_the_repeatability_says() -> None:
     problem = ro.load("position").problem
     p = problem.parameters
     x = 5 * p.free.scale
@@ -130,17 +132,17 @@ def test_sliding_joints_do_not_turn() -> None:
 
 
 def test_robots_part_and_reading_differ_by_the_instrument() -> None:
-    problem = ro.load("pose").problem.scattered(SCATTER)
+    problem = ro.load("pose").problem.with_repeatability(REPEATABILITY)
     for block, own, reading in zip(
         problem.data.blocks, problem.covariances(reading=False), problem.covariances(), strict=True
     ):
-        assert np.allclose(reading - own, SCATTER.instrument**2 * block.covariance)
+        assert np.allclose(reading - own, REPEATABILITY.instrument**2 * block.covariance)
         assert (np.linalg.eigvalsh(own) > 0).all()
 
 
 def test_worse_noise_makes_wider_intervals_and_other_weights() -> None:
     problem = ro.load("position").problem
     calm = ro.calibrate(problem, ro.tikhonov, 1.0)
-    rough = ro.calibrate(problem.scattered(Scatter(position=3e-4)), ro.tikhonov, 1.0)
+    rough = ro.calibrate(problem.with_repeatability(Repeatability(position=3e-4)), ro.tikhonov, 1.0)
     assert rough.spread.degrees_of_freedom < calm.spread.degrees_of_freedom
     assert rough.converged

@@ -19,6 +19,7 @@ OTHER = ro.robot.Robot(
     "other arm", ARM.mdh[:5] * 1.1, joint_map=np.diag([1.0, -1, 1, 1, 1]), gravity=ro.robot.Gravity((0, -1, 0))
 )
 """Five joints, of which the controller counts one backwards, mounted on a wall."""
+REPEATABLE = ro.problem.Repeatability()
 TOOL = ("tool_[xyz]",)
 DRAWS = 400
 
@@ -111,7 +112,7 @@ def test_names_say_of_what_kind_a_parameter_is_whosever_it_is() -> None:
     assert (free.wrapped(x) < np.pi).sum() == free.periodic.sum()
 
 
-def test_configurations_labels_scatter_and_gravity_are_each_robots_own() -> None:
+def test_configurations_labels_repeatability_and_gravity_are_each_robots_own() -> None:
     left, right, _ = two()
     left, right = (
         part.with_parameters(part.parameters.identify(["d?", "compliance[23]", *TOOL])) for part in (left, right)
@@ -126,10 +127,10 @@ def test_configurations_labels_scatter_and_gravity_are_each_robots_own() -> None
     assert np.array_equal(slopes[m:, :5], right.joint_slopes())
     assert not slopes[m:, 5].any()
     x = np.zeros(len(whole.parameters.free))
-    rough = ro.problem.Scatter(position=1e-4, joint=1e-4)
-    expected = np.concatenate([part.scattered(rough).linearize(parts_of(whole, part, robot, x)).b
+    rough = ro.problem.Repeatability(position=1e-4, joint=1e-4)
+    expected = np.concatenate([part.with_repeatability(rough).linearize(parts_of(whole, part, robot, x)).b
                                for part, robot in ((left, "left"), (right, "right"))])  # fmt: skip
-    assert np.abs(whole.scattered(rough).linearize(x).b - expected).max() < 1e-9
+    assert np.abs(whole.with_repeatability(rough).linearize(x).b - expected).max() < 1e-9
     values = np.random.default_rng(1).normal(size=len(x)) * whole.parameters.free.scale
     for part, robot in ((left, "left"), (right, "right")):
         own = parts_of(whole, part, robot, values)
@@ -139,7 +140,7 @@ def test_configurations_labels_scatter_and_gravity_are_each_robots_own() -> None
 
 HOW: dict[str, dict] = {
     "learned": {},
-    "learned, families": {"model": "auto"},
+    "learned, extensions": {"model": "auto"},
     "robust, learned": {"formulation": ro.robust},
     "number": {"weight": 1.0},
     "reml": {"weight": "reml"},
@@ -275,7 +276,10 @@ def test_the_covariance_of_one_robots_commands_is_that_of_the_whole() -> None:
         (lambda a, b: ro.together(a, b, shared=["flange_*"]), r"together, shared: found 'flange_\*'"),
         (lambda a, b: ro.together(a, b, shared="tool_*"), "patterns in a list"),
         (lambda a, b: ro.together(a, tool=b, shared=TOOL), "the name 'tool'"),
-        (lambda a, b: ro.together(a, b.scattered(ro.problem.Scatter()), shared=TOOL), "problem 'B': found the robot's"),
+        (
+            lambda a, b: ro.together(a, b.with_repeatability(ro.problem.Repeatability()), shared=TOOL),
+            "problem 'B': found the robot's",
+        ),
         (lambda a, b: ro.together(a, ro.together(a, b, shared=TOOL), shared=TOOL), "several robots"),
         (
             lambda a, b: ro.together(a, b.with_parameters(b.parameters.scaled({"tool_mm": 1.0})), shared=TOOL),

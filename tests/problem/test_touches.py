@@ -16,7 +16,7 @@ from rpim_opt.bayes.outliers import clustered, error_ratios
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches, with_known
 from rpim_opt.problem.contact import Touches, contrasted
-from rpim_opt.problem.noise import Equations, Scatter
+from rpim_opt.problem.noise import Equations, Repeatability
 
 SIGMA = 3e-5
 NAMES = ("A", "B", "C", "D")
@@ -150,7 +150,7 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
     ]
     data = replace(data, blocks=tuple(blocks))
     slopes = rng.normal(size=(found.equations, 6)) if joints else None
-    scatter = Scatter(position=4e-5, joint=2e-5 * joints)
+    repeatability = Repeatability(position=4e-5, joint=2e-5 * joints)
     of = Equations.of(data)
     whole = [of.stack(index, slopes) for index in of.grouped(data.configuration[of.row])]
     stacks = contrasted(found, whole, where, np.arange(found.equations) // 3)
@@ -158,7 +158,7 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
     r, A = (found.contrasts(v.reshape(found.equations, -1), where) for v in (left, moved))
     H, h, square, count = 0.0, 0.0, 0.0, 0
     for stack in stacks:
-        for index, V in zip(stack.index, stack.covariance(scatter), strict=True):
+        for index, V in zip(stack.index, stack.covariance(repeatability), strict=True):
             H = H + A[index].T @ np.linalg.solve(V, A[index])
             h = h + A[index].T @ np.linalg.solve(V, r[index])
             square += float((r[index].T @ np.linalg.solve(V, r[index]))[0, 0])
@@ -177,9 +177,9 @@ def test_elimination_is_a_fit_with_the_points_as_unknowns(data: ro.Dataset, join
             index = slice(start, start + k)
             V[index, index] = block.covariance[min(i, len(block.covariance) - 1)]
             if block.measurement.touching:
-                V[index, index] += scatter.position**2 * np.eye(3)
+                V[index, index] += repeatability.position**2 * np.eye(3)
                 if joints:
-                    V[index, index] += scatter.joint**2 * slopes[index] @ slopes[index].T
+                    V[index, index] += repeatability.joint**2 * slopes[index] @ slopes[index].T
             start += k
     if found.planar[0]:
         for thing, index in zip(where, found.rows, strict=True):
@@ -316,7 +316,7 @@ def test_a_result_survives_its_file(tmp_path: Path) -> None:
 
 
 def test_touches_of_a_point_are_neighbours_of_each_other() -> None:
-    """Three that err alike in similar postures are no blunders; one that errs alone is."""
+    """Three that err alike in similar configurations are no blunders; one that errs alone is."""
     problem = socketed()
     assert problem.touches is not None
     q = problem.data.blocks[0].q.copy()
@@ -330,22 +330,22 @@ def test_touches_of_a_point_are_neighbours_of_each_other() -> None:
 
 
 @pytest.mark.slow
-def test_a_postures_step_is_arithmetic() -> None:
+def test_a_configurations_step_is_arithmetic() -> None:
     problem = ro.load("datum_cube").problem
     place = np.array([[0.5, 0.1, 0.3], [0.6, -0.2, 0.2]])
-    q = ro.problem.postures_at(problem, place, seed=3)
-    again = ro.problem.postures_at(problem, place, seed=3)
+    q = ro.problem.configurations_at(problem, place, seed=3)
+    again = ro.problem.configurations_at(problem, place, seed=3)
     assert np.array_equal(q, again)
     low, high = problem.robot.limits.T
     assert ((q >= low) & (q <= high)).all()
     with pytest.raises(ro.InputError, match="out of reach"):
-        ro.problem.postures_at(problem, [[5.0, 0, 0]])
+        ro.problem.configurations_at(problem, [[5.0, 0, 0]])
 
 
 @pytest.mark.slow
-def test_designed_postures_tell_more_than_drawn_ones() -> None:
+def test_designed_configurations_tell_more_than_drawn_ones() -> None:
     problem = ro.load("contact").problem
-    q = ro.problem.postures_at(problem, np.tile([0.6, 0.1, 0.2], (40, 1)))
+    q = ro.problem.configurations_at(problem, np.tile([0.6, 0.1, 0.2], (40, 1)))
     design = ro.problem.choose(problem, q, 6, "D")
 
     def information(rows: np.ndarray) -> float:

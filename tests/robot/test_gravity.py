@@ -143,10 +143,10 @@ def test_kept_bends_are_neither_constant_nor_repeated_and_left_ones_are(seed: in
             assert all(np.ptp(v) > 0.02 for v in mine)
 
 
-def test_families_are_expected_to_bend_a_joint_by_a_tenth_of_a_milliradian() -> None:
+def test_extensions_are_expected_to_bend_a_joint_by_a_tenth_of_a_milliradian() -> None:
     robot = replace(ARM, gravity=ARM.gravity.carrying(3.0, (0, 0, 0.1)))
-    names = [name for of in ro.robot.families(robot).values() for name in of]
-    scales = ro.robot.family_scales(robot, names)
+    names = [name for of in ro.robot.model_extensions(robot).values() for name in of]
+    scales = ro.robot.extension_scales(robot, names)
     q = np.random.default_rng(0).uniform(-np.pi, np.pi, (300, 6))
     torques = ro.robot.gravity_torques(robot, q)
     slopes = ro.robot.moment_slopes(robot, q)
@@ -158,9 +158,9 @@ def test_families_are_expected_to_bend_a_joint_by_a_tenth_of_a_milliradian() -> 
         else:
             effect = np.ones(1)
         assert scale * np.abs(effect).max() == pytest.approx(1e-4)
-    assert ro.robot.family_scales(ARM, ["compliance1"]) == [1e-5]  # a vertical axis has no torque to go by
+    assert ro.robot.extension_scales(ARM, ["compliance1"]) == [1e-5]  # a vertical axis has no torque to go by
     with pytest.raises(ro.InputError, match="term of a joint: found 'theta1'"):
-        ro.robot.family_scales(ARM, ["theta1"])
+        ro.robot.extension_scales(ARM, ["theta1"])
 
 
 # --- where gravity points -------------------------------------------------------------------------------------------

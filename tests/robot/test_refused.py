@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.robot.extensions import EXPECTED, family_scales
+from rpim_opt.robot.extensions import EXPECTED, extension_scales
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 
@@ -43,9 +43,9 @@ def test_limits_of_some_joints_cannot_be_written(tmp_path: Path) -> None:
     assert not (tmp_path / "robot.toml").exists()
 
 
-def test_a_ratio_is_expected_to_show_as_much_as_other_families() -> None:
+def test_a_ratio_is_expected_to_show_as_much_as_other_extensions() -> None:
     """Over half a turn: 0.1 mrad or whatever is expected at the largest deflection."""
-    assert family_scales(ARM, ["ratio2"]) == pytest.approx([EXPECTED / np.pi])
+    assert extension_scales(ARM, ["ratio2"]) == pytest.approx([EXPECTED / np.pi])
 
 
 def test_a_table_of_some_angles_of_a_frame_is_added_up() -> None:

@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.robot.parameters import known_patterns, of_joint, of_term
-from rpim_opt.robot.terms import JOINT_TERMS, Joint, Posture, Weight, motion, terms_of
+from rpim_opt.robot.terms import JOINT_TERMS, Configuration, Joint, Weight, motion, terms_of
 from tests.simulate import ARM
 
 Q = np.random.default_rng(0).uniform(-2, 2, (7, 6))
@@ -109,14 +109,14 @@ def test_an_effect_that_is_not_needed_is_not_written_down() -> None:
             raise AssertionError(i, k, axis)
 
     values = {"ecc_cos1": 0.1, "compliance1": 0.0, "bend1_1x": ca.SX(0)}
-    moved = motion(("revolute",), 1, Posture([0.5], weight=Never()), lambda name: values.get(name, 0.0))
+    moved = motion(("revolute",), 1, Configuration([0.5], weight=Never()), lambda name: values.get(name, 0.0))
     assert float(moved) == pytest.approx(0.5 + 0.1 * np.cos(0.5))
 
 
-def test_what_a_joint_sees_is_what_its_posture_states() -> None:
-    joint = Joint(2, Posture([0.1, 0.2], torque=[3.0, 4.0], approach=[0.0, -1.0]))
+def test_what_a_joint_sees_is_what_its_configuration_states() -> None:
+    joint = Joint(2, Configuration([0.1, 0.2], torque=[3.0, 4.0], approach=[0.0, -1.0]))
     assert (joint.q, joint.every_q, joint.torque, joint.approach) == (0.2, [0.1, 0.2], 4.0, -1.0)
-    free = Joint(2, Posture([0.1, 0.2]))
+    free = Joint(2, Configuration([0.1, 0.2]))
     assert (free.torque, free.gravity, free.approach, free.moment(2, "x")) == (0.0, 0.0, 0.0, 0.0)
 
 

@@ -31,7 +31,9 @@ PROBLEMS = {
     ),
     "a reference without tolerance": ("position", "[0.", "[1.0, 2.0, 0.", "[value, tolerance]"),
     "all rows excluded": ("position", "[noise]", "[exclude]\nALL\n[noise]", "no remaining row (all are excluded)"),
-    "scatter below zero": ("position", "[noise]", "[scatter]\njoint_mrad = -1.0\n[noise]", "greater than or equal"),
+    "repeatability below zero": (
+        "position", "[noise]", "[repeatability]\njoint_mrad = -1.0\n[noise]", "greater than or equal"
+    ),
     "a tool that is a number": ("markers", "[tool.A]", "[tool]\nA = 3\n[tool.D]", "key tool.A: found 3"),
     "a record without a word": (
         "position", "[noise]", "[record]\nnotes = ' '\n[noise]", "0 characters, accepted: 1 to"

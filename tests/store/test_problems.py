@@ -185,7 +185,7 @@ def test_real_data_reach_the_least_squares_figures(name: str) -> None:
     assert np.sqrt(np.mean(before**2)) == pytest.approx(NOMINAL[name], rel=0.002)
 
 
-MODELLED = {  # RMS on the validation rows [mm] with families that the evidence wants
+MODELLED = {  # RMS on the validation rows [mm] with extensions that the evidence wants
     "ur5_jacobi": 0.102, "wam_jacobi": 2.08, "franka_fr3_nadeau": 1.32, "irb120_wu": 0.176, "rokae_lmpytorch": 0.086,
 }  # fmt: skip
 
@@ -241,21 +241,21 @@ def test_a_curved_valley_is_walked_to_its_end(
     assert len(calls) <= most
 
 
-def test_scatter_is_a_word_or_a_table(tmp_path: Path) -> None:
+def test_repeatability_is_a_word_or_a_table(tmp_path: Path) -> None:
     folder = tmp_path / "arm"
     shutil.copytree(problems_folder() / "position", folder)
     file = folder / "problem.toml"
     text = file.read_text(encoding="utf-8")
-    file.write_text(f'scatter = "level"\n{text}', encoding="utf-8")
+    file.write_text(f'repeatability = "level"\n{text}', encoding="utf-8")
     assert ro.load(folder).noise == "level"
-    file.write_text(f'scatter = "some"\n{text}', encoding="utf-8")
-    with pytest.raises(ro.InputError, match="key scatter: found 'some', accepted: robot"):
+    file.write_text(f'repeatability = "some"\n{text}', encoding="utf-8")
+    with pytest.raises(ro.InputError, match="key repeatability: found 'some', accepted: robot"):
         ro.load(folder)
-    file.write_text(f"{text}\n[scatter]\nposition_mm = 0.04\njoint_mrad = 0.02\n", encoding="utf-8")
+    file.write_text(f"{text}\n[repeatability]\nposition_mm = 0.04\njoint_mrad = 0.02\n", encoding="utf-8")
     instance = ro.load(folder)
     assert instance.noise == "declared"
-    assert instance.problem.scatter is not None
-    assert (instance.problem.scatter.position, instance.problem.scatter.joint) == (4e-5, 2e-5)
+    assert instance.problem.repeatability is not None
+    assert (instance.problem.repeatability.position, instance.problem.repeatability.joint) == (4e-5, 2e-5)
 
 
 def test_the_word_auto_is_for_calibrate() -> None:

@@ -110,7 +110,7 @@ def test_functions_of_a_script_are_missing_and_nothing_else(tmp_path: Path) -> N
     result = ro.calibrate(instance.problem, mine, ro.reml)
     again = saved(tmp_path, result, instance.record)
     assert np.array_equal(again.errors(), result.errors())
-    # the trusted rows' factor is a root that is squared again
+    # the kept rows' factor is a root that is squared again
     assert again.covariance == pytest.approx(result.covariance, rel=1e-13)
     q = instance.problem.data.q
     assert ro.calibration.Uncertainty(again).predict(q).expanded == pytest.approx(

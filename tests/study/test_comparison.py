@@ -102,7 +102,7 @@ def test_problems_come_in_every_form(tmp_path: Path) -> None:
             (folder / file.name).write_bytes(file.read_bytes())
     pair = (POSITION.problem, POSITION.validation)
     every = {"folder": ROOT / "problems" / "position", "name": "position", "loaded": POSITION, "pair": pair}
-    every["family"] = lambda seed: POSITION
+    every["generated"] = lambda seed: POSITION
     found = ro.compare(every, selectors=1.0, progress=False)
     assert found.problems == tuple(every)
     assert len({row["rms_mm"] for row in found.rows}) == 1

@@ -119,10 +119,10 @@ def test_problems_come_as_a_pair_or_as_a_file() -> None:
     assert file.label == "position"
 
 
-def test_a_family_returns_problems() -> None:
-    (family,) = sources_of({"mine": lambda seed: seed})
+def test_a_generator_returns_problems() -> None:
+    (generator,) = sources_of({"mine": lambda seed: seed})
     with pytest.raises(ro.InputError, match=r"problem mine: found a function of a seed that returns no problem \(7\)"):
-        family.instance(7)
+        generator.instance(7)
 
 
 def test_folds_need_as_many_configurations() -> None:

@@ -229,7 +229,7 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.study import Metric, Report
 
-QUESTION = "How do 1000 calibrations of the paper's arm scatter?"
+QUESTION = "How do 1000 calibrations of the paper's arm differ?"
 METRICS = {"mean": Metric("lower", 0.0)}
 
 

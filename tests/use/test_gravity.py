@@ -15,7 +15,7 @@ from tests.simulate import ARM
 
 SIGMA = 2e-5
 GEOMETRY = ("alpha[2-6]", "a[2-6]", "theta[2-6]", "d[2-6]")
-FAMILY = ("compliance[2345]",)
+EXTENSION = ("compliance[2345]",)
 TRUE = {"compliance2": 6e-6, "compliance3": 9e-6, "compliance4": 2e-5, "compliance5": 3e-5}
 """Of 120 Nm: joint 2 gives way by 0.7 mrad, which is 0.5 mm at the flange."""
 TOOL = (0.03, -0.02, 0.06, 0.0, 0.0, 0.0)
@@ -25,7 +25,7 @@ def arm(mounting: str = "floor", payload: float = 1.0, centre: tuple = (0.0, 0.0
     return replace(ARM, gravity=ro.robot.Gravity(payload=payload, payload_centre=centre).mounted(mounting))
 
 
-def table(robot: ro.robot.Robot, identify: tuple[str, ...] = GEOMETRY + FAMILY) -> ro.robot.Parameters:
+def table(robot: ro.robot.Robot, identify: tuple[str, ...] = GEOMETRY + EXTENSION) -> ro.robot.Parameters:
     parameters = ro.robot.model_parameters(robot, tools={"": TOOL}).identify(identify)
     scale = parameters.scale.copy()
     for i, name in enumerate(parameters.names):

@@ -12,7 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.problem.blocks import PartitionedProblem
-from rpim_opt.problem.noise import Scatter
+from rpim_opt.problem.noise import Repeatability
 from rpim_opt.use.export import export_urdf, write_all
 from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.recalibration import Cause, Moved
@@ -137,10 +137,10 @@ def test_compensation_knows_no_spread_where_the_formulation_has_none() -> None:
         ro.use.compensate(calibrated(), q=q, payload=3.0)
 
 
-def test_scatter_is_at_the_robot_that_was_found() -> None:
+def test_repeatability_is_at_the_robot_that_was_found() -> None:
     result = calibrated()
-    scattered = replace(result, problem=replace(result.problem, scatter=Scatter(1e-4, 0.0, 0.0)))
-    found = ro.use.compensate(scattered, q=checks().q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
+    noisy = replace(result, problem=replace(result.problem, repeatability=Repeatability(1e-4, 0.0, 0.0)))
+    found = ro.use.compensate(noisy, q=checks().q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     plain = ro.use.compensate(result, q=checks().q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0])
     assert np.allclose(found.q, plain.q, atol=1e-12)
 

@@ -37,7 +37,7 @@ def linear_rule(
         accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
         raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
-        program.trusted(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
+        program.inlier_model(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
     weights = grid_of(program.ridge)
     score_at = score_of(program)
     score = score_at(weights)

@@ -93,7 +93,7 @@ def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
         weight, rounds = 1.0, 0
         while True:
             z = program.solve(weight).z
-            selection = rule(program.on_squares(program.trusted(z)), *given, **options)
+            selection = rule(program.on_squares(program.inlier_model(z)), *given, **options)
             rounds += 1
             if abs(np.log(max(selection.weight, SMALLEST) / weight)) < SETTLED or rounds == ROUNDS:
                 return selection

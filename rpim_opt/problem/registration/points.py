@@ -25,7 +25,7 @@ FEWEST_ROWS = 6
 LONGEST = 3.0
 """A reflector farther from the flange [m] is none."""
 LEVER = 0.3  # length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions
-TRUSTED = 3.0
+FULL_WEIGHT = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
 LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 
@@ -301,7 +301,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
     for k in range(steps):
         if robust and k % 2 == 0:
             error = np.linalg.norm(state.residual, axis=0)
-            limit = TRUSTED * np.median(error, axis=1, keepdims=True) + 1e-12
+            limit = FULL_WEIGHT * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
             state = at(weights, state.zero, state.tools)
         step = _step(robot, candidates, pull, weights, state, damping, zeros)

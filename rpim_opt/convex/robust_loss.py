@@ -55,7 +55,7 @@ def outlying(norms: Array, count: np.ndarray) -> Array:
 
 
 @dataclass(frozen=True)
-class Trusted:
+class Inliers:
     """The equations that a robust loss keeps, times the square root of ``factor``; a `Reweigh` for blocks."""
 
     noise: float
@@ -69,7 +69,7 @@ class Trusted:
         return (norms <= limits(self.noise, self.configurations, count))[which]
 
     def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:
-        """Return the trusted equations at z (n,), and no constant."""
+        """Return the kept equations at z (n,), and no constant."""
         return kept_equations(model, self.keeps(model, z), self.factor), 0.0
 
 
@@ -82,7 +82,7 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
     return replace(model, A=A, b=b, group=model.group[keep])
 
 
-def trusted(formulation: Formulation, norms: Array, count: np.ndarray, loss: Term | None = None) -> Trusted:
+def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: Term | None = None) -> Inliers:
     """Return what a robust loss keeps, from whitened norms (N,) of configurations with ``count`` equations.
 
     Its factor is the median of loss'(v) / (2 v) over what it keeps, v the norms, or of a loss over equations norm /
@@ -105,7 +105,7 @@ def trusted(formulation: Formulation, norms: Array, count: np.ndarray, loss: Ter
     factor = float(np.median(np.abs(slope[: len(v)]) / (2 * v))) if len(v) else 0.0
     if not factor > 0:
         raise InputError(found, "a loss that rests on a few equations", accepted)
-    return Trusted(noise, len(norms), factor)
+    return Inliers(noise, len(norms), factor)
 
 
 # --- blocks of rows ---
