@@ -25,7 +25,7 @@ from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
 
-STEPS = 20
+STEPS, FIRST_STEPS, MANY = 20, 8, 40
 """Steps of a fit of base and reflectors, joint zeros too if they are free."""
 
 
@@ -43,14 +43,24 @@ def misfit(robot: Robot, points: Points) -> float:
 
 
 def misfits(robot: Robot, tries: Sequence[Points], zeros: bool = True) -> Array:
-    """Return the same (B,) of many readings of a table, joint zeros fitted by default."""
+    """Return the same (B,) of many readings of a table, joint zeros fitted by default.
+
+    Of more than `MANY` the quarter that fits best after `FIRST_STEPS` is fitted to the end: only the best one counts.
+    """
     found = np.full(len(tries), np.inf)
     sizes = np.array([len(points.row) for points in tries])
     for size in np.unique(sizes):
         some = np.flatnonzero(sizes == size)
-        chosen = [tries[int(i)] for i in some]
-        fits = fit_arms(robot, Candidates.of(robot, chosen), STEPS, zeros=zeros, robust=True)
-        found[some] = rms(fits) / [points.extent for points in chosen]
+        candidates = Candidates.of(robot, [tries[int(i)] for i in some])
+        extent = np.array([tries[int(i)].extent for i in some])
+        steps = STEPS
+        if len(some) > MANY:
+            fits = fit_arms(robot, candidates, FIRST_STEPS, zeros=zeros, robust=True)
+            found[some] = rms(fits) / extent
+            best = np.argsort(found[some])[: max(MANY, len(some) // 4)]
+            candidates = candidates._replace(zero=fits.zero, tools=fits.tools).take(best)
+            some, extent, steps = some[best], extent[best], STEPS - FIRST_STEPS
+        found[some] = rms(fit_arms(robot, candidates, steps, zeros=zeros, robust=True)) / extent
     return found
 
 

@@ -193,9 +193,7 @@ def test_results_keep_what_a_camera_saw(tmp_path: Path) -> None:
     assert again.errors(data, "pixel") == pytest.approx(result.errors(result.record.validation, "pixel"), abs=1e-9)
 
 
-@pytest.mark.parametrize(
-    "place", [pytest.param(each, marks=[pytest.mark.slow] * (i > 0)) for i, each in enumerate(STUDY.PLACES)]
-)
+@pytest.mark.parametrize("place", STUDY.PLACES)
 def test_new_makes_a_folder_from_corners(place: str, tmp_path: Path) -> None:
     rng = np.random.default_rng([7, 19])
     problem, truth = STUDY._world(place, False, rng)

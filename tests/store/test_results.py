@@ -91,10 +91,7 @@ FORMULATIONS = [
 ]
 
 
-@pytest.mark.parametrize(
-    "formulation",
-    [pytest.param(f, id=f.name, marks=[pytest.mark.slow] if f.name == "signs" else []) for f in FORMULATIONS],
-)
+@pytest.mark.parametrize("formulation", FORMULATIONS, ids=lambda f: f.name)
 def test_ready_made_formulations_can_be_solved_again(tmp_path: Path, formulation: ro.Formulation) -> None:
     problem, _ = simulated(noise=5e-5)
     result = ro.calibrate(problem, formulation, 1.0)

@@ -120,7 +120,7 @@ def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
         return (there[:, :2] / np.maximum(there[:, 2:], 1e-6) - xy).ravel()
 
     found = scipy.optimize.least_squares(
-        residual, np.zeros(6), method="lm", x_scale="jac", xtol=1e-15, ftol=1e-15, gtol=1e-15
+        residual, np.zeros(6), method="lm", x_scale="jac", xtol=1e-10, ftol=1e-15, gtol=1e-15
     )
     return pose_at(found.x), float(2 * found.cost)
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -65,6 +66,7 @@ class Points:
         return self.y.shape[1] == 1
 
 
+@lru_cache(maxsize=2)  # poses of a camera's views take seconds
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
     """Return the measured points of positions, poses and a camera's views; None where there are too few."""
     p = problem.parameters
@@ -284,15 +286,19 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
     y = np.moveaxis(candidates.y, -1, 0)
     eliminated = _anchored if coordinates == 1 else _registered
 
+    def weighted(weights: Array, zero: Array, tools: Array, where: Sequence[Array]) -> _State:
+        """Return the state of points whose kinematics (`_State.points` to `origins`) are known."""
+        base, offset, away, residual = eliminated(where[0], y, weights)
+        off = tools - candidates.stated
+        cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
+        return _State(zero, tools, base, cost, offset, *where, away, residual)
+
     def at(weights: Array, zero: Array, tools: Array) -> _State:
         """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
         turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
         tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
         points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
-        base, offset, away, residual = eliminated(points, y, weights)
-        off = tools - candidates.stated
-        cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
-        return _State(zero, tools, base, cost, offset, points, turn, axes, origins, away, residual)
+        return weighted(weights, zero, tools, (points, turn, axes, origins))
 
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
@@ -303,7 +309,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
             error = np.linalg.norm(state.residual, axis=0)
             limit = FULL_WEIGHT * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
-            state = at(weights, state.zero, state.tools)
+            state = weighted(weights, state.zero, state.tools, state[5:9])
         step = _step(robot, candidates, pull, weights, state, damping, zeros)
         tools = state.tools + step[:, :size].reshape(state.tools.shape)
         zero = state.zero
@@ -313,7 +319,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
         better = candidate.cost < state.cost
         before = state.cost
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
-        state = state.where(better, candidate)
+        state = candidate if better.all() else state.where(better, candidate)
         quiet = 0 if (before - state.cost > 1e-9 * before).any() else quiet + 1
         if quiet == 5:
             break
@@ -358,6 +364,11 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
     return np.stack([x, y, z]), p, axes, origins
 
 
+def _cross(a: Array, b: Array) -> Array:
+    """Return a x b (3, ...): `numpy.cross` takes three times as long."""
+    return np.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
+
+
 def _step(
     robot: Robot, candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool
 ) -> Array:
@@ -365,7 +376,8 @@ def _step(
     B, N, coordinates = candidates.y.shape
     M = len(candidates.stated)
     dof = state.zero.shape[1] if zeros else 0
-    J = np.zeros((B, 3 * M + dof, 3, candidates.q.shape[1]))
+    turning = 3 * (coordinates == 3)
+    J = np.zeros((B, 3 * M + dof + turning, 3, candidates.q.shape[1]))
     for m in range(M):
         seen = candidates.marker == m
         for k in range(3):
@@ -373,8 +385,10 @@ def _step(
     for j in range(dof):
         slope = state.axes[j]
         if robot.joint_types[j] == "revolute":
-            slope = np.cross(slope, state.points - state.origins[j], axis=0)
+            slope = _cross(slope, state.points - state.origins[j])
         J[:, 3 * M + j] = np.moveaxis(slope, 0, 1)
+    for k in range(turning):  # about the base's axes
+        J[:, 3 * M + dof + k, k - 2], J[:, 3 * M + dof + k, k - 1] = -state.away[k - 1], state.away[k - 2]
     if coordinates == 1:
         if J.shape[-1] == 2 * N:
             J = J[..., 1::2] - J[..., ::2]
@@ -382,9 +396,6 @@ def _step(
         J = np.einsum("bcin,ibn->bcn", J, unit)[:, :, None]
         if candidates.q.shape[1] == N:  # the anchor, and the offset as the mean
             J = np.concatenate([J, np.moveaxis(unit, 0, 1)[:, :, None]], axis=1)
-    else:
-        turns = [np.cross(axis[:, None, None], state.away, axis=0) for axis in np.eye(3)]
-        J = np.concatenate([J, np.stack(turns).transpose(2, 0, 1, 3)], axis=1)
     if candidates.q.shape[1] == N:
         share = (weights / weights.sum(axis=1, keepdims=True))[:, None, None]
         J -= (J * share).sum(axis=-1, keepdims=True)
