@@ -214,7 +214,11 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         "joint 2 has one and the same value in rows P21 to P40",
     ),
     "signs of joint 3 lost": (of_joint(2, np.abs), "no value of column q3 is negative"),
-    "signs of positions lost": (values(np.abs), "no value of column x, y and z is negative"),
+    # about the middle: where all y are negative, their signs lost are a mirrored frame, and that is what is named
+    "signs of positions lost": (
+        values(lambda y: np.abs(y - y.mean(axis=0))),
+        "no value of column x, y and z is negative",
+    ),
     "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "columns x and y have the same values"),
     "z a column of RMS": (values(lambda y: y * [1, 1, 1e-5]), "column z spreads over"),
     "x sorted alone": (
