@@ -21,6 +21,7 @@ from rpim_opt.problem.diagnosis import (
     mixed_reflectors,
     moved_far,
     odd_columns,
+    odd_joint,
     part_way,
     rounded,
     rows_without_values,
@@ -144,7 +145,7 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be
         return found
-    return list(odd_columns(problem)) or list(unrelated_rows(problem, error))
+    return list(odd_columns(problem)) or list(odd_joint(problem)) or list(unrelated_rows(problem, error))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

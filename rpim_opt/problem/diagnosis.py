@@ -25,9 +25,10 @@ from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
-from rpim_opt.problem.registration.points import lengths_of, points_of
+from rpim_opt.problem.registration.points import Points, lengths_of, points_of
 from rpim_opt.problem.row_functions import repeatable
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
@@ -60,10 +61,14 @@ BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
 UNRELATED = 0.5
 """Part of the spread of positions that a fit leaves where joint values do not explain them."""
+ON_GRID = 2e-4
+"""Part of a step by which rounded values may miss it, for their last decimal."""
+NARROWER, GRID = 0.25, 61
+"""Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
 MOST_ROUNDS = 20
-"""Of telling rows of one reflector from those of another."""
+"""Of telling rows of one reflector from those of another, and of fitting one joint's values."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 SPANS = 12
@@ -481,13 +486,13 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
         lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
         values = 1e3 * block.y[:, lengths]
         exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
-        digits = [*(np.full(values.shape, each) for each in (2, 1, 0)), exponents - 2, exponents - 3]
-        units = (10.0**each for each in digits)  # 100, 10 or 1 for all, or the last of 3 or 4 digits
-        exact = (unit for unit in units if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < 1e-6)
+        gaps = np.diff(np.unique(values))  # a grid of any step, or the last of 3 or 4 digits
+        units = (np.full(values.shape, gaps.min(initial=np.inf)), 10.0 ** (exponents - 2), 10.0 ** (exponents - 3))
+        exact = (unit for unit in units if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < ON_GRID)
         unit = next(exact, np.zeros(values.shape))
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
         remedy = "export more decimals, or state the rounding as their noise"
-        found.append((f"measured values are rounded to {unit.max(initial=0.0):g} mm", made, remedy))
+        found.append((f"measured values are rounded to {unit.max(initial=0.0):.4g} mm", made, remedy))
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
@@ -559,6 +564,56 @@ def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
             unsigned += [*("xyz" if y.min() >= 0 else "")]
         if unsigned and len(q) >= 2 * FEWEST:
             yield f"no value of column {joined(unsigned)} is negative: were signs lost?"
+
+
+def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
+    """Report a joint whose values explain nothing: if every row may have its own, the other joints explain the points.
+
+    Base, reflectors and the joint's values are fitted in turn, the values on a grid that gets narrower.
+    """
+    points = points_of(problem)
+    if points is None or len(points.row) < 2 * FEWEST or points.turns is not None:
+        return
+    robot = problem.robot
+    whole = misfit(robot, points)
+    fitted = [(_values_that_fit(robot, points, i), i) for i in range(robot.dof) if robot.joint_types[i] == "revolute"]
+    left = [misfit(robot, replace(points, q=q)) for q, _ in fitted]
+    best = int(np.argmin(left))
+    if left[best] >= FITS * whole:
+        return
+    q, i = fitted[best]
+    stated, found = points.q[:, i], q[:, i]
+    apart = np.abs(np.angle(np.exp(1j * (found - stated))))
+    label = [problem.data.label[row] for row in points.row]
+    odd = [label[k] for k in np.flatnonzero(apart > LEAST_TRAVEL["revolute"] / 2)]
+    what = f"{_rows(odd, 'has', 'have')} wrong values of joint {i + 1}"
+    if len(odd) > len(label) / 2:
+        what = f"the values of joint {i + 1} explain nothing (sorted, shuffled or scaled alone, or another quantity?)"
+    yield (
+        f"{what}: with other ones the points fit to {three_digits(1e3 * left[best] * points.extent)} mm instead of "
+        f"{three_digits(1e3 * whole * points.extent)} mm; check column q{i + 1}."
+    )
+
+
+def _values_that_fit(robot: Robot, points: Points, joint: int) -> Array:
+    """Return joint values (N, dof) in which one joint's are those that fit best."""
+    q, width = points.q, np.pi
+    rows = np.arange(len(q))
+    steps = np.linspace(-1, 1, GRID)
+    around: Any = 0.0
+    for _ in range(MOST_ROUNDS):
+        fit = placed(robot, replace(points, q=q))
+        tries = np.repeat(q[:, None], GRID, axis=1)
+        tries[..., joint] = around + width * steps
+        frames = fit.base @ forward_kinematics(robot, tries.reshape(-1, robot.dof))
+        tips = np.repeat(fit.tools[points.marker], GRID, axis=0)
+        modelled = np.einsum("kij,kj->ki", frames[:, :3, :3], tips) + frames[:, :3, 3]
+        error = np.linalg.norm(points.y[:, None] - modelled.reshape(len(q), GRID, 3), axis=2)
+        chosen = tries[rows, error.argmin(axis=1)]
+        if width < np.pi or np.array_equal(chosen, q):
+            around, width = chosen[:, [joint]], width * NARROWER
+        q = chosen
+    return q
 
 
 def decimals_of(values: Array) -> int | None:
@@ -731,8 +786,10 @@ def _moves(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterato
             causes[what] = "did it, or the robot's base, move"
             parts.setdefault(what, set()).update(of_fixture(name, block.fixture) for name in names)
     placed_by = [what for what in causes if what != "reflector"]
-    for i, kind in enumerate(problem.robot.joint_types, start=1):
-        parts[f"zero of joint {i}"] = {f"{'theta' if kind == 'revolute' else 'd'}{i}"}
+    zeros = _zeros(problem.robot)
+    parts |= {f"zero of joint {i}": {name} for i, name in enumerate(zeros, start=1)}
+    parts["set of joint zeros"] = set(zeros)
+    causes["set of joint zeros"] = "did several joints slip, or were they remastered"
     of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
     if len(data) < 2 * FEWEST or not any(of[what] for what in placed_by):
         return
@@ -757,13 +814,17 @@ def _moves(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterato
             yield model.A[:, some] * inside[:, None], partial(say, what, start, end)
 
 
+def _zeros(robot: Robot) -> list[str]:
+    """Return the names of the parameters that joint zeros are."""
+    return [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, start=1)]
+
+
 def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[tuple[Array, Say]]:
     """Yield the column (m, 1) of every gear ratio and coupling, and of a lag of all joints."""
     robot, free = problem.robot, problem.parameters.free
     slopes = model.A / free.scale
     q = problem.joint_values
-    zeros = [f"{'theta' if kind == 'revolute' else 'd'}{i}" for i, kind in enumerate(robot.joint_types, 1)]
-    of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(zeros) if name in free.names}
+    of_zero = {i: slopes[:, free.names.index(name)] for i, name in enumerate(_zeros(robot)) if name in free.names}
 
     def gear(i: int, j: int, coefficients: Array) -> tuple[str, str]:
         factor = coefficients[0]

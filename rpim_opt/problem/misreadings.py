@@ -248,6 +248,13 @@ def _of_positions() -> Iterator[Reading]:
         directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
         return replace(points, y=points.y[:, [2]] * directions)
 
+    def from_cylinder(points: Points) -> Points:
+        radius, angle, height = points.y.T
+        angle = np.radians(angle / 1e-3)
+        return replace(points, y=np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height]))
+
+    what = "columns x, y, z that are radius, angle and height (cylindrical coordinates)"
+    yield Reading(what, "convert them to x, y, z", from_cylinder)
     remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
     yield Reading("columns x, y, z that are azimuth, elevation and distance", remedy, from_angles)
     remedy = "change the sign of one coordinate, or exchange two"

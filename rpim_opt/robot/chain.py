@@ -144,6 +144,8 @@ def require_same_arm(
     if deviation[joint, column] > ANOTHER_ARM:
         found = f"{MDH[column]}{joint + 1} off by {deviation[joint, column]:.3g} m or rad"
         accepted = "a robot whose parameters were identified from this file's"
+        if np.pi - deviation[joint, column] < ANOTHER_ARM:
+            accepted += "; half a turn: --urdf-base with the link where its chain begins, such as base_link_inertia"
         raise InputError("robot", found, accepted, file)
 
 
