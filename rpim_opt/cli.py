@@ -292,8 +292,9 @@ def new(
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
             )  # fmt: skip
-    document = {"written": [made.folder], "rows": made.rows, **made.understood.content(), "notes": made.notes}
-    return Answer(made, document)
+    said = made.understood.content()
+    said["notes"] += made.notes
+    return Answer(made, {"written": [made.folder], **said})
 
 
 @command

@@ -766,6 +766,10 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if transmission:
         tried += [*_gears(problem, model), *_scales(problem, x, model)]
     found = _added(model, x, [columns for columns, _ in tried])
+    several = list(_moves(problem, x, model, several=True))
+    other = _added(model, x, [columns for columns, _ in several])
+    if other is not None and (found is None or other[2] < MOVED * found[2]):
+        tried, found = several, other
     if found is not None:
         number, coefficients, rest = found
         what, remedy = tried[number][1](coefficients)
@@ -773,8 +777,10 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
             yield f"{what} (that leaves {100 * rest:.0f} % of the residuals): {remedy}."
 
 
-def _moves(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[tuple[Array, Say]]:
-    """Yield the columns (m, c) of a base, fixture, reflector or joint zero that moved."""
+def _moves(
+    problem: CalibrationProblem, x: Array, model: LinearModel, *, several: bool = False
+) -> Iterator[tuple[Array, Say]]:
+    """Yield the columns (m, c) of a base, fixture, reflector or joint zero that moved, or of ``several`` zeros."""
     free, data = problem.parameters.free, problem.data
     markers = {marker for block in data.blocks for marker in block.markers}
     parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
@@ -788,10 +794,11 @@ def _moves(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterato
     placed_by = [what for what in causes if what != "reflector"]
     zeros = _zeros(problem.robot)
     parts |= {f"zero of joint {i}": {name} for i, name in enumerate(zeros, start=1)}
-    parts["set of joint zeros"] = set(zeros)
+    if several:
+        parts = {"set of joint zeros": set(zeros)}
     causes["set of joint zeros"] = "did several joints slip, or were they remastered"
     of = {what: [k for k, name in enumerate(free.names) if name in names] for what, names in parts.items()}
-    if len(data) < 2 * FEWEST or not any(of[what] for what in placed_by):
+    if len(data) < 2 * FEWEST or not (several or any(of[what] for what in placed_by)):
         return
     equations = Equations.of(data)
 

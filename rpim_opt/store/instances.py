@@ -28,7 +28,7 @@ from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.record import Record
-from rpim_opt.data.tables.reading import read_data, robodk_columns
+from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import together
 from rpim_opt.problem.problem import CalibrationProblem
@@ -149,7 +149,8 @@ def load(
         return _of_chains(stated, {each: load(name, variant, measurements, model, each) for each in stated.chains})
     table = stated.table
     path = stated.path
-    data, files, tools = _read_tables(stated)
+    data, files = _read_tables(stated)
+    tools = stated.tools
     validation = data.get("validation")
     with in_file(path):
         rows = data["identification"]
@@ -283,11 +284,9 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
 # --- the tables of a folder, without the excluded rows -----------------------------------------------------------
 
 
-def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files, Tools]:
-    """Return the measurements and the names of their files by role, and where the reflectors start."""
+def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files]:
+    """Return the measurements and the names of their files by role."""
     exclude = stated.table.exclude
-    # RoboDK's export states the tools [mm] itself, in the file's order; the file's own go before them
-    tcps = {marker: [1e3 * v for v in frame[:3]] for marker, frame in stated.tools.items() if stated.table.tool}
     files: dict[str, list[str]] = {role: [] for role in ROLES}
     parts: dict[str, list[Dataset]] = {role: [] for role in ROLES}
     for each in stated.observations:
@@ -295,7 +294,7 @@ def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files, Tools]
             file = getattr(each, role)
             if file:
                 files[role].append(file)
-                parts[role].append(_read(stated, each, stated.path.parent / file, tcps))
+                parts[role].append(_read(stated, each, stated.path.parent / file))
     data = {
         role: Dataset.together(parts[role], [Path(file).stem for file in files[role]]) for role in ROLES if files[role]
     }
@@ -309,27 +308,19 @@ def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files, Tools]
             file = stated.path.parent / files[role][0]
             raise InputError("the table", "no remaining row (all are excluded)", "at least one", file)
         data[role] = _with_known(rest, stated.table, role, stated.path)
-    tools = stated.tools
-    if any(each.layout == "robodk" for each in stated.observations):
-        exported = {marker: (*(1e-3 * v for v in tcp), 0.0, 0.0, 0.0) for marker, tcp in tcps.items()}
-        tools = {marker: stated.tools.get(marker, place) for marker, place in exported.items()}
-    return data, files, tools
+    return data, files
 
 
-def _read(stated: ProblemFile, each: Observation, path: Path, tcps: dict[str, list[float]]) -> Dataset:
+def _read(stated: ProblemFile, each: Observation, path: Path) -> Dataset:
     kind = stated.kinds[each.measurement]
-    robodk = each.layout == "robodk"
     source: Any = path
     try:
         if stated.board is not None and kind.by_camera:
             with in_file(path):
                 source = on_board(read_columns(path), stated.board)
-        elif robodk:
-            source = robodk_columns(path, stated.robot.joint_dimensions, tcps)
         return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
     except InputError as error:
-        at_fault = path if robodk and error.where.startswith("row") else stated.path
-        raise error.within(at_fault) from None
+        raise error.within(stated.path) from None
 
 
 # --- [[known_distance]] and [[known_angle]] between touched points and planes ------------------------------------

@@ -62,7 +62,7 @@ CAMERA_CLEARLY = 3.0
 
 @dataclass(frozen=True)
 class Started:
-    """A new folder: its files with their rows, and notes on everything recognized or guessed."""
+    """A new folder: its files with their rows, notes on what was guessed, and what was understood of the tables."""
 
     folder: Path
     rows: Mapping[str, int]
@@ -127,7 +127,6 @@ def new_problem(
     board = stated_target(target, names[TARGET])
     kind, how = _kind(arm, found, board, measurement)
     noise = usual_noise(kind)
-    notes = list(found.sentences)
     rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
     columns = found.columns
     if "label" not in columns:  # a row keeps its number where others are held out
@@ -138,7 +137,8 @@ def new_problem(
         other = understand_of(arm, [validation], kind.name, found.options)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[names[VALIDATION]] = other.columns
-        notes += other.sentences
+        if understood is not None:
+            understood(other)
         said = f'validation = "{names[VALIDATION]}"\n# from {Path(validation).name}; used for no choice'
     elif hold_out is not None:
         known = len(np.unique(rows.configuration))
@@ -191,13 +191,12 @@ def new_problem(
                 write_robot(arm.robot, made / "robot.toml")
             made.rename(folder)
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    assumed = ", ".join(
-        f"{name.rpartition('_')[0]} {value:g} {name.rpartition('_')[2]}" for name, value in noise.items()
-    )
-    notes += [f"Measurement {kind.name}: {how}.", guessed]
-    notes.append(
-        f"Assumed where no column states it: measurement noise (1 sigma) {assumed}; change [noise] in problem.toml."
-    )
+    assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
+    notes = [
+        f"Measurement {kind.name}: {how}.",
+        guessed,
+        f"Assumed measurement noise (1 sigma) where no column states it: {assumed}, in [noise] of problem.toml.",
+    ]
     if before:
         notes.append(SHARED)
     elif chain:

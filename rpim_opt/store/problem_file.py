@@ -32,7 +32,6 @@ from rpim_opt.robot.terms import Term
 from rpim_opt.store.own_code import is_own, own_object
 from rpim_opt.store.statements import Constraints, PriorTable, part
 
-Layout = Literal["named", "robodk"]
 Model = Literal["geometry", "auto"]
 LEARNED_NOISE = ("robot", "free", "level", "declared")
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -150,7 +149,6 @@ class Observation(Table):
     """Tables of one kind of measurement: ``[[observation]]``."""
 
     measurement: str = "position"
-    layout: Layout = "named"
     identification: str
     validation: str | None = None
     noise: dict[str, Any] = Field(default_factory=dict)
@@ -179,8 +177,6 @@ class ProblemTable(Table):
     """Measurement type; one of your own is mine:height, the Measurement `height` in mine.py (--allow-code)."""
     terms: list[str] = Field(default_factory=list)
     """Terms of your own: mine:droop is the Term `droop` in mine.py (--allow-code)."""
-    layout: Layout = "named"
-    """named: columns by name; robodk: RoboDK's export."""
     identification: str | None = None
     """Table of the identification data."""
     validation: str | None = None
@@ -294,7 +290,7 @@ def read_problem(
         table, placed = _checked(_overlay(own, table.chain[chain or chains[0]]), kinds, path)
     observations = list(table.observation)  # behind that of the top level
     if table.identification is not None:
-        keys = ("measurement", "layout", "identification", "validation")
+        keys = ("measurement", "identification", "validation")
         observations.insert(0, Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={}))
     if not observations:
         raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)

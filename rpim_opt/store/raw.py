@@ -93,19 +93,6 @@ class Understanding:
         what = "pixels of a camera" if self.kind.by_camera else f"measurement {self.kind.name}"
         return "\n\n".join(parts) + "\n" + "\n".join([*self.notes, f"{self.count} rows, {what}."])
 
-    @property
-    def sentences(self) -> tuple[str, ...]:
-        """The interpretation as sentences, without unchanged columns."""
-        said = []
-        for each in self.tables:
-            said += [f"{each.file}: {note}" for note in each.notes]
-            renamed = [f"{m.column} is {m.name}" for m in each.meant if m.name and m.name != m.column]
-            if renamed:
-                said.append(f"{each.file}: {', '.join(renamed)}.")
-            if each.left_out:
-                said.append(f"{each.file}: left out {', '.join(each.left_out)}.")
-        return (*said, *self.notes)
-
     def content(self) -> dict[str, Any]:
         """Return the same as a document."""
         said = [f"{each.file}: {note}" for each in self.tables for note in each.notes]

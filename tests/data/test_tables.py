@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import shutil
 import sys
 from pathlib import Path
 
@@ -14,7 +12,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.store.problem_file import problems_folder
 from tests.simulate import ARM
 from tests.test_cli import run
 
@@ -249,32 +246,6 @@ def test_rows_at_the_same_joint_values_are_one_configuration() -> None:
     again = both.take([3, 0, 0])
     assert again.label == ("two:2", "one:1", "one:1")
     assert again.q[:, 0] == pytest.approx(np.radians([2, 1, 1]))
-
-
-def test_robodks_export_is_read_by_position(monkeypatch, capsys, tmp_path: Path) -> None:
-    folder = Path(shutil.copytree(problems_folder() / "markers", tmp_path / "robodk"))
-    tool = {"A": (40, 0, 30), "B": (0, 40, 30), "C": (-40, 0, 50)}
-    for name in ("identification", "validation"):
-        with (folder / f"{name}.csv").open(newline="") as stream:
-            rows = list(csv.DictReader(stream))
-        lines = ["J1,J2,J3,J4,J5,J6,X,Y,Z,TCP X,TCP Y,TCP Z"]
-        for row in rows:
-            figures = [row[f"q{i}_deg"] for i in range(1, 7)] + [row[f"{c}_mm"] for c in "xyz"]
-            lines.append(",".join([*figures, *(str(v) for v in tool[row["marker"]])]))
-        (folder / f"{name}.csv").write_text("\n".join(lines))
-    text = (folder / "problem.toml").read_text()
-    start, end = text.index("[tool.A]"), text.index("[simulation]")
-    text = text[:start] + text[end:]
-    (folder / "problem.toml").write_text(
-        text.replace('measurement = "position"', 'measurement = "position"\nlayout = "robodk"')
-    )
-    ours, theirs = ro.load("markers"), ro.load(folder)
-    assert sorted(b.markers for b in theirs.problem.data.blocks) == [("A",), ("B",), ("C",)]
-    mean = [ro.calibrate(i.problem, i.formulation, i.weight).errors(i.validation).mean() for i in (ours, theirs)]
-    assert mean[0] == pytest.approx(mean[1], rel=1e-6)
-    (folder / "identification.csv").write_text("J1,J2\n1,2\n")
-    assert run(monkeypatch, "calibrate", str(folder)) == 2
-    assert "identification.csv, the header: found 2 columns, accepted: 6 joints" in capsys.readouterr().err
 
 
 def test_excel_says_what_is_missing(monkeypatch, tmp_path: Path) -> None:

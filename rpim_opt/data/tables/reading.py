@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, count
-from pathlib import Path
-from string import ascii_uppercase
 from typing import Any
 
 import numpy as np
@@ -14,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
-from rpim_opt.basics.units import LARGEST, SMALLEST, joint_columns, spelled, split_unit, with_unit
+from rpim_opt.basics.units import LARGEST, SMALLEST, spelled, split_unit, with_unit
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
@@ -281,30 +278,3 @@ def require_unique(names: Sequence[str], column: str) -> None:
         if not name or name in seen:
             raise InputError(f"row {i}, column {column}", f"'{name}'", f"a unique {column}")
         seen.add(name)
-
-
-# --- RoboDK ----------------------------------------------------------------------------------------------------------
-
-
-def robodk_columns(path: str | Path, joints: Sequence[str], tools: dict[str, list[float]]) -> Columns:
-    """Return the columns of RoboDK's export of calibration measurements, which are identified by order.
-
-    They are the joints [deg or mm], the measured point x, y, z [mm], and the reflector in the flange frame x, y, z [mm]
-    (RoboDK's macro library reads it so). ``joints`` are "angle" or "length" each; ``tools`` are the reflectors that are
-    known, marker to x, y, z [mm], to which new ones are added as A, B, ...
-    """
-    with in_file(path):
-        table = list(read_columns(Path(path)).values())
-        names = [*joint_columns(joints), "x_mm", "y_mm", "z_mm"]
-        if len(table) < len(names) + 3:
-            accepted = f"{len(joints)} joints, 3 measured and 3 of the tool"
-            raise InputError("the header", f"{len(table)} columns", accepted)
-        places = np.column_stack([numbers(table[i], f"{i + 1}") for i in range(len(names), len(names) + 3)])
-    markers = []
-    for place in places:
-        name = next((name for name, known in tools.items() if np.allclose(known, place, atol=1e-6)), None)
-        if name is None:
-            name = next(new for new in chain(ascii_uppercase, (f"M{i}" for i in count(1))) if new not in tools)
-            tools[name] = place.tolist()
-        markers.append(name)
-    return {**dict(zip(names, table, strict=False)), "marker": markers}
