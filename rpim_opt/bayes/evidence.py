@@ -309,7 +309,6 @@ class Evidence:
         gradient[s:] = by_noise
         # how the mean follows noise, and e^2 at constant local variances
         z_by_noise = -C @ f.T
-        among = among + 2 * f @ z_by_noise
         direct = np.zeros_like(of_size)
         direct[:, s:] = C_by_noise + 2 * z[:, None] * z_by_noise
         information = np.where(own, 1 / v, 0.0)
@@ -320,12 +319,12 @@ class Evidence:
         curvature = np.zeros((len(logs), len(logs)))
         curvature[:s] = of_size[:, :s].T @ slopes / 2
         curvature[s:, :s] = curvature[:s, s:].T
-        curvature[s:, s:] = among + 2 * np.diag(by_noise) - direct[:, s:].T @ (information[:, None] * log_v[:, s:])
+        precision = information[:, None] * log_v
+        curvature[s:, s:] = among + 2 * (f @ z_by_noise + np.diag(by_noise)) - direct[:, s:].T @ precision[:, s:]
         if prior.spectrum is not None:
             curves = slice(s - len(CURVES), s)
             curvature[curves, curves] += np.tensordot(1 - e2 / v, bend, axes=1)
         off = self.root @ (logs - self.centre)
-        precision = information[:, None] * log_v
         of_z = C @ (z[:, None] * precision)
         of_z[:, s:] += z_by_noise
         return Point(
@@ -405,25 +404,20 @@ class Evidence:
         self, parts: Sequence[Whitened], size2: Array, v: Array, accuracy: float
     ) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v, which are solved jointly; curves are integrated out first."""
-        prior = self.prior
+        spectrum = self.prior.spectrum
         p = len(size2)
-        g = p if prior.spectrum is None else p - len(prior.spectrum.w2)
+        g = p if spectrum is None else p - len(spectrum.w2)
         X = np.concatenate([part.X.reshape(-1, p) for part in parts])
         y = np.concatenate([part.y.ravel() for part in parts])
-        regression, own, logdet = np.zeros((0, g + 1)), np.zeros((0, 0)), 0.0
-        equations = np.column_stack([X[:, :g], y])
-        if g < p:
-            information, regression, own, logdet = _eliminated(X[:, g:], equations, size2[g:])
-        else:
-            information = equations.T @ equations
-        rows = prior.rows[:, :g]
+        information, regression, own, logdet = _eliminated(X[:, g:], np.column_stack([X[:, :g], y]), size2[g:])
+        rows = self.prior.rows[:, :g]
         H = information[:g, :g] + rows.T @ rows
-        h = information[:g, g] + rows.T @ prior.values
+        h = information[:g, g] + rows.T @ self.prior.values
         z, C, more, v = self._known(H, h, size2[:g], v[:g], accuracy)
         follow = regression[:, :g] @ C
-        whole = np.block([[C, -follow.T], [-follow, own + follow @ regression[:, :g].T]])
+        C = np.block([[C, -follow.T], [-follow, own + follow @ regression[:, :g].T]])
         z = np.append(z, regression[:, g] - regression[:, :g] @ z)
-        return z, whole, logdet + more, np.append(v, size2[g:])
+        return z, C, logdet + more, np.append(v, size2[g:])
 
     def _known(self, H: Array, h: Array, size2: Array, v: Array, accuracy: float) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v of all but curves, from their information matrix H and vector h."""
@@ -556,6 +550,8 @@ def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Arr
     Return the information G'K^-1 G of the equations, K = I + U diag(v) U', the regression C U'G of the coefficients on
     them, C = (U'U + diag(1 / v))^-1 and -ln|C|; by Cholesky's factor of K or of C^-1, whichever is smaller.
     """
+    if not len(v):
+        return equations.T @ equations, np.zeros((0, equations.shape[1])), np.zeros((0, 0)), 0.0
     if len(U) < len(v):
         root = np.sqrt(v)
         scaled = U * root

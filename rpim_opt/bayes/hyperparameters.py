@@ -41,8 +41,6 @@ CLOSE = 0.1
 """Scales (RMS) up to which the posterior mean at one linearization stands for a fit."""
 ITERATIONS = 6
 """Of the first fit between two estimates, twice as many in every later one: the first estimates change soon."""
-DISTINCT = 0.3
-"""Logarithms of hyperparameters by which two optima differ."""
 VAGUE = 1.0
 """Standard deviation of a logarithm from which on a scale of the geometry is hardly identified."""
 FLATTEST = 0.05
@@ -256,8 +254,7 @@ class Estimator:
         continued, since where few data leave frames far from their start, their order changes with the linearization.
         """
         first = self._once(problem, x, before, before is None, ITERATIONS)
-        distinct = [other for other in first.others if np.abs(other.logs - first.point.logs).max() > DISTINCT]
-        fits = [first, *(self._once(problem, x, other.logs, False, ITERATIONS) for other in distinct)]
+        fits = [first, *(self._once(problem, x, other.logs, False, ITERATIONS) for other in first.others)]
         for i, fit in enumerate(fits):
             for k in range(1, rounds):
                 again = self._once(problem, fit.x, fit.point.logs, False, ITERATIONS * 2**k)
