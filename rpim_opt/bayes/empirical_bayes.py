@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
-from rpim_opt.bayes.outliers import beyond_noise, suspects, unexplained
+from rpim_opt.bayes.outliers import beyond_noise, outlier_candidates, unexplained
 from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.blocks import Source
@@ -108,12 +108,12 @@ def _without_outliers(
             return fit, ()
         return select_model(estimator, fit)
 
-    outliers = suspects(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
+    outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = explain(outliers)
     for _ in range(LOOKS):  # what extensions explain, and the worst outliers, stood before the smaller ones
         if not outliers and not (trials and trials[0].extensions):
             break
-        more = suspects(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
+        more = outlier_candidates(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
         if not more.keys() - outliers.keys():
             break
         outliers = {**more, **outliers}

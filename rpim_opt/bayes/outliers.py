@@ -118,7 +118,7 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     return scale * z
 
 
-def suspects(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
+def outlier_candidates(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
     """Return the rows that may be outliers, as a mapping from label to error over the median.
 
     At deviations x (n,) of a squared fit, of prior scales (n,) [SI], that left over a part ``spare`` of the equations.

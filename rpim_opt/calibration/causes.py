@@ -100,7 +100,7 @@ def likely_causes(result: Outcome) -> list[str]:
         if ratio > NOISY:
             noise = f"{three_digits(ratio)} times the stated noise"
             signs.append(f"residuals {noise}, including the degrees of freedom of transmission errors")
-    # no drawing is as wrong as that; what was learned to be large is not what was expected
+    # no nominal model is as wrong as that; an estimated scale is not the expected one
     expected = free.scale if learned is None else learned.stated
     largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
     share = np.abs(result.x) / np.maximum(largest, SCALES * expected)

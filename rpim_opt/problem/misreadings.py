@@ -85,11 +85,11 @@ def pose_misfit(robot: Robot, data: Dataset) -> float:
 BETTER = 0.2
 """Another reading of the data is reported when it leaves less than this part of the position error."""
 SIBLING, SIBLING_BETTER = 0.1, 0.5
-"""A ready robot whose drawing differs by less than this [m, rad] is reported from this part of the error on."""
+"""A ready robot whose nominal parameters differ by less [m, rad] is reported from this part of the error on."""
 FURTHER = 0.7
 """A second mistake is looked for behind a reading that leaves less than this part."""
 WRONG = 0.02
-"""Points that are off by more than this part of their extent fit no drawing of their robot."""
+"""Points that are off by more than this part of their extent fit no nominal model of their robot."""
 LEFT = 0.05
 """What leaves more than this part of the extent explains nothing, even if gross errors are behind it."""
 FEW = 30
@@ -400,9 +400,9 @@ def _other_robots(robot: Robot, points: Points) -> Iterator[Reading]:
 def better_reading(problem: CalibrationProblem) -> Better | None:
     """Return the interpretation that fits far better than the table as written, or None.
 
-    Single mistakes are tried first, then a second and a third one behind the best of them; where the drawing cannot be
-    right, all orders of up to six joints, and the ready robots. Base or anchor and reflectors are fitted anew for every
-    reading.
+    Single mistakes are tried first, then a second and a third one behind the best of them; where the nominal model
+    cannot be right, all orders of up to six joints, and the ready robots. Base or anchor and reflectors are fitted anew
+    for every reading.
     """
     points = points_of(problem) or lengths_of(problem)
     if points is None:
@@ -428,7 +428,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
             if not left < BETTER * stated:
                 chain, left = _best(robot, points, list(readings(robot, points)))
     if not left < BETTER * stated or (left > LEFT and not points.seen):
-        # a ready robot of nearly the same drawing, a UR10 for a UR10e
+        # a ready robot of nearly the same nominal parameters, a UR10 for a UR10e
         own = misfit(robot, points)
         for each in [] if points.seen else _other_robots(robot, points):
             if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:

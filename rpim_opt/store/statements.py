@@ -153,7 +153,7 @@ class PriorTable(Table):
     earlier: str = Field(default="", alias="from")
     without: list[str] = Field(default_factory=list)
     inflate: float | int = 1.0
-    fleet: list[str] = Field(default_factory=list)
+    population: list[str] = Field(default_factory=list)
     tails: float | int = 3.0
     groups: list[str] = Field(default_factory=list)
     joint_offset: float | int = FACTOR
@@ -163,7 +163,7 @@ class PriorTable(Table):
 
     def files(self, path: Path) -> dict[str, Path]:
         """Return the files of the prior in the problem's folder, by their names in the problem file."""
-        named = [(file, "key prior.fleet") for file in self.fleet]
+        named = [(file, "key prior.population") for file in self.population]
         if self.earlier:
             named.append((self.earlier, "key prior.from"))
         found = {}
@@ -221,8 +221,9 @@ def stated_prior(
         if table.earlier:
             earlier = results[table.earlier]
             parts.append(("from", lambda: Prior.from_result(earlier(), table.inflate, table.without)))
-        if table.fleet:
-            parts.append(("fleet", lambda: Prior.from_population({name: results[name]() for name in table.fleet})))
+        if table.population:
+            arms = {name: results[name] for name in table.population}
+            parts.append(("population", lambda: Prior.from_population({name: arm() for name, arm in arms.items()})))
     for key, read in parts:
         try:
             prior &= read()

@@ -10,7 +10,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
-from rpim_opt.bayes.outliers import clustered, error_ratios, resistant_fit, suspects, unexplained
+from rpim_opt.bayes.outliers import clustered, error_ratios, outlier_candidates, resistant_fit, unexplained
 
 POSITION = ro.load("position").problem
 
@@ -349,7 +349,7 @@ def test_a_fit_that_swallows_its_data_suspects_nobody() -> None:
     few = spoiled(POSITION.on(POSITION.data.take(range(8))), [2], 3e-3)
     x = ro.calibrate(few, weight=1e-6).x
     scale = few.parameters.free.scale
-    assert suspects(few, x, scale, spare=0.1) == {}
+    assert outlier_candidates(few, x, scale, spare=0.1) == {}
 
 
 def test_a_resistant_fit_is_not_pulled() -> None:

@@ -109,7 +109,7 @@ def test_another_arm_gains_by_what_the_others_share() -> None:
 # --- from calibrations ----------------------------------------------------------------------------------------------
 
 
-def test_the_prior_of_a_fleet_centres_on_what_calibrations_share() -> None:
+def test_the_prior_of_a_population_centres_on_what_calibrations_share() -> None:
     problem = ro.load("position").problem
     rows = np.arange(len(problem.data))
     results = {f"arm {k}": ro.calibrate(problem.on(problem.data.take(rows[k::3])), ro.tikhonov, 1.0) for k in range(3)}
@@ -126,7 +126,7 @@ def test_the_prior_of_a_fleet_centres_on_what_calibrations_share() -> None:
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_one_arm_is_no_fleet(count: int) -> None:
+def test_one_arm_is_no_population(count: int) -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
     with pytest.raises(ro.InputError, match="two arms"):
         Prior.from_population([result] * count)

@@ -1,4 +1,4 @@
-"""What a fleet's prior brings to the next arm of its type, and that it does no harm to an arm of another kind.
+"""What a population prior brings to the next arm of its type, and that it does no harm to an arm of another kind.
 
 Simulated: arms of `position` with lengths and angles off by their scales, of whose mean square deviation 80 % is what
 all have in common; positions repeat to 0.1 mm, where 0.03 are declared; the population is six arms of 25
@@ -22,7 +22,7 @@ FREE = POSITION.parameters.free
 STATED = ro.bayes.Prior().stated(POSITION.parameters)
 DECLARED, REPEATABILITY = 3e-5, 1e-4
 SHARED, FRAMES = 0.8, 0.02
-FLEETS, ARMS, NEXT = 8, 6, 2
+POPULATIONS, ARMS, NEXT = 8, 6, 2
 OTHERS = {"alike": True, "of another kind": False}
 
 
@@ -45,7 +45,7 @@ def error(validation: ro.problem.CalibrationProblem, x: Array) -> float:
 
 
 def ratios(seed: int) -> dict[tuple[str, int], list[float]]:
-    """Return the error without a fleet's prior over that with it, of the next arms of its type and of others."""
+    """Return the error without a population prior over that with it, of the next arms of its type and of others."""
     rng = np.random.default_rng([21, seed])
     unit = STATED.scale * FREE.scale
     common = np.sqrt(SHARED) * drawn(rng)
@@ -57,7 +57,7 @@ def ratios(seed: int) -> dict[tuple[str, int], list[float]]:
             own = np.where(STATED.heavy, common + np.sqrt(1 - SHARED) * own, own)
         return own * unit
 
-    fleet = ro.bayes.Prior.from_population(
+    population = ro.bayes.Prior.from_population(
         [ro.calibrate(measured(arm(True), 25, REPEATABILITY, (seed, k))) for k in range(ARMS)]
     )
     for kind, alike in OTHERS.items():
@@ -66,13 +66,13 @@ def ratios(seed: int) -> dict[tuple[str, int], list[float]]:
             validation = measured(truth, 200, 0.0, (seed, k, 2))
             for count in (6, 10):
                 problem = measured(truth, count, REPEATABILITY, (seed, k, count))
-                plain, told = (ro.calibrate(problem, prior=prior).x for prior in (None, fleet))
-                found.setdefault((kind, count), []).append(error(validation, plain) / error(validation, told))
+                plain, informed = (ro.calibrate(problem, prior=prior).x for prior in (None, population))
+                found.setdefault((kind, count), []).append(error(validation, plain) / error(validation, informed))
     return found
 
 
 def test_the_next_arm_gains_and_another_kind_loses_nothing() -> None:
-    every = [ratios(seed) for seed in range(FLEETS)]
+    every = [ratios(seed) for seed in range(POPULATIONS)]
     gain = {key: np.concatenate([each[key] for each in every]) for key in every[0]}
     mean = {key: float(np.exp(np.mean(np.log(values)))) for key, values in gain.items()}
     said = {key: f"{mean[key]:.3f}, least {values.min():.2f}" for key, values in gain.items()}

@@ -81,7 +81,7 @@ def test_names_that_lead_out_of_the_folder_are_refused(monkeypatch, capsys, rece
 
 
 @pytest.mark.parametrize("how", [*HOW, "a link in a folder"])
-@pytest.mark.parametrize("key", ["from", "fleet"])
+@pytest.mark.parametrize("key", ["from", "population"])
 def test_priors_come_from_the_folder_alone(monkeypatch, capsys, received, key, how) -> None:
     """Also where an honest result lies elsewhere: what is read there would show in the answer."""
     if (key, how) == ("from", "empty"):
@@ -93,7 +93,7 @@ def test_priors_come_from_the_folder_alone(monkeypatch, capsys, received, key, h
     else:
         name = names_elsewhere(received, how)
     value = f'"{name}"'
-    if key == "fleet":
+    if key == "population":
         value = f'["{name}"]'
     with (received / "problem.toml").open("a") as stream:
         stream.write(f"\n[prior]\n{key} = {value}\n")

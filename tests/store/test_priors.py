@@ -128,7 +128,7 @@ def test_a_folder_takes_an_earlier_result_as_its_prior(folder: Path, tmp_path: P
     assert "earlier.json" in found.record.files
 
 
-def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
+def test_a_folder_learns_from_a_population(folder: Path) -> None:
     problem = ro.load("position").problem
     results = {}
     for k in range(2):
@@ -136,7 +136,7 @@ def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
         results[f"arm{k}"] = ro.calibrate(part, ro.tikhonov, 1.0)
         (folder / f"arm{k}").mkdir()
         ro.store.save_result(results[f"arm{k}"], folder / f"arm{k}")
-    found = with_prior(folder, '[prior]\nfleet = ["arm0", "arm1"]').prior
+    found = with_prior(folder, '[prior]\npopulation = ["arm0", "arm1"]').prior
     wanted = Prior.from_population(results)
     assert found.centre == pytest.approx(wanted.centre, rel=1e-6, abs=1e-12)
     assert found.scale == pytest.approx(wanted.scale, rel=1e-6)
@@ -155,7 +155,7 @@ def test_a_folder_learns_from_a_fleet(folder: Path) -> None:
         ('groups = ["b?"]', "key groups"),
         ('from = "nowhere.json"', "nowhere.json"),
         ('from = "robot.toml"', "robot.toml"),
-        ('fleet = ["robot.toml"]', "robot.toml"),
+        ('population = ["robot.toml"]', "robot.toml"),
         ("inflate = 2", "no key from in addition"),
         ('form = "x.json"', "from"),
     ],
