@@ -86,35 +86,15 @@ class Transmitted(NamedTuple):
 class Learned(Brief):
     """Hyperparameters estimated from the data.
 
-    Parameters
-    ----------
-    sizes
-        Scales of the groups of deviations, over the stated ones.
-    noise
-        Of the robot's repeatability: ``position`` [m], ``orientation`` and ``joint`` [rad]; ``instrument`` over the
-        stated.
-    local
-        (n,) local scale of each deviation over that of its group; 1 without heavy tails.
-    trials
-        The models that were compared, the selected one first; empty where nothing was compared.
-    value
-        -2 ln of the restricted likelihood at the end.
-    freedom
-        Degrees of freedom of the variance of a reading (Satterthwaite).
-    left_out
-        Outliers that were excluded, the worst first.
-    covariance
-        (s, s) of the logarithms of ``sizes`` and ``noise``.
-    stated
-        (n,) the scales that were stated for what is identified [SI].
-    drift
-        (n, k) D, with D D' what the uncertainty of hyperparameters and heavy tails add to the covariance [SI].
-    added
-        Parameters of model extensions that were added.
-    notes
-        Sentences on how far the marginal likelihood decides.
-    curves
-        Of the joints' transmission errors; None without them.
+    ``sizes`` are scales of the groups of deviations over the stated ones, ``noise`` the robot's repeatability, in
+    ``position`` [m], ``orientation`` and ``joint`` [rad], and ``instrument`` over the stated noise; ``covariance``
+    (s, s) that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of their groups, 1
+    without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the models that were compared, the
+    selected one first, ``value`` is -2 ln of the restricted likelihood at the end, ``freedom`` the degrees of freedom
+    of the variance of a reading (Satterthwaite). D D' of ``drift`` (n, k) is what the uncertainty of hyperparameters
+    and heavy tails add to the covariance [SI]. ``left_out`` are outliers that were excluded, the worst first, ``added``
+    parameters of model extensions, ``notes`` sentences on how far the marginal likelihood decides, and ``curves`` the
+    joints' transmission errors, None without them.
     """
 
     sizes: Mapping[str, Size]

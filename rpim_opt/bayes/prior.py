@@ -38,34 +38,20 @@ class Prior:
     because they are set at assembly, and frames ten times. The data estimate a factor on them for each group: lengths,
     angles and joint offsets, which are alike a priori, and the base. `stated` returns it for a problem in numbers.
 
-    Parameters
-    ----------
-    centre
-        Prior means of deviations, by name, pattern or group with a unit as in `Parameters.scaled`:
-        ``{"theta5_mrad": 4.0}``. Zero for all others.
-    scale
-        Prior standard deviations, keys as for ``centre``: ``{"theta?_mrad": 10.0, "tool_mm": 2.0}``. Neither
-        ``joint_offset`` nor ``frames`` nor the estimated scale of the base multiplies them.
-    tails
-        Degrees of freedom of the Student's t of the robot's geometry; infinity: a normal distribution.
-    groups
-        Parameters of the robot that share an estimated scale of their own, as patterns: ``(("a?", "d?"),
-        ("alpha?",))``. Of the others, lengths, angles and joint offsets share one each, and so does every model
-        extension (compliance, eccentricity, ...); session offsets have one for shifts and one for turns.
-    joint_offset, frames
-        Factors on the scales of joint offsets, and of frames (base, reflectors, anchors).
-    statements
-        Of linear combinations: `known`, `from_result`.
-    optional
-        Whether centre and scale are left out where the marginal likelihood is against them: `from_population`.
+    ``centre`` are prior means of deviations by name, pattern or group with a unit as in `Parameters.scaled`,
+    ``{"theta5_mrad": 4.0}``, zero for all others; ``scale`` their prior standard deviations, ``{"theta?_mrad": 10.0,
+    "tool_mm": 2.0}``, which neither ``joint_offset`` nor ``frames``, the factors on the scales of joint offsets and of
+    frames (base, reflectors, anchors), nor the estimated scale of the base multiplies. ``tails`` are the degrees of
+    freedom of the Student's t of the robot's geometry; infinity: a normal distribution.
 
-    Raises
-    ------
-    InputError
-        For tails, factors or patterns that cannot be.
+    ``groups`` of parameters of the robot share an estimated scale of their own, as patterns: ``(("a?", "d?"),
+    ("alpha?",))``. Of the others, lengths, angles and joint offsets share one each, and so does every model extension
+    (compliance, eccentricity, ...); session offsets have one for shifts and one for turns.
 
-    Examples
-    --------
+    ``statements`` are of linear combinations (`known`, `from_result`). With ``optional`` (`from_population`) centre and
+    scale are left out where the marginal likelihood is against them. InputError for tails, factors or patterns that
+    cannot be.
+
     >>> import rpim_opt as ro
     >>> Prior = ro.bayes.Prior
     >>> prior = Prior(scale={"theta?_mrad": 10.0}) & Prior.known("a2 + a3 +- 0.05 mm")
@@ -99,35 +85,19 @@ class Prior:
                 raise InputError(f"prior, key {key}", f"{value}", "a number above zero")
 
     @classmethod
-    def known(cls, text: str, value: float | None = None, *, sd: float | None = None) -> Prior:
+    def known(cls, text: str) -> Prior:
         """Return the prior with a known linear combination of parameters added.
 
-        Where prior scales and noise are estimated, the default, its standard deviation is absolute; with one weight,
-        given or of a rule, the weight and the estimated noise multiply the statement as they do all of the prior.
-
-        Parameters
-        ----------
-        text
-            ``"a2 + a3 = 612.3 +- 0.05 mm"``, of the parameters' values; ``"a2 + a3 +- 0.05 mm"``, nominal to that
-            standard deviation; ``"a2 + a3 = nominal + 0.2 +- 0.05 mm"``; or the combination alone.
-        value, sd
-            Of the combination of the parameters' values [SI], nominal by default, and its standard deviation [SI].
-
-        Raises
-        ------
-        InputError
-            For a text that is no such statement, or an sd that is not above zero.
+        ``"a2 + a3 = 612.3 +- 0.05 mm"`` is one of the parameters' values, ``"a2 + a3 +- 0.05 mm"`` is nominal to that
+        standard deviation, ``"a2 + a3 = nominal + 0.2 +- 0.05 mm"`` one of deviations. Where prior scales and noise are
+        estimated, the default, its standard deviation is absolute; with one weight, given or of a rule, the weight and
+        the estimated noise multiply the statement as they do all of the prior. InputError for any other text.
         """
-        return cls(statements=(terms.known(text, value, sd),))
+        return cls(statements=(terms.known(text),))
 
     @classmethod
     def from_result(
-        cls,
-        result: Result,
-        inflate: float = 1.0,
-        without: Sequence[str] = (),
-        *,
-        noise: float | None = None,
+        cls, result: Result, inflate: float = 1.0, without: Sequence[str] = (), *, noise: float | None = None
     ) -> Prior:
         """Return the posterior of an earlier calibration as a prior, replacing the scales of its parameters.
 
@@ -135,24 +105,11 @@ class Prior:
         the earlier penalty already: of several results of one robot only the last one is to be taken. With estimated
         hyperparameters it is as wide as `Calibration.covariance`.
 
-        Parameters
-        ----------
-        result
-            A calibration whose penalty is a squared norm.
-        inflate
-            Factor on its standard deviations: above 1 where the robot may have changed.
-        without
-            Patterns of parameters that were set up anew, ``("base_*", "tool_*")``: the prior of the others is marginal.
-        noise
-            Standard deviation of its equations in units of the declared noise; what it found by default.
+        ``inflate`` multiplies its standard deviations, above 1 where the robot may have changed; the prior is marginal
+        to parameters that match ``without``, patterns of what was set up anew; ``noise`` is the standard deviation of
+        its equations in units of the declared noise, by default what it found. InputError for a penalty without
+        covariance (lasso), and for factors that are not above zero.
 
-        Raises
-        ------
-        InputError
-            For a result without covariance (lasso), and for factors that are not above zero.
-
-        Examples
-        --------
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
@@ -169,17 +126,8 @@ class Prior:
         """Return a prior for another robot of a type from several calibrated ones: their mean and spread.
 
         By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where
-        the marginal likelihood of another robot's data is against it, this prior is left out (``optional``).
-
-        Parameters
-        ----------
-        results
-            Two or more calibrations of the same nominal robot; with names where a mapping has them.
-
-        Raises
-        ------
-        InputError
-            For fewer than two, and for robots with other nominal parameters.
+        the marginal likelihood of another robot's data is against it, this prior is left out (``optional``). Names in
+        a mapping are those of messages. InputError for fewer than two, and for other nominal parameters.
         """
         from rpim_opt.bayes.population import population
 
@@ -209,20 +157,11 @@ class Prior:
         return Prior(**both)
 
     def stated(self, parameters: Parameters, *, widened: bool = True) -> Stated:
-        """Return the prior of a problem's identified parameters, in units of their scales.
+        """Return the prior of a problem's identified parameters, in units of their scales; given is the whole table.
 
-        Parameters
-        ----------
-        parameters
-            The whole table of the problem.
-        widened
-            Whether ``joint_offset`` and ``frames`` count. Without them a penalty over the scales stays what it is
-            where nothing is stated.
-
-        Raises
-        ------
-        InputError
-            For names or patterns that the table has not, units that do not fit, statements on values far from nominal.
+        Unless ``widened``, ``joint_offset`` and ``frames`` do not count: a penalty over the scales then stays what it
+        is where nothing is stated. InputError for names or patterns that the table has not, units that do not fit,
+        statements on values far from nominal.
         """
         free = parameters.free
         identified = parameters.identified

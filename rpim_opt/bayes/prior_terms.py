@@ -49,8 +49,6 @@ class Stated:
     the identified ones. ``replaced`` (n,) are those with a statement in the place of a prior of their own, ``heavy``
     (n,) those with Student's t of ``tails`` degrees of freedom; ``names[group]`` (n,) are the groups, -1 is none.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
     >>> stated = ro.bayes.Prior.known("a2 + a3 +- 0.05 mm").stated(parameters)  # scales of 0.5 mm
@@ -88,8 +86,6 @@ class Stated:
 
             penalty((z - centre) / scale) + |rows z - values|^2
 
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> problem = ro.load("position").problem
         >>> stated = ro.bayes.Prior.known("a2 + a3 = nominal + 0.3 +- 0.001 mm").stated(problem.parameters)
@@ -207,11 +203,8 @@ class Statement:
             raise InputError(self.where, f"'{missing[0]}'", "parameters: " + choices(missing[0], parameters.names))
         of = {name: parameters.dimensions[here[name]] for name in self.names if name in here}
         for name, dimension in zip(self.names, self.dimensions, strict=True):
-            if name in of and dimension not in (of[name], ""):
+            if name in of and dimension != of[name]:
                 raise InputError(self.where, f"a unit of {dimension} for '{name}'", f"one of {of[name]}")
-        if len(set(of.values())) > 1 and "" in self.dimensions:
-            found = f"a sum of {' and '.join(sorted(set(of.values())))}"
-            raise InputError(self.where, found, "parameters of one dimension")
         known = [name for name in self.names if name in here]
         place = np.array([here[name] for name in known], dtype=int)
         own = np.array([self.names.index(name) for name in known], dtype=int)
@@ -273,27 +266,15 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
     return left, right
 
 
-def known(text: str, value: float | None = None, sd: float | None = None) -> Statement:
-    """Return the statement that a combination of parameters has a known value; arguments as for `Prior.known`."""
+def known(text: str) -> Statement:
+    """Return the statement that a combination of parameters has a known value, as of `Prior.known`."""
     from rpim_opt.convex.tolerances import combination  # texts are read where there are any
 
     said = combination(text)
-    if said.sd is not None:
-        if value is not None or sd is not None:
-            raise InputError(f"prior '{text}'", "a separate value or sd", "the text alone, or value and sd [SI]")
-        value, sd = said.value, said.sd
-    if sd is None or not (np.isfinite(sd) and sd > 0):
-        raise InputError(f"prior '{text}'", f"sd {sd}", "a standard deviation above zero: '+- 0.05 mm', or sd [SI]")
-    if value is not None and not np.isfinite(value):
-        raise InputError(f"prior '{text}'", f"value {value}", "a finite number [SI]")
-    row = tuple(factor / sd for factor in said.factors)
+    row = tuple(factor / said.sd for factor in said.factors)
+    reference = None if said.nominal else (0.0,) * len(row)
     dimensions = (said.dimension,) * len(row)
-    reference = None
-    if value is None:
-        value = said.deviation
-    else:
-        reference = (0.0,) * len(row)
-    return Statement(said.names, dimensions, (row,), (value / sd,), reference, text=text.strip())
+    return Statement(said.names, dimensions, (row,), (said.value / said.sd,), reference, text=text.strip())
 
 
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:

@@ -53,15 +53,9 @@ def likely_causes(result: Outcome) -> list[str]:
 
     A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
     does not downweight, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
-    without value, exchanged rows, rounded joints and a base that moved are looked for.
+    without value, exchanged rows, rounded joints and a base that moved are looked for. A calibration of data in blocks
+    says nothing.
 
-    Parameters
-    ----------
-    result
-        A calibration; one of data in blocks says nothing.
-
-    Examples
-    --------
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem

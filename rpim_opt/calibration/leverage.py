@@ -76,18 +76,6 @@ class Influence(Tabled):
             rows.append(row)
         return rows
 
-    def _shown_rows(self) -> list[dict[str, Any]]:
-        """Return the configurations from the strongest to the weakest, with what each moves most."""
-        moved = self.standardized
-        size = np.where(np.isnan(moved), np.inf, np.abs(moved))
-        rows: list[dict[str, Any]] = []
-        for k in np.argsort(-self.cook):
-            most = int(np.argmax(size[k]))
-            row: dict[str, Any] = {"label": self.label[k], "leverage": float(self.leverage[k])}
-            row |= {"cook": float(self.cook[k]), "weight": float(self.weight[k])}
-            rows.append(row | {"moves most": self.parameters[most], "by [std]": float(moved[k, most])})
-        return rows
-
 
 @one_blas_thread  # small matrices: threads would wait for each other longer than they compute
 def influence(result: Outcome) -> Influence:

@@ -45,15 +45,9 @@ ROWS = 3
 class Verdict:
     """Whether the robot of a calibration is delivered.
 
-    Exit codes, exports, compensation and the report follow it.
+    Exit codes, exports, compensation and the report follow it. ``reasons`` say why it is not delivered, a sentence
+    each; empty where it is.
 
-    Parameters
-    ----------
-    reasons
-        Why it is not delivered, a sentence each; empty where it is.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.calibrate(ro.load("position").problem).verdict.delivered
     True
@@ -77,12 +71,9 @@ class Verdict:
         return [text for text in causes if text not in self.reasons and not (self.reasons and text.startswith(BAD))]
 
     def require(self, forced: bool = False) -> str:
-        """Return the note for a robot used despite its verdict, empty if it is delivered; otherwise raise NotDelivered.
+        """Return the note for a robot used despite its verdict, empty if it is delivered.
 
-        Raises
-        ------
-        NotDelivered
-            With the reasons, unless ``forced``.
+        NotDelivered with the reasons, unless ``forced``.
         """
         if self.delivered:
             return ""

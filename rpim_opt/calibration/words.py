@@ -216,17 +216,44 @@ def _outlying(result: Outcome) -> list[str]:
 
 def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
     """Return sentences on estimated hyperparameters, from names (n,) and z (n,) in units of the local scales."""
-    groups = []
-    deflections = []
+    ratio = np.abs(z) * learned.local
+    unusual = []
+    for i in np.argsort(-ratio)[:MOST]:
+        if ratio[i] > UNUSUAL:
+            cause = ": an error of assembly or of its zero" if is_joint_offset(names[i]) else ""
+            unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
+    excluded = [f"{row.label} ({row.ratio:.0f} times the median error)" for row in learned.left_out]
+    lines = [
+        *_scale_lines(learned),
+        *_noise_lines(learned),
+        *_condition_lines(learned, names, z),
+        *_model_lines(learned),
+        *unusual,
+        *_said("Excluded outliers", [listed(excluded, MOST)] if excluded else []),
+    ]
+    return [*lines, *learned.notes]
+
+
+def _scale_lines(learned: Learned) -> list[str]:
+    """Say the prior scales of the deviations, of model extensions and of transmission errors."""
+    groups, deflections, curves = [], [], []
     for name, size in learned.sizes.items():
         if name in DEFLECTIONS:
             deflections.append(f"{DEFLECTIONS[name]} {_figure(size, 1e3 * EXPECTED, 'mrad')}")
         elif name not in (*SESSIONS.values(), BASE, EXPANSION, "transmission"):
             groups.append(f"{name} {_figure(size, 1.0, 'x' if groups else 'x the stated one')}")
-    curves = []
     if learned.curves is not None:
         ripple, waves = (_figure(size, 1e3, "mrad") for size in (learned.curves.size, learned.curves.waves))
         curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad; waves {waves}")
+    return [
+        *_said("Estimated prior scale", groups),
+        *_said("Estimated scale of model extensions", deflections),
+        *_said("Transmission error of joints (1 sigma)", curves),
+    ]
+
+
+def _noise_lines(learned: Learned) -> list[str]:
+    """Say the robot's repeatability, its parts beside the largest, and the factor on the instrument's noise."""
     robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
     largest = max((size.value for size in robot.values()), default=0.0)
     parts = []
@@ -234,56 +261,45 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         if size.value > NEGLIGIBLE * largest:
             unit, where = REPEATABILITY[kind]
             parts.append(f"{_figure_or_bound(size, 1e3, unit)} {where}")
-    instrument = []
-    if "instrument" in learned.noise:
-        instrument.append(_figure_or_bound(learned.noise["instrument"], 1.0, "x the stated one"))
-    expansion = []
-    for name, stated, value in zip(names, learned.stated, z, strict=True):
-        if own_name(name) == EXPANSION and EXPANSION in learned.sizes:
-            per_kelvin = 1e6 * stated * learned.sizes[EXPANSION].value * value
-            expansion.append(f"{per_kelvin:.3g} um per metre and kelvin")
-    sessions = []  # a coordinate and an axis
+    factor = learned.noise.get("instrument")
+    instrument = [] if factor is None else [_figure_or_bound(factor, 1.0, "x the stated one")]
+    return [*_said("Robot repeatability (1 sigma)", parts), *_said("Measurement noise", instrument)]
+
+
+def _condition_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
+    """Say session offsets, of a coordinate and an axis, and thermal expansion."""
+    sessions = []
     for dimension, group in SESSIONS.items():
         if group in learned.sizes:
             turn = dimension == "angle"
             of = [of_session(name) and own_name(name).rpartition("_")[2].startswith("r") == turn for name in names]
             scale = learned.stated[of.index(True)]
             sessions.append(_figure_or_bound(learned.sizes[group], 1e3 * scale, "mrad" if turn else "mm"))
-    lines = [
-        _said("Estimated prior scale", groups),
-        _said("Estimated scale of model extensions", deflections),
-        _said("Transmission error of joints (1 sigma)", curves),
-        _said("Robot repeatability (1 sigma)", parts),
-        _said("Measurement noise", instrument),
-        _said("Session offsets (1 sigma)", sessions),
-        _said("Thermal expansion", expansion),
+    expansion = []
+    if EXPANSION in learned.sizes:
+        per_kelvin = 1e6 * learned.stated * learned.sizes[EXPANSION].value * z
+        of = [own_name(name) == EXPANSION for name in names]
+        expansion = [f"{value:.3g} um per metre and kelvin" for value in per_kelvin[of]]
+    return [*_said("Session offsets (1 sigma)", sessions), *_said("Thermal expansion", expansion)]
+
+
+def _model_lines(learned: Learned) -> list[str]:
+    """Say which model extensions were selected, and by how much the evidence supports each."""
+    if not learned.trials:
+        return []
+    gains = {extension: learned.gain(extension) for trial in learned.trials for extension in trial.extensions}
+    supported = [f"{extension} {gain:.0f}" for extension, gain in gains.items() if gain is not None and gain >= 0.5]
+    evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
+    if not learned.extensions:
+        return [f"Model: the data support no extension{evidence}."]
+    return [
+        f"Model: geometry with {joined(learned.extensions)}{evidence}. `compensate` uses the whole model; files "
+        "of controllers hold geometry alone, and `export` states the error of what it writes."
     ]
-    if learned.trials:
-        gains = {extension: learned.gain(extension) for trial in learned.trials for extension in trial.extensions}
-        supported = [f"{extension} {gain:.0f}" for extension, gain in gains.items() if gain is not None and gain >= 0.5]
-        evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
-        model = f"Model: the data support no extension{evidence}."
-        if learned.extensions:
-            model = (
-                f"Model: geometry with {joined(learned.extensions)}{evidence}. `compensate` uses the whole model; "
-                "files of controllers hold geometry alone, and `export` states the error of what it writes."
-            )
-        lines.append(model)
-    ratio = np.abs(z) * learned.local
-    for i in np.argsort(-ratio)[:MOST]:
-        if ratio[i] > UNUSUAL:
-            cause = ": an error of assembly or of its zero" if is_joint_offset(names[i]) else ""
-            lines.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
-    excluded = [f"{row.label} ({row.ratio:.0f} times the median error)" for row in learned.left_out[:MOST]]
-    if len(learned.left_out) > MOST:
-        excluded[-1] += f" and {len(learned.left_out) - MOST} more"
-    if excluded:
-        lines.append(f"Excluded outliers: {', '.join(excluded)}.")
-    return [line for line in [*lines, *learned.notes] if line]
 
 
-def _said(what: str, parts: Sequence[str]) -> str:
-    return f"{what}: {joined(parts)}." if parts else ""
+def _said(what: str, parts: Sequence[str]) -> list[str]:
+    return [f"{what}: {joined(parts)}."] if parts else []
 
 
 def _figure(size: Size, factor: float, unit: str) -> str:

@@ -91,25 +91,10 @@ class Given(Identified):
         >>> print(f"{result.forward(home)[0, 2, 3]:.4f} m")
         0.1975 m
         """
-        return _expression(predicted(problem_of(self), q, marker, torque, self.at), self)
-
-    def movements(self, q: Array, marker: str | None = None, torque: Array | None = None) -> cp.Expression:
-        """Return the displacement of the reflector (N, 3) [m] by the robot's parameters; arguments as for `positions`.
-
-        Linear in z. Deviations of frames (base, reflector) do not count: they say where things stand, not how the
-        robot is.
-
-        >>> import cvxpy as cp
-        >>> import numpy as np
-        >>> import rpim_opt as ro
-        >>> still = lambda z, p: cp.norm(p.movements(np.zeros((1, 6)))[0]) <= 1e-3  # [m]
-        >>> stated = ro.Formulation("at home", penalty=ro.tikhonov.penalty, constraints=(still,))
-        >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
-        >>> before, after = (ro.robot.forward_kinematics(r, np.zeros(6)) for r in (result.problem.robot, result.robot))
-        >>> print(f"{1e3 * np.linalg.norm((after - before)[0, :3, 3]):.3f} mm")
-        1.000 mm
-        """
-        return _expression(moved(problem_of(self), q, marker, torque, self.at), self)
+        found = predicted(problem_of(self), q, marker, torque, self.at)
+        count = len(found.position)
+        flat = (found.slope * self.scale).reshape(3 * count, -1)
+        return cp.reshape(flat @ self.z, (count, 3), order="C") + found.position
 
 
 def whole(p: Given) -> Parameters:
@@ -127,17 +112,14 @@ def problem_of(p: Given) -> CalibrationProblem:
 
 
 def every_movement(p: Given, q: Array) -> Predicted:
-    """Return `Given.movements` of every reflector, one after the other: (M, 3) [m] and their slopes (M, 3, n) by z."""
+    """Return displacements (M, 3) [m] of every reflector by the robot's parameters, and their slopes (M, 3, n) by z.
+
+    Deviations of frames (base, reflector) do not count: they say where things stand, not how the robot is.
+    """
     problem = problem_of(p)
     found = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]
     slope = np.concatenate([each.slope for each in found])
     return Predicted(np.concatenate([each.position for each in found]), slope * p.scale)
-
-
-def _expression(found: Predicted, p: Given) -> cp.Expression:
-    count = len(found.position)
-    flat = (found.slope * p.scale).reshape(3 * count, -1)
-    return cp.reshape(flat @ p.z, (count, 3), order="C") + found.position
 
 
 def given(z: Any, parameters: Parameters) -> Given:

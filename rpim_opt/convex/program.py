@@ -32,8 +32,6 @@ ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
-PROXIMAL = 1e-7
-"""Weight of the distance from the last minimum, beside the mean sensitivity, where the solver fails without it."""
 STATUS = {
     "PrimalInfeasible": "infeasible",
     "AlmostPrimalInfeasible": "infeasible_inaccurate",
@@ -133,10 +131,6 @@ class Program(Brief):
         if self.formulation == formulation and again.structure.like(self.structure):
             return self.on(model)
         return again.beginning(z)
-
-    def apart(self, model: LinearModel) -> Program:
-        """Return the program for another model, whose solutions leave those of this one nothing to begin with."""
-        return Program(self.formulation, model, self.structure, self._warm.begun(self._warm.z))
 
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""
@@ -412,9 +406,8 @@ class Program(Brief):
         """
         if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
             return None
-        begun = self.apart(self.model).beginning(z)
         try:
-            found = minimum(self.structure.loss, self._rows, begun._warm, weight, self._squares)
+            found = minimum(self.structure.loss, self._rows, self._warm.begun(z), weight, self._squares)
         except Unsolved:
             return None
         p = self.structure.canonical
@@ -453,19 +446,11 @@ class Program(Brief):
         return Estimate(z, weight, *self.value(z, weight), multipliers, iterations=iterations)
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
-        """Return the minimum by the structure of the loss; where rounding stops that by a proximal step, or CVXPY's."""
+        """Return the minimum by the structure of the loss; where that fails, CVXPY's."""
         of = self.structure.loss, self._rows, self._warm, weight, self._squares
         try:
             with phase("solve"):
-                try:
-                    found = minimum(*of, damping, accuracy)
-                except Unsolved as error:
-                    if damping is not None or str(error) in STATUS:
-                        raise
-                    n = self.structure.n
-                    centre = np.zeros(n) if self._warm.z is None else self._warm.z
-                    size = PROXIMAL * np.linalg.norm(self.rows[0]) / np.sqrt(n)
-                    found = minimum(*of, Damping(centre, np.full(n, size)))
+                found = minimum(*of, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
@@ -480,11 +465,16 @@ class Program(Brief):
         canonical = self.structure.canonical
         if not self.formulation.constraints:
             return ()
-        if canonical.cones is None:
-            stated = np.empty_like(found.dual)
-            stated[canonical.order] = found.dual
-            counts = [len(_sides(low, high)) for low, high in self.structure.limits or []]
-            return self._by_function([[part] for part in np.split(stated, np.cumsum(counts)[:-1])])
+        if canonical.cones is None and self.box is not None:
+            lower, upper = self.box
+            price = np.bincount(_sides(lower, upper), np.abs(found.dual), self.structure.n)
+            below = found.x - lower < upper - found.x
+            duals = []
+            for box in self.formulation.constraints:  # of those that share a bound the first one has its price
+                low, high = box.bounds(self.structure.parameters) if isinstance(box, Box) else self.box
+                duals.append(np.where(np.where(below, low == lower, high == upper), price, 0.0))
+                price = price - duals[-1]
+            return tuple(duals)
         values = canonical.duals(found.x, found.dual)
         groups = self.structure.constraints
         return self._by_function([[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in groups])

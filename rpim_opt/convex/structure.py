@@ -268,28 +268,24 @@ class Structure:
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
     @cached_property
-    def limits(self) -> list[tuple[Array, Array]] | None:
-        """Lower and upper bounds (n,) of every `Box`, in the order in which they are stated; None beside others."""
+    def box(self) -> tuple[Array, Array] | None:
+        """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none.
+
+        None beside another constraint, and where they contradict each other.
+        """
         boxes = [constraint for constraint in self.formulation.constraints if isinstance(constraint, Box)]
         if len(boxes) < len(self.formulation.constraints):
             return None
-        return [box.bounds(self.parameters) for box in boxes]
-
-    @cached_property
-    def box(self) -> tuple[Array, Array] | None:
-        """Lower and upper bounds (n,) where every constraint is a `Box`, infinite where there is none."""
-        if self.limits is None:
-            return None
-        lower = np.max([low for low, _ in self.limits], axis=0, initial=-np.inf)
-        upper = np.min([high for _, high in self.limits], axis=0, initial=np.inf)
-        lower, upper = np.broadcast_to(lower, self.n), np.broadcast_to(upper, self.n)
+        bounds = [box.bounds(self.parameters) for box in boxes]
+        lower = np.max([np.full(self.n, -np.inf), *(low for low, _ in bounds)], axis=0)
+        upper = np.min([np.full(self.n, np.inf), *(high for _, high in bounds)], axis=0)
         return None if (lower > upper).any() else (lower, upper)
 
     @cached_property
     def canonical(self) -> Canonical:
         """Penalty and constraints of z in canonical form."""
-        if self.limits is not None and (self.formulation.penalty is None or self.penalty_form is not None):
-            return Canonical.box(self.n, self.penalty_form, self.limits)
+        if self.box is not None and (self.formulation.penalty is None or self.penalty_form is not None):
+            return Canonical.box(self.penalty_form, *self.box)
         penalty = self.answers.penalty_of_z
         with self._lock:
             return Canonical(cp.Constant(0.0) if penalty is None else penalty, self.flat, self.answers.z)
@@ -406,14 +402,11 @@ def structure(
     if not formulation.solvable:
         return Structure(formulation, model.parameters, m, model.members[0], forms)
     if model.stands_for is not None:
-        if not invariant(formulation, lambda: model.equations):
-            found = f"formulation '{formulation.name}'"
-            raise InputError(found, "equations in blocks, of which only the QR factor is kept", "a squared loss")
-        # a loss may depend on their number: a mean square of the equations is no mean of the factor's rows
-        form = None if formulation.loss in INVARIANT else _loss_form(formulation, model.equations)
-        if form is not None:
-            factor, constant = float(form.L[0] ** 2), form.constant
-            formulation = replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
+        found = of_length(formulation, model.equations)
+        if found is None:
+            where = f"formulation '{formulation.name}'"
+            raise InputError(where, "equations in blocks, of which only the QR factor is kept", "a squared loss")
+        formulation = found
     if formulation.loss in INVARIANT and formulation.loss_over == "equation":
         m = n + 1
     groups = model.members[0]
@@ -436,28 +429,27 @@ MOST_KEPT = 64
 """Structures of ready formulations that are kept for the next model of their shape."""
 
 
-def invariant(formulation: Formulation, equations: Callable[[], int]) -> bool:
-    """Return whether the loss sees only the length of the whole residual; ``equations`` counts them where needed."""
-    if formulation.loss_over != "equation":
-        return False
+def of_length(formulation: Formulation, equations: int) -> Formulation | None:
+    """Return the formulation whose loss sees only the length of the residual, in a way that holds for its QR factor.
+
+    A loss may depend on the number of equations: their mean square is no mean of the factor's rows. None for one that
+    sees more.
+    """
+    if formulation.loss_over != "equation" or (formulation.ready and formulation.loss not in INVARIANT):
+        return None
     if formulation.loss in INVARIANT:
-        return True
-    if formulation.ready:
-        return False
-    count = equations()
-    if count > MOST_CANONICALIZED:
-        return False
-    form = _loss_form(formulation, count)
-    return form is not None and form.diagonal and not form.c.any() and bool(np.ptp(form.L) == 0)
-
-
-def _loss_form(formulation: Formulation, equations: int) -> Quadratic | None:
-    """Return the quadratic that a loss is of so many residuals; None where it is something else."""
+        return formulation
+    if equations > MOST_CANONICALIZED:
+        return None
     try:
         loss = term(formulation.loss, equations, f"formulation '{formulation.name}', loss")
     except ValueError:  # it is made for another number of residuals
         return None
-    return quadratic(loss.expression, loss.variable)
+    form = quadratic(loss.expression, loss.variable)
+    if form is None or not form.diagonal or form.c.any() or np.ptp(form.L) > 0:
+        return None
+    factor, constant = float(form.L[0] ** 2), form.constant
+    return replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
 
 
 def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, Squares | None]:
@@ -466,7 +458,7 @@ def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[F
     A loss that sees only the length of the residual needs nothing; ``equations`` counts them. InputError for a loss
     that is no sum over rows.
     """
-    if invariant(formulation, equations):
+    if formulation.loss in INVARIANT or of_length(formulation, equations()) is not None:
         return formulation, None
     where = f"formulation '{formulation.name}'"
     accepted = "a squared loss, or a sum over configurations or equations (robust)"

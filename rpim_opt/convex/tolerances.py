@@ -66,17 +66,14 @@ class Sentence:
 
 @dataclass(frozen=True)
 class Combination:
-    """A linear combination of parameters: its value or its deviation from nominal, and its standard deviation [SI].
-
-    ``value`` is None where ``deviation`` says it, ``sd`` where the text says none; ``dimension`` is that of the unit.
-    """
+    """A linear combination of parameters: its value, or with ``nominal`` its deviation from it, and its sd [SI]."""
 
     names: tuple[str, ...]
     factors: tuple[float, ...]
-    value: float | None = None
-    deviation: float = 0.0
-    sd: float | None = None
-    dimension: str = ""
+    value: float
+    nominal: bool
+    sd: float
+    dimension: str
 
 
 def sentence(text: str) -> Sentence:
@@ -103,8 +100,8 @@ def combination(text: str) -> Combination:
 
     >>> from rpim_opt.convex.tolerances import combination
     >>> known = combination("a2 - 0.5 a3 = nominal + 0.2 +- 0.05 mm")
-    >>> known.names, known.factors, known.deviation, known.sd
-    (('a2', 'a3'), (1.0, -0.5), 0.0002, 5e-05)
+    >>> known.names, known.factors, known.value, known.nominal, known.sd
+    (('a2', 'a3'), (1.0, -0.5), 0.0002, True, 5e-05)
     """
     return _Reader(text, "prior").combination()
 
@@ -180,8 +177,7 @@ class _Reader:
             raise self._wrong(f"'{patterns[0]}'", "names of single parameters")
         if known.constant or known.nominal:
             raise self._wrong("a number or nominal before =", "a sum of parameters, with its value after =")
-        equals = self._next("=")
-        stated = self._sum() if equals else Sum(nominal=1)
+        stated = self._sum() if self._next("=") else Sum(nominal=1)
         spread = self._next("+-")
         wide = self._item(self._next("+", "-")) if spread else Sum()
         self._require_end()
@@ -189,9 +185,7 @@ class _Reader:
             accepted = f"a number with a unit: {choices(name, units())}"
             raise self._wrong(f"'{name}' where a number should stand", accepted)
         if not spread:
-            if equals or self.unit:
-                raise self._wrong("no standard deviation")
-            return Combination(known.names, known.factors)
+            raise self._wrong("no standard deviation")
         if not self.unit:
             raise self._wrong("no unit", f"one of {', '.join(units())} at the end")
         unit = UNITS[self.unit]
@@ -199,9 +193,7 @@ class _Reader:
         if not sd >= SMALLEST:
             found = f"a standard deviation of {sd / unit.si:g} {self.unit}"
             raise self._wrong(found, "a positive standard deviation; [constraints] fixes parameters")
-        if stated.nominal:
-            return Combination(known.names, known.factors, None, stated.constant, sd, unit.dimension)
-        return Combination(known.names, known.factors, stated.constant, 0.0, sd, unit.dimension)
+        return Combination(known.names, known.factors, stated.constant, bool(stated.nominal), sd, unit.dimension)
 
     def sentence(self) -> Sentence:
         sides = [self._side()]

@@ -6,7 +6,6 @@ from collections.abc import Callable
 from typing import Any
 
 import cvxpy as cp
-import numpy as np
 import pytest
 
 import rpim_opt as ro
@@ -38,11 +37,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "NumPy's maximum as a loss": (lambda: posed(loss=lambda r: np.max(np.abs(r))), "loss: found a NumPy function"),
     "a list of patterns": (lambda: ro.in_ball(1.0, ["a1", "a2"]), "arguments one by one"),  # type: ignore[arg-type]
     "a statement that is a number": (lambda: combination(3), "prior: found 3"),  # type: ignore[arg-type]
-    "a value beside a text that has one": (
-        lambda: Prior.known("a2 = 0.1 +- 0.1 mm", value=1.0), "a separate value or sd, accepted: the text alone"
-    ),
-    "a value that is none": (lambda: Prior.known("a2 - a3", value=np.nan, sd=1.0), "value nan, accepted: a finite"),
-    "no deviation": (lambda: Prior.known("a2 - a3", value=0.0, sd=0.0), "sd 0.0, accepted: a standard deviation"),
+    "no deviation": (lambda: Prior.known("a2 - a3 = 0 mm"), "no standard deviation"),
     "groups of nothing": (lambda: Prior(groups=((),)), "names or patterns of parameters"),
     "two centres": (lambda: Prior(centre={"d5_mm": 1.0}) & Prior(centre={"d5_mm": 2.0}), "'d5_mm' as 1 and 2"),
     "places in a list": (

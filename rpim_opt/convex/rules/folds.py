@@ -25,8 +25,6 @@ from rpim_opt.convex.rules.selection import (
 
 PARTS = 100
 """Configurations up to which each is left out alone, where each takes solving; of more, so many parts are left out."""
-AHEAD = 5
-"""Weights that are solved at once, where each takes solving."""
 COARSE = 12
 """Weights with which a search for the least error begins, where each takes solving."""
 DROPPED = 1e-13
@@ -38,12 +36,12 @@ MANY = 1_000_000
 
 
 @on_squares
-def leave_one_out(program: Program, exact: bool = False) -> Selection:
+def leave_one_out(program: Program) -> Selection:
     """Choose by leave-one-out cross-validation of whole configurations.
 
     For a linear estimator in closed form, r_g^- = (1 - H_gg)^-1 r_g with H = A (A'A + w)^-1 A' (Allen 1974; by blocks).
     With constraints, another penalty or loss the program is solved without each; of more than 100 configurations
-    without each of 100 parts, unless ``exact``. InputError for a single configuration, or without penalty.
+    without each of 100 parts. InputError for a single configuration, or without penalty.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.leave_one_out)
@@ -56,7 +54,7 @@ def leave_one_out(program: Program, exact: bool = False) -> Selection:
     if program.closed_form and not mixed:
         note = "smallest leave-one-out error"
         return linear_rule(program, "leave_one_out", _of_squares, note)
-    return _least(program, "leave_one_out", held_out_error(program, None if exact else _singly(program)))
+    return _least(program, "leave_one_out", held_out_error(program, _singly(program)))
 
 
 @on_squares
@@ -106,15 +104,9 @@ def two_step(program: Program) -> Selection:
     if not program.linear_penalty:
         last = max(last, min(start, weight_grid(program, 2)[0]))
     coarse = np.geomspace(start, last, 30)
-    some = len(coarse) if program.closed_form else AHEAD
-    level, residual = float(coarse[0]), np.empty(0)
-    while len(residual) < len(coarse):
-        more = solved(program, coarse[len(residual) : len(residual) + some])
-        residual = np.append(residual, np.sqrt([each.loss if each else np.nan for each in more]))
-        flat = residual[1:] >= 0.99 * residual[:-1]
-        if flat.any():
-            level = float(coarse[np.argmax(flat)])
-            break
+    residual = np.sqrt([each.loss if each else np.nan for each in solved(program, coarse)])
+    flat = np.flatnonzero(residual[1:] >= 0.99 * residual[:-1])
+    level = float(coarse[flat[0] if len(flat) else 0])
     fine = level * np.linspace(0.563 / 3.063, 5.063 / 3.063, 10)
     if program.closed_form and program.squared is program.model:
         score = np.sqrt(_of_squares(program)(fine) / len(program.model.b))
@@ -181,7 +173,7 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
     def without(out: np.ndarray) -> Program:
         kept = np.ones(len(model.group))
         kept[out] = 0.0
-        return program.apart(model.scaled(kept))
+        return program.on(model.scaled(kept))
 
     kept = [without(out) for out in rows] if len(parts) * model.A.nbytes <= MEMORY else []
 

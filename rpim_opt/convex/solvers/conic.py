@@ -50,7 +50,6 @@ class Canonical:
     constraints may be stated in metres.
     """
 
-    order: np.ndarray  # of a box: the stated places of its rows, equations first
     own = False  # whether the functions have variables of their own
 
     def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
@@ -95,21 +94,16 @@ class Canonical:
         self.P: Any = sparse.csc_array((values, (P.row, P.col)), P.shape)
 
     @classmethod
-    def box(cls, n: int, penalty: Quadratic | None, bounds: Sequence[tuple[Array, Array]]) -> Canonical:
-        """Return a quadratic penalty |L z - c|^2 + constant and boxes lower <= z <= upper, each (n,)."""
+    def box(cls, penalty: Quadratic | None, lower: Array, upper: Array) -> Canonical:
+        """Return a quadratic penalty |L z - c|^2 + constant and a box lower <= z <= upper, (n,), fixed ones first."""
         made = cls.__new__(cls)
+        n = len(lower)
         made.size, made.at = n, np.arange(n)
         eye = np.eye(n)
-        rows, limits, later = [np.zeros((0, n))], [np.zeros(0)], [np.zeros(0)]
-        for low, high in bounds:
-            fixed, below, above = box_sides(low, high)
-            rows += [eye[fixed], -eye[below], eye[above]]
-            limits += [low[fixed], -low[below], high[above]]
-            later += [np.zeros(fixed.sum()), np.ones(below.sum() + above.sum())]
-        made.order = np.argsort(np.concatenate(later), kind="stable")  # equations come first
-        made.A, made.b = np.vstack(rows)[made.order], np.concatenate(limits)[made.order]
-        made.linear = len(made.b)
-        made.zero = made.linear - int(np.concatenate(later).sum())
+        fixed, below, above = box_sides(lower, upper)
+        made.A = np.vstack([eye[fixed], -eye[below], eye[above]])
+        made.b = np.concatenate([lower[fixed], -lower[below], upper[above]])
+        made.zero, made.linear = int(fixed.sum()), len(made.b)
         made.row_scale, made.column_scale = np.ones(len(made.b)), np.ones(n)
         made.P, made.q, made.offset = np.zeros((n, n)), np.zeros(n), 0.0
         if penalty is not None:
@@ -395,9 +389,11 @@ class Small:
         q[0][p.at] += squares.g
         bounds, dense = [residual, p.b - p.A @ x0], [squares.R.ravel()]
         if self.loss is not None and A is not None and b is not None:
-            q.append(self.loss.q)
-            bounds += [self.loss.b, data.linked(b - A @ z0)]
-            dense.append(A.ravel())
+            if self.sizes is None:
+                q[0][p.at] += A.T @ self.loss.q[self.loss.at]
+            q.append(self.loss.q[data.own])
+            bounds.append(data.linked(b - A @ z0))
+            dense.append((data.factors @ A).ravel())
         cost = np.concatenate(q)
         scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
         P, matrix = data.filled(weight, np.concatenate(dense))
@@ -408,48 +404,54 @@ class Small:
         self.near = x[: p.size]
         own = slice(k, k + len(p.b))
         point = Point(x[: p.size], z[own], int(found.iterations))
-        if self.loss is not None:
-            point = replace(point, rest=x[p.size + k :])
+        if self.loss is not None and A is not None and b is not None:
+            rest = np.zeros(self.loss.size)
+            if self.sizes is None:
+                rest[self.loss.at] = A @ x[p.at] - b
+            rest[data.own] = x[p.size + k :]
+            point = replace(point, rest=rest)
         return point, s[own]
 
 
 class _Data:
-    """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
+    """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those ``own`` to the loss.
 
-    Rows: R z - s = y, those of the penalty and of the loss, and what links the loss's entries to the equations A z ~ b:
-    A z - v = b, or (v_k, A_k z - b_k) in a second-order cone for every norm v_k.
+    Rows: R z - s = y, those of the penalty and of the loss. Entries of the loss are A z - b in its rows; norms are
+    unknowns v, with (v_k, A_k z - b_k) in a second-order cone each. ``factors`` times A and b is what these rows have.
     """
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
+        from scipy import sparse
+
         clarabel = import_module("clarabel")
         cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
-        n, top = len(p.at), k + len(p.b)
+        top, size = k + len(p.b), p.size + k
         squares = np.arange(k)
         # entries as (rows, columns, numbers): first R, then A, which other programs have other numbers of
         dense = [_block(squares, p.at)]
         entries = [(squares, p.size + squares, -np.ones(k)), _entries(p.A, k, 0)]
         curvature = [_entries(p.P, 0, 0, upper=True), (p.size + squares, p.size + squares, np.full(k, 2.0))]
-        size, self._sign = p.size + k, 1.0
         if loss is not None:
-            m = len(loss.at)
-            entries.append(_entries(loss.A, top, size))
-            curvature.append(_entries(loss.P, size, size, upper=True))
-            top += len(loss.b)
-            self._first = np.arange(m)
-            self._equations = self._first
+            self._bounds = loss.b
             cones += loss.linear_cones
             if sizes is None:
-                cones.append(clarabel.ZeroConeT(m))
+                self.own = np.setdiff1d(np.arange(loss.size), loss.at)
+                by_entry = loss.A[:, loss.at]
+                self._equations = np.flatnonzero(np.diff(by_entry.indptr))
+                self.factors: Any = by_entry[self._equations]
             else:
-                self._first = np.cumsum(sizes + 1) - sizes - 1
-                self._equations = np.setdiff1d(np.arange(int(sizes.sum()) + m), self._first)
-                self._sign = -1.0
+                self.own = np.arange(loss.size)
+                first = len(loss.b) + np.cumsum(sizes + 1) - sizes - 1
+                self._bounds = np.pad(loss.b, (0, len(first) + int(sizes.sum())))
+                self._equations = np.setdiff1d(np.arange(len(loss.b), len(self._bounds)), first)
+                self.factors = -sparse.eye_array(len(self._equations), format="csr")
                 cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
+                entries.append((top + first, size + loss.at, -np.ones(len(first))))
             dense.append(_block(top + self._equations, p.at))
-            entries.append((top + self._first, size + loss.at, -np.ones(m)))
-            top += len(self._equations) + (0 if sizes is None else m)
-            size += loss.size
-        self._R = k * n
+            entries.append(_entries(loss.A[:, self.own], top, size))
+            curvature.append(_entries(loss.P[self.own][:, self.own], size, size, upper=True))
+            top += len(self._bounds)
+            size += len(self.own)
         self.matrix, place = _assembled([*dense, *entries], (top, size))
         self._numbers = place[: sum(len(rows) for rows, _, _ in dense)]
         self.P, place = _assembled(curvature, (size, size))
@@ -460,14 +462,13 @@ class _Data:
         self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
 
     def linked(self, b: Array) -> Array:
-        """Return the bounds of what links entries to equations, from those of the equations (m,)."""
-        bound = np.zeros(len(self._equations) + (len(self._first) if self._sign < 0 else 0))
-        bound[self._equations] = self._sign * b
-        return bound
+        """Return the bounds of the loss's rows, from those of the equations (m,)."""
+        bounds = self._bounds.copy()
+        bounds[self._equations] += self.factors @ b
+        return bounds
 
     def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
-        """Return P at a weight, and the matrix with the numbers of R (k, n) and A (m, n), row by row."""
-        numbers[self._R :] *= self._sign
+        """Return P at a weight, and the matrix with the numbers of R (k, n) and of the loss's rows, row by row."""
         self.matrix.data[self._numbers] = numbers
         self.P.data = np.where(self._weighted, weight, 1.0) * self._curvature
         return self.P, self.matrix

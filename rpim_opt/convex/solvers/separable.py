@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.expressions import cp
+from rpim_opt.convex.expressions import cp, substituted
 from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
 
 DECREASE = 1e-12
@@ -103,12 +103,11 @@ class Rows:
 
     def alone(self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int) -> tuple[Small, Array, Array]:
         """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
-        expression, own = loss.some(which)
         sizes = None if self.sizes is None else self.sizes[which]
         places = which
         if self.sizes is not None:
             places = np.concatenate([np.arange(int(self.sizes[i])) + self.starts[i] for i in which])
-        return Small(penalty, squares, Canonical(expression, [], own), sizes), self.A[places], self.b[places]
+        return Small(penalty, squares, loss.some(which), sizes), self.A[places], self.b[places]
 
 
 @dataclass(eq=False)
@@ -382,7 +381,13 @@ class Loss:
     @cached_property
     def canonical(self) -> Canonical:
         """The loss in canonical form."""
-        return Canonical(self.expression, [], self.variable)
+        return self._form(self.expression, self.variable)
+
+    def _form(self, expression: Any, variable: Any) -> Canonical:
+        """Return an expression in canonical form; unless it is of norms, P has no squares of the variable itself."""
+        if not self.positive:
+            expression = substituted(expression, {id(variable): cp.multiply(np.ones(variable.size), variable)})
+        return Canonical(expression, [], variable)
 
     @cached_property
     def _evaluated(self) -> Evaluation:
@@ -466,11 +471,11 @@ class Loss:
         t, value, _ = min(low, high, key=lambda point: point[1])
         return value, t
 
-    def some(self, which: np.ndarray) -> tuple[Any, Any]:
-        """Return the sum of some entries and the threshold, and the variable (k,) of their own that it is of."""
+    def some(self, which: np.ndarray) -> Canonical:
+        """Return the sum of some entries (k,) and the threshold in canonical form."""
         own = cp.Variable(len(which))
         total = cp.sum(_restricted(self.entries, self.variable, own, which))
-        return total if self.threshold is None else total + self.threshold, own
+        return self._form(total if self.threshold is None else total + self.threshold, own)
 
     def kink(self, rows: Rows) -> float:
         """Return the largest jump of the slope by residuals of usual size, or where norms are zero; 0 for none."""

@@ -134,9 +134,7 @@ def _whole(loss: Loss, warm: Warm) -> bool:
     """
     if loss.expression.is_pwl():
         return True
-    penalty, near = warm.penalty, warm.z is not None
-    unknowns = penalty.size > len(penalty.at)
-    return loss.quadratic and ((unknowns and not (near and penalty.polyhedral)) or not (near or penalty.polyhedral))
+    return loss.quadratic and not warm.penalty.polyhedral
 
 
 # --- losses that are no sums over entries ----------------------------------------------------------------------
