@@ -58,7 +58,6 @@ class Calibration(Outcome):
 
     Examples
     --------
-
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
     >>> result = ro.calibrate(instance.problem, ro.tikhonov, weight=ro.l_curve)

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from typing import Any
 
 import cvxpy as cp
+import numpy as np
 import pytest
 
 import rpim_opt as ro
