@@ -124,10 +124,6 @@ class Tabled(Brief):
     def _frame_rows(self) -> list[dict[str, Any]]:
         raise NotImplementedError
 
-    def _shown_rows(self) -> list[dict[str, Any]]:
-        """Return the rows that a notebook shows."""
-        return self._frame_rows()
-
     def _notes(self) -> Sequence[str]:
         """Return the sentences below the table."""
         return ()
@@ -140,7 +136,7 @@ class Tabled(Brief):
 
     def _repr_html_(self) -> str:
         """Return the table for a notebook, without empty columns."""
-        rows = self._shown_rows()
+        rows = self._frame_rows()
         notes = list(self._notes())
         if len(rows) > MOST:
             notes.insert(0, f"... and {len(rows) - MOST} rows more.")

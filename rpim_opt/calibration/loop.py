@@ -125,6 +125,12 @@ class State:
             return replace(self, choice=choice)
         return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight))
 
+    def stalled(self, accuracy: float, rounded: bool) -> bool:
+        """Whether many iterations together have changed the objective by no more than its accuracy."""
+        if len(self.history) <= STALLED or self.history[-STALLED].weight != self.choice.weight:
+            return False
+        return self.history[-STALLED].objective - self.merit <= (accuracy if rounded else STALLED * accuracy)
+
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""
         return length / (1 + float(np.linalg.norm(self.z)))
@@ -208,11 +214,8 @@ class Loop:
         if state.damping > 0 and (short or nothing):
             return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
         state = replace(state, idle=state.idle + 1 if nothing else 0)
-        stalled = False  # many iterations together have changed the objective by no more than its accuracy
-        if len(state.history) > STALLED and state.history[-STALLED].weight == state.choice.weight:
-            limit = accuracy if np.isfinite(best) else STALLED * accuracy
-            stalled = state.history[-STALLED].objective - state.merit <= limit
-        if state.choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED or stalled):
+        at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.stalled(accuracy, np.isfinite(best))
+        if state.choice.settled and at_rest:
             return replace(state, outcome="rest")
         waiting = state.choice.settled and not state.choice.final and not state.choice.answers
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
@@ -226,13 +229,7 @@ class Loop:
         if promised > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
             gain = fall / promised
         effect = float(np.sum((state.size * (z - state.z)) ** 2))
-        damping = state.damping
-        if gain < GAIN_POOR and effect > 0 and promised > 0:
-            damping = DAMPING_GROWTH * damping if damping else DAMPING_FIRST * promised / effect
-        elif gain > GAIN_GOOD:
-            damping = DAMPING_SHRINK * damping
-            if damping * effect <= DAMPING_LEAST * promised:
-                damping = 0.0
+        damping = damped(state.damping, gain, promised, effect)
         state = replace(state, damping=damping, evaluations=state.evaluations + 1)
         if after <= state.merit + rounding:
             return self._accepted(state, candidate, z, after, short)
@@ -436,6 +433,17 @@ def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Arr
     objective = program.objective(z, choice.weight)
     floor = VANISHING * abs(objective) if np.isfinite(objective) else 0.0
     return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), floor)
+
+
+def damped(damping: float, gain: float, promised: float, effect: float) -> float:
+    """Return the weight of the damping term after a step, from its gain ratio, promised decrease and effect."""
+    if gain < GAIN_POOR and effect > 0 and promised > 0:
+        return DAMPING_GROWTH * damping if damping else DAMPING_FIRST * promised / effect
+    if gain > GAIN_GOOD:
+        damping = DAMPING_SHRINK * damping
+        if damping * effect <= DAMPING_LEAST * promised:
+            return 0.0
+    return damping
 
 
 def require_start(start: Array, count: int) -> Array:

@@ -28,11 +28,7 @@ PARTS = 100
 COARSE = 12
 """Weights with which a search for the least error begins, where each takes solving."""
 DROPPED = 1e-13
-"""Pivots below this belong to what nothing else decides."""
-MEMORY = 500_000_000
-"""Bytes of equations that are kept for all folds together; of more, a fold is made when it is asked for."""
-MANY = 1_000_000
-"""Residuals that are in memory together, of many weights."""
+"""Added to what a configuration leaves to itself: below, nothing else decides it."""
 
 
 @on_squares
@@ -175,12 +171,10 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
         kept[out] = 0.0
         return program.on(model.scaled(kept))
 
-    kept = [without(out) for out in rows] if len(parts) * model.A.nbytes <= MEMORY else []
-
     def error(weights: Array) -> Array:
         found = []
-        for k, out in enumerate(rows):
-            estimates = solved(kept[k] if kept else without(out), weights)
+        for out in rows:
+            estimates = solved(without(out), weights)
             Z = np.array([each.z if each else np.full(model.A.shape[1], np.nan) for each in estimates])
             squares = (Z @ model.A[out].T - model.b[out]) ** 2
             which = np.unique(model.group[out], return_inverse=True)[1]
@@ -195,26 +189,6 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
     return error
 
 
-def _solved(M: Array, v: Array) -> Array:
-    """Return M^-1 v for many small symmetric matrices, (k, k, ...) and (k, ...); zero where a pivot vanishes."""
-    k = len(M)
-    M, v = M.copy(), v.copy()
-    for i in range(k):
-        pivot = M[i, i]
-        with np.errstate(divide="ignore"):
-            inverse = np.where(np.abs(pivot) > DROPPED, 1 / pivot, 0.0)
-        M[i, i] = inverse
-        for j in range(i + 1, k):
-            share = M[j, i] * inverse
-            M[j, i:] = M[j, i:] - share * M[i, i:]
-            v[j] = v[j] - share * v[i]
-    for i in reversed(range(k)):
-        for j in range(i + 1, k):
-            v[i] = v[i] - M[i, j] * v[j]
-        v[i] = v[i] * M[i, i]
-    return v
-
-
 def _of_squares(program: Program) -> Score:
     """Return the sums of squares (K,) of all left-out residuals of an estimator with influence Q diag(f) Q', by weight.
 
@@ -222,27 +196,18 @@ def _of_squares(program: Program) -> Score:
     """
     Q, s2, target = influence(program.squared, program.ridge)
     projected = Q.T @ target
-    parts = []
     _, which, count = np.unique(program.squared.group, return_inverse=True, return_counts=True)
     order, first = np.argsort(which, kind="stable"), np.cumsum(count) - count
-    for k in np.unique(count).tolist():  # configurations of k equations together
-        places = order[first[count == k][:, None] + np.arange(k)]
-        each = Q[places]
-        parts.append((places, {(i, j): each[:, i] * each[:, j] for i in range(k) for j in range(i, k)}))
+    # configurations of k equations together
+    places = [order[first[count == k][:, None] + np.arange(k)] for k in np.unique(count).tolist()]
 
-    def some(weights: Array) -> Array:
-        filters = (s2 / (s2 + weights[:, None])).T
-        residual = target[:, None] - Q @ (filters * projected[:, None])
-        total = np.zeros(len(weights))
-        for places, products in parts:
-            k = places.shape[1]
-            M = np.empty((k, k, len(places), len(weights)))
-            for (i, j), product in products.items():
-                M[i, j] = (i == j) - product @ filters
-                M[j, i] = M[i, j]
-            left = _solved(M, residual[places.T])
-            total += np.einsum("igw,igw->w", left, left)
+    def squares(weight: float) -> float:
+        filters = s2 / (s2 + weight)
+        residual = target - Q @ (filters * projected)
+        total = 0.0
+        for rows in places:
+            M = (1 + DROPPED) * np.eye(rows.shape[1]) - (Q[rows] * filters) @ Q[rows].transpose(0, 2, 1)
+            total += float(np.sum(np.linalg.solve(M, residual[rows][:, :, None]) ** 2))
         return total
 
-    few = max(1, MANY // len(target))
-    return lambda weights: np.concatenate([some(weights[k : k + few]) for k in range(0, len(weights), few)])
+    return lambda weights: np.array([squares(weight) for weight in weights])

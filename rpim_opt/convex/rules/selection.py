@@ -28,8 +28,6 @@ objective is less than the accuracy to which that is known."""
 
 HOMOGENEOUS = 1e-9
 """Relative deviation of penalty(2 z) from 2 penalty(z) that is rounding."""
-AROUND = 5
-"""Weights on either side of the choice that a notebook shows."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,14 +65,6 @@ class Selection(Tabled):
     def _frame_rows(self) -> list[dict[str, Any]]:
         pairs = zip(self.weights, self.score, strict=True)
         return [{"weight": float(weight), "score": float(score)} for weight, score in pairs]
-
-    def _shown_rows(self) -> list[dict[str, Any]]:
-        """Return those about the choice."""
-        rows = self._frame_rows()
-        if not rows:
-            return rows
-        near = int(np.argmin(np.abs(self.weights - self.weight)))
-        return rows[max(near - AROUND, 0) : near + AROUND + 1]
 
     def _notes(self) -> list[str]:
         return [self.note]
