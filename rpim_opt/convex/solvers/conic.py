@@ -315,10 +315,10 @@ class Small:
         self.face = np.zeros(0, dtype=int)
         self.near = np.zeros(penalty.size)
 
-    def solve(self, squares: Squares | None, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
+    def solve(self, squares: Squares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
-        if squares is None or self.loss is not None or not p.polyhedral:
+        if self.loss is not None or not p.polyhedral:
             return self._by_cones(squares, weight, A, b)[0]
         found = self._on_faces(squares, weight, self.face, self.near)
         if found is not None:
@@ -369,13 +369,9 @@ class Small:
         """Clarabel's data and solver."""
         return _Data(self.penalty, self.rows, self.loss, self.sizes)
 
-    def _by_cones(
-        self, squares: Squares | None, weight: float, A: Array | None, b: Array | None
-    ) -> tuple[Point, Array]:
+    def _by_cones(self, squares: Squares, weight: float, A: Array | None, b: Array | None) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
         data, p, k, n = self.data, self.penalty, self.rows, len(self.penalty.at)
-        if squares is None:
-            squares = Squares(np.zeros((k, n)), np.zeros(k), np.zeros(n))
         # tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
         # of the squares with some weight on |z|^2
         z0 = self.near[p.at]

@@ -77,37 +77,38 @@ def minimum(
     quadratic                  the small program of its QR factor
     separable, smooth          proximal Newton, a sequence of small programs
     separable, non-smooth      the same on the smoothed loss, then rows near kinks
-    at most `FEW_ENTRIES`      all rows as they are, where that is quicker (`_whole`)
+    at most `FEW_ENTRIES`      all rows as they are, where that is quicker
     with a threshold           entries near a kink as they are, tangents of others
     any other                  all rows
     ========================== =====================================================
 
-    A quadratic loss is None, with ``squares``, which are also what is quadratic beside another loss. ``accuracy`` is
-    the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is found.
+    A quadratic loss is None, with ``squares`` in its place. ``accuracy`` is the part of the loss that a sum over rows
+    may be above its minimum. Unsolved where no minimum is found.
     """
     with warm.lock:
         n = rows.A.shape[1]
         if loss is None:
             point = warm.program(n + 1).solve((squares or rows.squares).damped(damping), weight)
         elif not loss.separable:
-            point = _coupled(loss, rows, warm, weight, squares, damping)
+            point = _coupled(loss, rows, warm, weight, damping)
         else:
             try:
                 point = _by_newton(loss, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
-                point = _all_rows(loss, rows, warm, weight, None, damping)
+                point = _all_rows(loss, rows, warm, weight, damping)
         warm.z, warm.x = point.x[warm.penalty.at], point.x
         return point
 
 
 def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
-    if few and _whole(loss, warm):
-        return _all_rows(loss, rows, warm, weight, None, damping)
+    # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too
+    if few and (loss.expression.is_pwl() or (loss.quadratic and not warm.penalty.polyhedral)):
+        return _all_rows(loss, rows, warm, weight, damping)
     if warm.kink < 0:
         warm.kink = loss.kink(rows)
     if few and warm.kink:
-        return _all_rows(loss, rows, warm, weight, None, damping)
+        return _all_rows(loss, rows, warm, weight, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
     known = z is not None
@@ -125,42 +126,22 @@ def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Dampi
     return Point(search.x, dual, search.steps)
 
 
-def _whole(loss: Loss, warm: Warm) -> bool:
-    """Whether few rows of a loss are solved at once: piecewise linear ones, and in place of Newton quadratic ones.
-
-    Newton takes ten steps, or four near the minimum. One program of all rows takes three times as long as one of them
-    where the penalty has unknowns of its own, and longer still beside one whose active set is known; a first one's is
-    not.
-    """
-    if loss.expression.is_pwl():
-        return True
-    return loss.quadratic and not warm.penalty.polyhedral
-
-
 # --- losses that are no sums over entries ----------------------------------------------------------------------
 
 
-def _beside(squares: Squares | None, n: int, damping: Damping | None) -> Squares | None:
-    """Return the quadratic terms beside a loss that is taken as it is; None where there are none."""
-    if squares is None and damping is None:
-        return None
-    return (squares or Squares(np.zeros((n + 1, n)), np.zeros(n + 1), np.zeros(n))).damped(damping)
+def _alone(n: int, damping: Damping | None) -> Squares:
+    """Return the quadratic terms beside a loss that is taken as it is: the damping, or none."""
+    return Squares(np.zeros((0, n)), np.zeros(0), np.zeros(n)).damped(damping)
 
 
-def _all_rows(
-    loss: Loss, rows: Rows, warm: Warm, weight: float, squares: Squares | None, damping: Damping | None
-) -> Point:
+def _all_rows(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None) -> Point:
     """Return the minimum with all rows of the loss in Clarabel."""
-    n = rows.A.shape[1]
-    terms = _beside(squares, n, damping)
-    count = 0 if terms is None else n + 1
-    whole = warm.program(count, loss.canonical, rows.sizes if loss.positive else None)
+    terms = _alone(rows.A.shape[1], damping)
+    whole = warm.program(len(terms.y), loss.canonical, rows.sizes if loss.positive else None)
     return whole.solve(terms, weight, rows.A, rows.b)
 
 
-def _coupled(
-    loss: Loss, rows: Rows, warm: Warm, weight: float, squares: Squares | None, damping: Damping | None
-) -> Point:
+def _coupled(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None) -> Point:
     """Return the minimum of a loss with a threshold (a maximum, CVaR, the sum of the largest) by some of its entries.
 
     Those near a kink are taken as they are and all others by their tangents, which bounds the loss from below; those
@@ -168,14 +149,14 @@ def _coupled(
     """
     n, at = rows.A.shape[1], warm.penalty.at
     if loss.variable.size <= FEW_ENTRIES or loss.threshold is None:
-        return _all_rows(loss, rows, warm, weight, squares, damping)
-    terms = _beside(squares, n, damping) or Squares(np.zeros((0, n)), np.zeros(0), np.zeros(n))
+        return _all_rows(loss, rows, warm, weight, damping)
+    terms = _alone(n, damping)
     z = warm.z
     if z is None:
         z = warm.program(n + 1).solve(rows.squares.damped(damping), weight).x[at]
     tangent = Tangent(loss, rows, rows.A @ z - rows.b)
     if not np.isfinite(tangent.value):
-        return _all_rows(loss, rows, warm, weight, squares, damping)
+        return _all_rows(loss, rows, warm, weight, damping)
     working = np.sort(tangent.near[: max(4 * n, warm.count or np.count_nonzero(tangent.pull))])
     for _ in range(GENERATIONS):
         outside = np.ones(loss.variable.size, dtype=bool)
@@ -203,7 +184,7 @@ def _coupled(
         if len(more) == len(working):
             break
         tangent, working = there, more
-    return _all_rows(loss, rows, warm, weight, squares, damping)
+    return _all_rows(loss, rows, warm, weight, damping)
 
 
 class Tangent:
