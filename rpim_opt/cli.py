@@ -142,7 +142,6 @@ Marker = Annotated[Text, Option(help="Name of the reflector, if there are severa
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
 Workers = Annotated[int, Option(help="Processes on this machine.")]
-Scheduler = Annotated[Text, Option(help="Address of a Dask scheduler to compute on.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
 Folder = Annotated[File, Option(help="Folder in which to write result.json.")]
@@ -667,7 +666,6 @@ def study(
     name: Annotated[str, Argument(help="A file mine.py, a folder with study.py, or a study of the checkout.")],
     quick: Annotated[bool, Option("--quick", help="The small version.")] = False,
     workers: Workers = 1,
-    scheduler: Scheduler = None,
     resume: Resume = None,
     redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from the last replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
@@ -682,7 +680,7 @@ def study(
     from rpim_opt.study.studies import regressions, run_study
 
     with progress_bar(name, not as_json) as say:
-        report, folder = run_study(name, quick, workers, scheduler, resume, redraw, out, progress=say)
+        report, folder = run_study(name, quick, workers, resume, redraw, out, progress=say)
     worse: list[str] = []
     if gate:
         worse = regressions(name, quick, report.metrics)
@@ -707,7 +705,6 @@ def compare(
     metrics: Annotated[str, Option(help="Metrics, the first one summarized: rms_mm,max_mm,...")] = "",
     against: Annotated[Text, Option(help="Reference method, such as 'tikhonov, reml'.")] = None,
     workers: Workers = 1,
-    scheduler: Scheduler = None,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the page, the replicates and the figure.")] = None,
     as_json: Json = False,
@@ -724,7 +721,7 @@ def compare(
     found = compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
         counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
-        workers=workers, scheduler=scheduler, journal=journal, resume=resume, progress=not as_json,
+        workers=workers, journal=journal, resume=resume, progress=not as_json,
     )  # fmt: skip
     summary = found.summary(against=against)
     written: list[Path] = []

@@ -40,7 +40,6 @@ def compare(
     metrics: Any = USUAL,
     options: Mapping[str, Any] | None = None,
     workers: int = 1,
-    scheduler: Any = None,
     journal: str | Path | None = None,
     resume: bool | None = True,
     progress: bool | Callable[[int, int], None] = True,
@@ -82,9 +81,7 @@ def compare(
     options
         Further options of every calibration: ``{"model": "auto"}``.
     workers
-        Processes on this machine; -1 for all processors.
-    scheduler
-        Address of a Dask scheduler to compute on instead, or a client of one.
+        Processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config`` names one.
     journal
         A file that every finished replicate is written to at once. A call with the same code and arguments goes on
         with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is refused, and
@@ -152,7 +149,7 @@ def compare(
         with refused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:
-        rows = run_cases(cases, work, workers, scheduler, say, path, code, resume)
+        rows = run_cases(cases, work, workers, say, path, code, resume)
     axes = {
         "Problems": sources,
         "Methods": compared,

@@ -1,4 +1,4 @@
-"""Replicates: computed here, in processes or on a Dask cluster, kept in a SQLite database; what made them."""
+"""Replicates: computed here or in joblib's processes, kept in a SQLite database; what made them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError
-from contextlib import ExitStack, closing, contextmanager, suppress
+from concurrent.futures import BrokenExecutor
+from contextlib import closing, contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from hashlib import sha256
@@ -49,13 +49,13 @@ COMMIT;
 
 
 def run_cases(
-    cases: Sequence[Mapping[str, Any]], work: Callable[[Mapping[str, Any]], Work], workers: int, scheduler: Any,
+    cases: Sequence[Mapping[str, Any]], work: Callable[[Mapping[str, Any]], Work], workers: int,
     progress: Progress, journal: Path | None = None, code: Mapping[str, str] | None = None, resume: bool | None = True,
 ) -> list[Row]:  # fmt: skip
     """Return every case with its figures, in the order of the cases.
 
-    ``cases`` are plain tables, and ``work`` returns what computes one; ``workers`` and ``scheduler`` are as `compute`
-    has them, ``progress`` is called whenever a replicate is done. Every finished replicate is written to the
+    ``cases`` are plain tables, and ``work`` returns what computes one; ``workers`` is as `compute` has it,
+    ``progress`` is called whenever a replicate is done. Every finished replicate is written to the
     ``journal`` before the next one counts; ``code`` are digests of what replicates follow from, and those of other code
     are refused. Replicates of an interrupted run are resumed (true), dropped (false), or refused (None).
     """
@@ -76,7 +76,7 @@ def run_cases(
         done = {key: stored[key] for key, _ in keyed if key in stored}
         progress(len(done), len(cases))
         tasks = [(key, work(case)) for key, case in keyed if key not in done]
-        for key, found in compute(tasks, workers, scheduler):
+        for key, found in compute(tasks, workers):
             text = json.dumps(found)
             with _sentence(journal):
                 base.execute("INSERT INTO replicates VALUES (?, ?, ?)", (key, text, _digest(code, key, text)))
@@ -140,17 +140,14 @@ def require_package(name: str, where: str) -> None:
 # --- who computes ----------------------------------------------------------------------------------------------------
 
 
-def compute(tasks: Sequence[tuple[str, Work]], workers: int, scheduler: Any) -> Iterator[tuple[str, Row]]:
+def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:
     """Yield keys and results as they are finished.
 
-    ``workers`` are processes on this machine, -1 for all processors; ``scheduler`` the address of a Dask scheduler to
-    compute on instead, or a client of one.
+    ``workers`` are processes on this machine, -1 for all processors; or those of the backend that
+    ``joblib.parallel_config`` names, ``"dask"`` for a cluster.
     """
     if workers == 0:
         raise InputError("workers", "0", "one or more, or -1 for all processors")
-    if scheduler is not None:
-        require_package("distributed", "scheduler")
-        return _on_cluster(tasks, scheduler)
     if workers != 1:
         require_package("joblib", "workers")
         return _in_processes(tasks, workers)
@@ -178,27 +175,6 @@ def _in_processes(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[t
         raise RpimError(
             f"A process ended before its replicate was finished: {error} Finished replicates are kept."
         ) from None
-
-
-def _on_cluster(tasks: Sequence[tuple[str, Work]], scheduler: Any) -> Iterator[tuple[str, Row]]:
-    from distributed import Client, KilledWorker, as_completed
-
-    with ExitStack() as stack:
-        client = scheduler
-        if isinstance(scheduler, str):
-            try:
-                client = stack.enter_context(Client(scheduler, timeout="10s"))
-            except (OSError, ValueError) as error:  # ValueError: no address
-                raise RpimError(f"Dask scheduler {scheduler}: cannot be reached: {error}.") from None
-        if not isinstance(client, Client):
-            raise InputError("scheduler", f"a {type(client).__name__}", "the address of a Dask scheduler, or a client")
-        futures = [client.submit(_computed, *task, pure=False) for task in tasks]
-        try:
-            for future in as_completed(futures):
-                yield future.result()
-        except (KilledWorker, CancelledError) as error:  # whoever computes it dies, or the scheduler has
-            said = next(iter(str(error).splitlines()), type(error).__name__)
-            raise RpimError(f"Dask failed to compute a replicate: {said} Finished replicates are kept.") from None
 
 
 # --- what made them --------------------------------------------------------------------------------------------------

@@ -187,7 +187,7 @@ def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> st
 
 
 def run_study(
-    name: str | Path, quick: bool = False, workers: int = 1, scheduler: Any = None, resume: bool | None = None,
+    name: str | Path, quick: bool = False, workers: int = 1, resume: bool | None = None,
     redraw: bool = False, out: Path | None = None, progress: Progress = lambda _done, _every: None,
 ) -> tuple[Report, Path]:  # fmt: skip
     """Run a study; return its report and the folder with ``README.md``, ``metrics.json``, replicates and figures.
@@ -195,7 +195,7 @@ def run_study(
     Every replicate is a case, a table of plain values with the seed among them, so that results do not depend on who
     computes them. A finished replicate is written down at once. The ``name`` is a file ``mine.py``, a folder with
     ``study.py``, or a study of the checkout without its ending; ``quick`` is the small version; ``workers``,
-    ``scheduler``, ``resume`` and ``progress`` are as `run_cases` has them. ``redraw`` computes nothing: the report is
+    ``resume`` and ``progress`` are as `run_cases` has them. ``redraw`` computes nothing: the report is
     written anew from the replicates of the last run. Results go to ``out``, by default ``results/NAME`` or
     ``results/NAME-quick`` beside the study.
     """
@@ -229,7 +229,7 @@ def run_study(
     made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
     code = {**{f"file {file}": digest for file, digest in files.items()}, **replicates.package_code()}
     journal = folder / f"{REPLICATES}.sqlite"
-    rows = run_cases(cases, lambda case: partial(_run, path, case), workers, scheduler, progress, journal, code, resume)
+    rows = run_cases(cases, lambda case: partial(_run, path, case), workers, progress, journal, code, resume)
     report = study.report(rows)
     columns = list(dict.fromkeys(key for row in rows for key in row))
     table = pyarrow.table({key: [row.get(key) for row in rows] for key in columns})

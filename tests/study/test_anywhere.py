@@ -177,8 +177,7 @@ def test_what_a_study_depends_on_is_there_and_not_endless(place: Path, monkeypat
 
 
 def test_a_plain_installation_says_at_once_what_a_study_needs(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    for package in ("joblib", "distributed"):
-        monkeypatch.setitem(sys.modules, package, None)
+    monkeypatch.setitem(sys.modules, "joblib", None)
     ran = place.parent / "ran"
     text = (
         (place / "mine.py")
@@ -186,10 +185,9 @@ def test_a_plain_installation_says_at_once_what_a_study_needs(place: Path, monke
         .replace("    from inside", f"    open({str(ran)!r}, 'w').close()\n    from inside")
     )
     (place / "mine.py").write_text(text)
-    for asked in ({"workers": 2}, {"scheduler": "tcp://127.0.0.1:1"}):
-        with pytest.raises(ro.InputError, match=r"no package (joblib|distributed)"):
-            run_study("mine.py", quick=True, **asked)
-        assert not ran.exists()
+    with pytest.raises(ro.InputError, match="no package joblib"):
+        run_study("mine.py", quick=True, workers=2)
+    assert not ran.exists()
     assert run_study("mine.py", quick=True)[0].metrics == {"largest": 2}
 
 

@@ -12,7 +12,6 @@ import rpim_opt as ro
 from rpim_opt.study.figures import headline
 from rpim_opt.study.methods import sources_of, splits_of
 from rpim_opt.study.ranking import UNCONVERGED, number
-from rpim_opt.study.replicates import compute
 from rpim_opt.study.studies import Report, load_study, write
 from tests import ROOT
 from tests.study.test_comparison import POSITION, rows_of
@@ -131,11 +130,6 @@ def test_folds_need_as_many_configurations() -> None:
     few = data.take(np.flatnonzero(data.configuration < 4))
     with pytest.raises(ro.InputError, match="splits: found 4 configurations, accepted: at least 5 for 5 folds"):
         five.held_out(few, 1, 0)
-
-
-def test_a_scheduler_is_an_address_or_a_client() -> None:
-    with pytest.raises(ro.InputError, match="scheduler: found a int, accepted: the address of a Dask scheduler"):
-        list(compute([("a", dict)], 1, 3))
 
 
 def test_a_study_is_a_python_file(tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ import os
 import signal
 import sqlite3
 import subprocess
-import warnings
 from contextlib import closing
 from pathlib import Path
 
@@ -82,7 +81,7 @@ def _answers() -> dict[str, bool]:
 
 def test_an_interrupt_is_for_the_process_that_waits_for_the_others() -> None:
     before = signal.getsignal(signal.SIGINT)
-    assert list(compute([("a", _answers)], 2, None)) == [("a", {"ignored": True})]
+    assert list(compute([("a", _answers)], 2)) == [("a", {"ignored": True})]
     assert signal.getsignal(signal.SIGINT) == before
 
 
@@ -99,20 +98,6 @@ def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
     assert text.startswith("# Do random numbers have a mean?\n")
     for part in ("rpim-opt study toy` (in no repository)", "12 replicates", "numpy", "clarabel"):
         assert part in text
-
-
-def test_a_dask_cluster_gives_the_same(toy, tmp_path: Path) -> None:
-
-    toy()
-    here, _ = run_study("toy", out=tmp_path / "here")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the cluster's own, of ports and event loops
-        from distributed import LocalCluster
-
-        with LocalCluster(n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None) as cluster:
-            there, _ = run_study("toy", scheduler=cluster.scheduler_address, out=tmp_path / "there")
-    assert there.metrics == here.metrics
-    assert values(tmp_path / "here") == values(tmp_path / "there")
 
 
 def entries(journal: Path) -> list[tuple[str, str, str]]:
@@ -222,97 +207,6 @@ def test_a_study_prepares_once_before_its_cases(toy, tmp_path: Path):
     )
     run_study("toy", quick=True, out=tmp_path / "out")
     assert (tmp_path / "p").read_text() == "x"
-
-
-MONTE_CARLO = """
-import numpy as np
-import rpim_opt as ro
-from rpim_opt.study import Metric, Report
-
-QUESTION = "How do 1000 calibrations of the paper's arm differ?"
-METRICS = {"mean": Metric("lower", 0.0)}
-
-
-def cases(quick):
-    return [{"seed": seed} for seed in range(1000)]
-
-
-def run(seed):
-    instance = ro.load("paper_arm")
-    data = instance.problem.data
-    y = data.blocks[0].y + 3e-5 * np.random.default_rng(seed).normal(size=data.blocks[0].y.shape)
-    result = ro.calibrate(instance.problem.on(ro.Dataset.of(data.q, y, 3e-5)), ro.tikhonov, ro.reml)
-    return {"value": float(1e3 * result.errors(instance.validation).mean())}
-
-
-def report(rows):
-    return Report(f"{len(rows)} calibrations", {"mean": float(np.mean([row["value"] for row in rows]))})
-"""
-
-
-@pytest.mark.slow
-def test_a_killed_worker_of_a_cluster_loses_no_replicate(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(studies, "studies_folder", lambda: tmp_path)
-    (tmp_path / "monte_carlo.py").write_text(MONTE_CARLO)
-    here, _ = run_study("monte_carlo", out=tmp_path / "here")
-    killed: list[int] = []
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the cluster's own, of ports, event loops and the worker that dies
-        from distributed import Client, LocalCluster
-
-        with LocalCluster(n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None) as cluster:
-            with Client(cluster) as client:
-                workers = list(client.run(os.getpid).values())
-
-            def progress(done: int, of: int) -> None:
-                if done == 300:
-                    os.kill(workers[0], signal.SIGKILL)
-                    killed.append(done)
-
-            address = cluster.scheduler_address
-            there, _ = run_study("monte_carlo", scheduler=address, out=tmp_path / "there", progress=progress)
-    assert killed == [300]
-    assert values(tmp_path / "there") == values(tmp_path / "here")
-    assert len(values(tmp_path / "there")) == 1000
-    assert there.metrics == here.metrics
-
-
-def dies() -> dict[str, float]:
-    os._exit(3)
-
-
-def gives_up(*_: object) -> None:
-    from distributed.client import FutureCancelledError
-
-    raise FutureCancelledError("replicate", "scheduler-connection-lost")
-
-
-@pytest.fixture
-def cluster():
-    """Yield a cluster of one process that is given up when it dies."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # the cluster's own, of ports, event loops and the worker that dies
-        import dask
-        from distributed import LocalCluster
-
-        strict = dask.config.set({"distributed.scheduler.allowed-failures": 0})
-        with strict, LocalCluster(n_workers=1, threads_per_worker=1, processes=True, dashboard_address=None) as made:
-            yield made
-
-
-@pytest.mark.slow
-def test_what_ends_every_worker_of_a_cluster_is_a_sentence(cluster) -> None:
-    with pytest.raises(RpimError, match=r"Dask failed to compute a replicate: .* What was finished is kept"):
-        list(compute([("a", dies)], 1, cluster.scheduler_address))
-
-
-@pytest.mark.slow
-def test_a_scheduler_that_dies_is_a_sentence(cluster, monkeypatch: pytest.MonkeyPatch) -> None:
-    from distributed import Future
-
-    monkeypatch.setattr(Future, "result", gives_up)
-    with pytest.raises(RpimError, match=r"Dask failed to compute a replicate: .*connection-lost"):
-        list(compute([("a", dict)], 1, cluster.scheduler_address))
 
 
 def test_a_report_is_redrawn_from_the_replicates(toy, tmp_path: Path) -> None:
