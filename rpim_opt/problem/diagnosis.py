@@ -65,6 +65,8 @@ ON_GRID = 2e-4
 """Part of a step by which rounded values may miss it, for their last decimal."""
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
+SEVERAL = 0.85
+"""Several joint zeros moved, if that leaves less than this part of what one move leaves."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
 MOST_ROUNDS = 20
@@ -532,28 +534,16 @@ def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
 
 
 def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
-    """Report columns of joint and measured values that are frozen, identical, flat or without signs.
+    """Report columns of joint and measured values that are identical or sorted, coordinates that are flat or unsigned.
 
     Asked of data that nothing else explains: a robot may be measured so.
     """
     for block in problem.data.blocks:
         q, y = block.q[:, 0], block.y[:, :3]
-        labels = [problem.data.label[i] for i in block.row]
-        for i, column in enumerate(q.T):
-            changes = np.concatenate([[-1], np.flatnonzero(np.diff(column)), [len(column) - 1]])
-            k = int(np.argmax(np.diff(changes)))
-            first, last = changes[k] + 1, changes[k + 1]
-            if last - first + 1 >= FEWEST and np.ptp(q[first : last + 1], axis=0).any():
-                yield (
-                    f"joint {i + 1} has one and the same value in rows {labels[first]} to {labels[last]}, where others "
-                    "move: was its reading frozen?"
-                )
         named = dict(zip([*(f"q{i + 1}" for i in range(q.shape[1])), *"xyz"], np.hstack([q, y]).T, strict=False))
         ordered = [name for name, column in named.items() if np.ptp(column) > 0 and (np.diff(column) >= 0).all()]
         if len(ordered) == 1 and len(q) >= 2 * FEWEST:
             yield f"column {ordered[0]} is in ascending order, and no other one: was it sorted alone?"
-        negative = problem.robot.limits[:, 0] < -LEAST_TRAVEL["revolute"]
-        unsigned = [f"q{i + 1}" for i in np.flatnonzero((q.min(axis=0) >= 0) & (np.ptp(q, axis=0) > 0) & negative)]
         for (one, first), (other, second) in combinations(named.items(), 2):
             if np.ptp(first) > 0 and (first == second).all():
                 yield f"columns {one} and {other} have the same values: is one a copy?"
@@ -561,9 +551,8 @@ def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
             spread = y.std(axis=0)
             for k in np.flatnonzero(spread < FLAT * spread.max()):
                 yield f"column {'xyz'[k]} spreads over {three_digits(1e3 * spread[k])} mm only: is it another column?"
-            unsigned += [*("xyz" if y.min() >= 0 else "")]
-        if unsigned and len(q) >= 2 * FEWEST:
-            yield f"no value of column {joined(unsigned)} is negative: were signs lost?"
+            if y.min() >= 0 and len(q) >= 2 * FEWEST:
+                yield "no value of column x, y and z is negative: were signs lost?"
 
 
 def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
@@ -768,7 +757,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     found = _added(model, x, [columns for columns, _ in tried])
     several = list(_moves(problem, x, model, several=True))
     other = _added(model, x, [columns for columns, _ in several])
-    if other is not None and (found is None or other[2] < MOVED * found[2]):
+    if other is not None and (found is None or other[2] < SEVERAL * found[2]):
         tried, found = several, other
     if found is not None:
         number, coefficients, rest = found

@@ -208,12 +208,12 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "joint 5 in radians": (of_joint(4, np.radians), "joint 5 read as radians, not degrees"),
     "joints in turns": (joints(lambda q: q / 360), "as turns, not degrees"),
     "column q1 a row too low": (of_joint(0, lambda q: np.roll(q, 1)), "column q1 one row too low"),
-    "joint 5 frozen": (of_joint(4, lambda q: 0 * q + 0.3), "joint 5 has one and the same value in rows P1 to P40"),
+    "joint 5 frozen": (of_joint(4, lambda q: 0 * q + 0.3), "the values of joint 5 explain nothing"),
     "joint 2 frozen halfway": (
         of_joint(1, lambda q: np.where(np.arange(COUNT) < 20, q, q[20])),
-        "joint 2 has one and the same value in rows P21 to P40",
+        "wrong values of joint 2",
     ),
-    "signs of joint 3 lost": (of_joint(2, np.abs), "no value of column q3 is negative"),
+    "signs of joint 3 lost": (of_joint(2, np.abs), "values of joint 3"),
     # about the middle: where all y are negative, their signs lost are a mirrored frame, and that is what is named
     "signs of positions lost": (
         values(lambda y: np.abs(y - y.mean(axis=0))),
@@ -229,6 +229,27 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "joint 2 slipped halfway": (
         of_joint(1, lambda q: q + 0.014 * (np.arange(COUNT) < 20)),
         "fit a zero of joint 2 that moved",
+    ),
+    "joint 5 shuffled": (of_joint(4, np.random.default_rng(3).permutation), "the values of joint 5 explain nothing"),
+    "joint 4 reversed at half its gear": (of_joint(3, lambda q: -q / 2), "the values of joint 4 explain nothing"),
+    "joints 2 and 4 slipped halfway": (
+        both(
+            of_joint(1, lambda q: q + 0.026 * (np.arange(COUNT) < 20)),
+            of_joint(3, lambda q: q - 0.035 * (np.arange(COUNT) < 20)),
+        ),
+        "did several joints slip",
+    ),
+    "positions rounded to sixteenths of an inch": (
+        values(lambda y: (y / 1.5875e-3).round() * 1.5875e-3),
+        "measured values are rounded to 1.587 mm",
+    ),
+    "cylindrical coordinates": (
+        values(
+            lambda y: np.column_stack(
+                [np.hypot(y[:, 0], y[:, 1]), 1e-3 * np.degrees(np.arctan2(y[:, 1], y[:, 0])), y[:, 2]]
+            )
+        ),
+        "cylindrical",
     ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),

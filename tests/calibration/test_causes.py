@@ -50,7 +50,15 @@ QUICK = {
         "distances too long",
         "joint 2 slipped halfway",
     ],
-    "irb120": ["joint 3 coupled to 2", "values a row too low", "two rows exchanged", "joints rounded to 0.1 degrees"],
+    "irb120": [
+        "joint 5 shuffled",
+        "joints 2 and 4 slipped halfway",
+        "cylindrical coordinates",
+        "joint 3 coupled to 2",
+        "values a row too low",
+        "two rows exchanged",
+        "joints rounded to 0.1 degrees",
+    ],
     "iiwa7": [
         "a column in centimetres",
         "joint 2 from 90 degrees and joint 3 reversed",
