@@ -38,7 +38,7 @@ class Calibration(Outcome):
     message
         How the loop ended, in a sentence. It does not judge the data: whether to use the robot is the `verdict`.
     history
-        One `Iteration` each.
+        The iterations, with objective, step and weight.
     program
         The convex program at the last linearization.
     certificate

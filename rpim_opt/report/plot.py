@@ -21,14 +21,13 @@ from rpim_opt.calibration.uncertainty import TransmissionError, Uncertainty
 from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import Selection, weight_grid
-from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.report.summary import mm
 
 if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
 
-__all__ = ["error_vectors", "errors", "l_curve", "parameters", "picard", "selection", "selectors"]
+__all__ = ["error_vectors", "errors", "l_curve", "parameters", "picard", "selection"]
 
 Axes = Any  # matplotlib's, imported where axes are made
 
@@ -253,31 +252,6 @@ def selection(of: Selection | Calibration, ax: Axes = None) -> Axes:
     ax.axvline(selection.weight, color=COLORS["mark"], ls="-" if selection.interior else "--", label=label)
     ax.set(xlabel="weight", ylabel=f"score of {selection.name}")
     _logarithmic(ax, "x")
-    return _with_legend(ax)
-
-
-def selectors(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
-    """Draw the weights that selectors choose (`compare` by default); hollow: at an edge. Arguments as for `l_curve`.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.selectors(result)
-    >>> [label.get_text() for label in ax.get_yticklabels()][:4]  # by weight
-    ['quasi_optimality', 'discrepancy', 'corner', 'l_curve']
-    """
-    chosen = selections or compare(of.program if isinstance(of, Calibration) else of)
-    ordered = sorted(chosen.items(), key=lambda item: -item[1].weight)
-    ax = _axes(ax, len(ordered))
-    weight = np.array([each.weight for _, each in ordered])
-    interior = np.array([each.interior for _, each in ordered])
-    place = np.arange(1.0, len(ordered) + 1)
-    if interior.any():
-        _dots(ax, weight[interior], place[interior], "after")
-    if not interior.all():
-        _dots(ax, weight[~interior], place[~interior], "after", "at an edge", mfc="none")
-    ax.set_xlabel("weight")
-    _logarithmic(ax, "x")
-    _name(ax, "y", [name for name, _ in ordered])
     return _with_legend(ax)
 
 

@@ -113,7 +113,9 @@ def attributes() -> str:
             if name != "Prediction" or each not in ("count", "index"):  # of any tuple
                 rows.append((f"`{each}{called}`", fields.get(each) or _first(value)))
         rows += [(f"`{each}`", what) for each, what in fields.items() if not hasattr(owner, each)]
-        text += f"\n\n## {{py:obj}}`{name} <rpim_opt.{folder}.{name}>`\n\n{_table(rows[0], *sorted(rows[1:]))}"
+        head, *body = rows
+        body.sort(key=lambda row: row[0].strip("`()"))
+        text += f"\n\n## {{py:obj}}`{name} <rpim_opt.{folder}.{name}>`\n\n{_table(head, *body)}"
     return text + "\n"
 
 

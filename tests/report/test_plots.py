@@ -82,9 +82,6 @@ def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:
     assert np.array_equal(drawn(ax, "singular value s").get_ydata(), s[s > 0])
     assert np.array_equal(drawn(ax, "data |u'b|").get_ydata(), np.abs(beta[s > 0]))
     assert drawn(ax, "square root of the weight").get_ydata() == pytest.approx(np.sqrt([result.weight] * 2), rel=1e-12)
-    ax.clear()
-    ro.plot.selectors(result.program, {"reml": result.selection}, ax)
-    assert ax.lines[0].get_xdata()[0] == result.weight
 
 
 def overlapping(axis) -> int:
