@@ -101,28 +101,20 @@ def page(result: Calibration) -> str:
 
 # --- verdict and headline ----------------------------------------------------------------------------------
 
-VERDICTS = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Inconclusive"}
-
 
 def _headline(content: Content) -> Iterator[Block]:
     result = content.result
     found = content.accepted
     yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
     if found is not None:
-        confidence = percent(found.requirement.confidence)
-        text = (
-            f"limit {1e3 * found.requirement.limit:g} mm with {confidence} confidence at every configuration of"
-            " the region."
-        )
+        word, _, text = found.sentences()[0].partition(": ")
         if found.bound is not None and np.isfinite(found.bound):
-            reached = (
-                f"expanded uncertainty of the position reached (U, {confidence}) at most {1e3 * found.bound:.3f} mm"
-            )
-            text = f"{reached}, {text}"
-        yield "verdict", {"kind": found.verdict, "word": VERDICTS[found.verdict], "text": text}
+            U = f"expanded uncertainty of the position reached (U, {percent(found.requirement.confidence)})"
+            text = f"{U} at most {1e3 * found.bound:.3f} mm, {text}"
+        yield "verdict", {"kind": found.verdict, "word": word, "text": text}
     elif summary.inconclusive(result, content.map):
-        text = summary.inconclusive(result, content.map).partition(": ")[2]
-        yield "verdict", {"kind": "undecided", "word": VERDICTS["undecided"], "text": text}
+        word, _, text = summary.inconclusive(result, content.map).partition(": ")
+        yield "verdict", {"kind": "undecided", "word": word, "text": text}
     elif result.verdict.delivered:
         text = "the fit gives no reason against using this robot; no acceptance limit is stated."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
