@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.files import LARGEST_TEXT
 from rpim_opt.robot.kinematics import numeric_frame, roll_pitch_yaw
-from rpim_opt.robot.library import find_robot
+from rpim_opt.robot.library import find_robot, find_source, read_arm
 from tests.simulate import ARM, simulated
 
 EXACT = 1e-11
@@ -623,6 +623,13 @@ def test_ros_kinematics_in_and_out(tmp_path: Path) -> None:
     assert "# as measured" in target.read_text()
     with pytest.raises(ro.InputError, match="beta6, which follows the last joint"):
         ro.robot.write_ur_kinematics(path, replace(better, mdh=better.mdh + 1e-3), target)
+
+
+def test_a_command_takes_the_drivers_file_as_robot(tmp_path: Path) -> None:
+    path = tmp_path / "kinematics.yaml"
+    path.write_text(YAML_PLAIN)
+    arm = read_arm(find_source(str(path)).file)
+    assert np.array_equal(arm.robot.mdh, ro.robot.read_ur_kinematics(path).robot.mdh)
 
 
 @pytest.mark.parametrize(
