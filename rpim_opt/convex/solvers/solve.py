@@ -102,8 +102,10 @@ def minimum(
 
 def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
-    # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too
-    if few and (loss.expression.is_pwl() or (loss.quadratic and not warm.penalty.polyhedral)):
+    # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too, or
+    # begin with an unknown active set
+    quick = warm.penalty.polyhedral and (warm.z is not None or warm.penalty.size == len(warm.penalty.at))
+    if few and (loss.expression.is_pwl() or (loss.quadratic and not quick)):
         return _all_rows(loss, rows, warm, weight, damping)
     if warm.kink < 0:
         warm.kink = loss.kink(rows)
