@@ -20,7 +20,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import better_reading, coupling, misfit, placed, signs
+from rpim_opt.problem.misreadings import WRONG, better_reading, coupling, misfit, placed, signs
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
@@ -568,7 +568,7 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     fitted = [(_values_that_fit(robot, points, i), i) for i in range(robot.dof) if robot.joint_types[i] == "revolute"]
     left = [misfit(robot, replace(points, q=q)) for q, _ in fitted]
     best = int(np.argmin(left))
-    if left[best] >= FITS * whole:
+    if left[best] >= min(FITS * whole, WRONG):  # free values take up much of any other mistake
         return
     q, i = fitted[best]
     stated, found = points.q[:, i], q[:, i]
