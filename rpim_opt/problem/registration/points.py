@@ -286,19 +286,21 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
     y = np.moveaxis(candidates.y, -1, 0)
     eliminated = _anchored if coordinates == 1 else _registered
 
-    def weighted(weights: Array, zero: Array, tools: Array, where: Sequence[Array]) -> _State:
-        """Return the state of points whose kinematics (`_State.points` to `origins`) are known."""
-        base, offset, away, residual = eliminated(where[0], y, weights)
+    def weighted(
+        weights: Array, zero: Array, tools: Array, points: Array, turn: Array, axes: Array, origins: Array
+    ) -> _State:
+        """Return the state of points whose kinematics are known."""
+        base, offset, away, residual = eliminated(points, y, weights)
         off = tools - candidates.stated
         cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
-        return _State(zero, tools, base, cost, offset, *where, away, residual)
+        return _State(zero, tools, base, cost, offset, points, turn, axes, origins, away, residual)
 
     def at(weights: Array, zero: Array, tools: Array) -> _State:
         """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
         turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
         tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
         points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
-        return weighted(weights, zero, tools, (points, turn, axes, origins))
+        return weighted(weights, zero, tools, points, turn, axes, origins)
 
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
@@ -309,7 +311,8 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
             error = np.linalg.norm(state.residual, axis=0)
             limit = FULL_WEIGHT * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
-            state = weighted(weights, state.zero, state.tools, state[5:9])
+            kinematics = state.points, state.turn, state.axes, state.origins
+            state = weighted(weights, state.zero, state.tools, *kinematics)
         step = _step(robot, candidates, pull, weights, state, damping, zeros)
         tools = state.tools + step[:, :size].reshape(state.tools.shape)
         zero = state.zero
