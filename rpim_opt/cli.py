@@ -545,6 +545,10 @@ def export(
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
+    tip_measured: Annotated[
+        bool,
+        Option("--tip-measured", help="The reflector is the tip link: write its identified place."),
+    ] = False,
     marker: Marker = None,
     despite_verdict: Despite = False,
 ) -> Answer:
@@ -558,7 +562,7 @@ def export(
         written, notes = export_files(
             loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, camera_info=camera_info,
             mdh=mdh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
-            marker=marker, despite_verdict=despite_verdict,
+            tip_measured=tip_measured, marker=marker, despite_verdict=despite_verdict,
         )  # fmt: skip
     return Answer("\n".join(notes), {"notes": notes}, written=written)
 

@@ -95,7 +95,7 @@ def export_files(
     ``corrections`` are files to write, the last one the transmission errors of the whole model: ``joint``,
     ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``. A joint stands at its angle plus the correction:
     subtract it from a command. Without transmission errors the other files are written, and a note says so. ``marker``
-    is the reflector that is the tip, ``frames`` are ``root`` and ``tip`` of `export_urdf`; with ``despite_verdict`` a
+    is the reflector, ``frames`` are ``root``, ``tip`` and ``tip_measured`` of `export_urdf`; with ``despite_verdict`` a
     robot that is not delivered is written, too, with a note in every file.
 
     Returned are the files, and sentences on what they do not hold. Raises NotDelivered for a calibration that is not
@@ -217,18 +217,20 @@ def export_urdf(
     root: str | None = None,
     tip: str | None = None,
     marker: str | None = None,
+    tip_measured: bool = False,
     despite_verdict: bool = False,
 ) -> list[str]:
     """Write a URDF with the identified origins, and base and tool if they belong to the file.
 
-    An identified base or reflector that lies near the file's root or tip is the same frame, known better, and is
-    written. Elsewhere it is the instrument's or the reflector's own, and the file's frame stays as it is. Returned is a
-    sentence for each of the two frames that was identified, the place in the frames of the file's links: of the root in
-    the instrument's frame, of the reflector in the tip link's.
+    An identified base that lies near the file's root is the same frame, known better, and is written; elsewhere it is
+    the instrument's own. The tip link stays where the file has it behind the last joint, unless ``tip_measured``: the
+    reflector (``marker`` of several) is the tip link's origin, which goes to its identified place. A reflector on the
+    flange is near the tip, and is not the tip. Returned is a sentence for each of the two frames that was identified,
+    the place in the frames of the file's links: of the root in the instrument's frame, of the reflector in the tip
+    link's.
 
-    ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`.
-    ``marker`` is the reflector that is the tip; of several none is, unless it is named. ``despite_verdict`` as for
-    `export_files`.
+    ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`;
+    ``despite_verdict`` as for `export_files`. InputError for several reflectors of which none is named as the tip.
 
     Examples
     --------
@@ -251,7 +253,9 @@ def export_urdf(
     arm = identified(result, marker)
     own = read_urdf(source, root, tip)
     p = result.problem.parameters
-    no_tip = marker is None and len(reflectors(p.names)) > 1
+    known = reflectors(p.names)
+    if tip_measured and marker is None and len(known) > 1:
+        raise InputError("--tip-measured", f"{len(known)} reflectors", f"--marker with one of {', '.join(known)}")
     root_at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
     reflector_at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
     written: list[Array | None] = []
@@ -262,12 +266,13 @@ def export_urdf(
     ):
         place = getattr(arm, name)
         free = any(each.startswith(f"{name}_") for each in p.free.names)
-        moves = free and same_place(place, getattr(own, name)) and not (no_tip and name == "tool")
+        moves = free and (tip_measured if name == "tool" else same_place(place, own.base))
         written.append(place if moves else None)
         if moves:
             notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)} in {where}.")
         elif free:
-            notes.append(f"URDF: its {link} link stays where it was; in {there}.")
+            option = "; where the reflector is the tip, --tip-measured moves it there" if name == "tool" else ""
+            notes.append(f"URDF: its {link} link has the place that the file states; in {there}{option}.")
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, *written)
