@@ -199,7 +199,7 @@ def noise_test(squares: float, freedom: float, learned: bool = False, factor: fl
     if upper >= 0.5:
         cause = "the noise is stated too large"
         if learned and factor == 1.0:
-            cause += ' (noise = "free" estimates it)'
+            cause += ' (--noise free, or repeatability = "free" in problem.toml, estimates it)'
     elif learned:
         cause = "the difference is the robot's repeatability, or an effect that the model lacks"
     return NoiseTest(ratio, probability, f"Residuals are {ratio:.2f} times the stated measurement noise: {cause}.")

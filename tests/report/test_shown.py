@@ -62,21 +62,6 @@ def test_a_notebook_shows_a_table(name: str) -> None:
     assert max(map(len, cells)) < 30
 
 
-def test_a_notebook_shows_the_scores_about_the_choice() -> None:
-    page = ElementTree.fromstring(RESULT.selection._repr_html_())
-    shown = np.array([float(cell.text or "") for cell in page.findall(".//tbody/tr/th")])
-    assert len(shown) == 11
-    assert shown[5] == pytest.approx(RESULT.weight, rel=0.1)
-
-
-def test_a_notebook_shows_the_strongest_configuration_first() -> None:
-    bad = ro.calibrate(ro.load("blunders").problem, ro.tikhonov, weight=1.0)
-    page = ElementTree.fromstring(ro.influence(bad)._repr_html_())
-    first = [cell.text for cell in page.findall(".//tbody/tr/th")]
-    wrong = {flag.label for flag in ro.calibrate(bad.problem, ro.robust, weight=1.0).flagged}
-    assert set(first[:3]) <= wrong
-
-
 def test_long_tables_are_cut_in_notebooks_and_whole_in_frames() -> None:
     parameters = INSTANCE.problem.parameters
     assert len(parameters) > 60
