@@ -128,8 +128,14 @@ class Box:
         fixed = np.flatnonzero(lower == upper)
         low = np.flatnonzero(np.isfinite(lower) & (lower < upper))
         high = np.flatnonzero(np.isfinite(upper) & (lower < upper))
-        made = [z[fixed] == lower[fixed], z[low] >= lower[low], z[high] <= upper[high]]
-        return [each for each in made if each.size]
+        made: list[Any] = []
+        if len(fixed):
+            made.append(z[fixed] == lower[fixed])
+        if len(low):
+            made.append(z[low] >= lower[low])
+        if len(high):
+            made.append(z[high] <= upper[high])
+        return made
 
 
 def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
