@@ -402,7 +402,7 @@ def structure(
     if not formulation.solvable:
         return Structure(formulation, model.parameters, m, model.members[0], forms)
     if model.stands_for is not None:
-        found = of_length(formulation, model.equations)
+        found = of_length(formulation, lambda: model.equations)
         if found is None:
             where = f"formulation '{formulation.name}'"
             raise InputError(where, "equations in blocks, of which only the QR factor is kept", "a squared loss")
@@ -429,20 +429,21 @@ MOST_KEPT = 64
 """Structures of ready formulations that are kept for the next model of their shape."""
 
 
-def of_length(formulation: Formulation, equations: int) -> Formulation | None:
+def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formulation | None:
     """Return the formulation whose loss sees only the length of the residual, in a way that holds for its QR factor.
 
-    A loss may depend on the number of equations: their mean square is no mean of the factor's rows. None for one that
-    sees more.
+    A loss may depend on the number of equations: their mean square is no mean of the factor's rows. They are counted,
+    which reads all blocks, where a loss is not known. None for one that sees more.
     """
     if formulation.loss_over != "equation" or (formulation.ready and formulation.loss not in INVARIANT):
         return None
     if formulation.loss in INVARIANT:
         return formulation
-    if equations > MOST_CANONICALIZED:
+    count = equations()
+    if count > MOST_CANONICALIZED:
         return None
     try:
-        loss = term(formulation.loss, equations, f"formulation '{formulation.name}', loss")
+        loss = term(formulation.loss, count, f"formulation '{formulation.name}', loss")
     except ValueError:  # it is made for another number of residuals
         return None
     form = quadratic(loss.expression, loss.variable)
@@ -458,7 +459,7 @@ def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[F
     A loss that sees only the length of the residual needs nothing; ``equations`` counts them. InputError for a loss
     that is no sum over rows.
     """
-    if formulation.loss in INVARIANT or of_length(formulation, equations()) is not None:
+    if formulation.loss in INVARIANT or of_length(formulation, equations) is not None:
         return formulation, None
     where = f"formulation '{formulation.name}'"
     accepted = "a squared loss, or a sum over configurations or equations (robust)"

@@ -48,12 +48,12 @@ def box(lower: Any, upper: Any) -> ro.constraints.Box:
     ],
 )
 def test_what_sees_the_length_of_the_residual_alone(stated: dict[str, Any], is_invariant: bool) -> None:
-    assert (of_length(ro.Formulation("mine", **stated), 30) is not None) == is_invariant
+    assert (of_length(ro.Formulation("mine", **stated), lambda: 30) is not None) == is_invariant
 
 
 def test_many_equations_are_not_canonicalized_to_see() -> None:
-    assert of_length(ro.Formulation("mine", loss=lambda r: 3 * cp.sum_squares(r)), 20_001) is None
-    assert of_length(ro.tikhonov, 20_001) is ro.tikhonov
+    assert of_length(ro.Formulation("mine", loss=lambda r: 3 * cp.sum_squares(r)), lambda: 20_001) is None
+    assert of_length(ro.tikhonov, lambda: 20_001) is ro.tikhonov
 
 
 def test_a_triangle_stands_for_its_equations_where_the_loss_sees_their_length() -> None:
