@@ -16,7 +16,6 @@ from .calibration import influence as influence
 from .convex import Formulation as Formulation
 from .convex import bounded as bounded
 from .convex import constraints as constraints
-from .convex import corner as corner
 from .convex import discrepancy as discrepancy
 from .convex import gcv as gcv
 from .convex import group_lasso as group_lasso
@@ -28,11 +27,9 @@ from .convex import lasso as lasso
 from .convex import least_squares as least_squares
 from .convex import leave_one_out as leave_one_out
 from .convex import minimax as minimax
-from .convex import ncp as ncp
 from .convex import quasi_optimality as quasi_optimality
 from .convex import reml as reml
 from .convex import robust as robust
-from .convex import robust_gcv as robust_gcv
 from .convex import select as select
 from .convex import sum_of_norms as sum_of_norms
 from .convex import tikhonov as tikhonov

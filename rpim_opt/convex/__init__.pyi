@@ -17,15 +17,12 @@ from .given import given as given
 from .program import Estimate as Estimate
 from .program import Program as Program
 from .program import pose as pose
-from .rules.curve import corner as corner
 from .rules.curve import l_curve as l_curve
 from .rules.folds import k_fold as k_fold
 from .rules.folds import leave_one_out as leave_one_out
 from .rules.folds import two_step as two_step
 from .rules.scores import discrepancy as discrepancy
 from .rules.scores import gcv as gcv
-from .rules.scores import ncp as ncp
 from .rules.scores import quasi_optimality as quasi_optimality
 from .rules.scores import reml as reml
-from .rules.scores import robust_gcv as robust_gcv
 from .unknown import Unknown as Unknown

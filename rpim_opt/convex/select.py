@@ -10,24 +10,21 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, pick
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.rules.curve import corner, l_curve
+from rpim_opt.convex.rules.curve import l_curve
 from rpim_opt.convex.rules.folds import k_fold, leave_one_out, two_step
-from rpim_opt.convex.rules.scores import discrepancy, gcv, ncp, quasi_optimality, reml, robust_gcv
+from rpim_opt.convex.rules.scores import discrepancy, gcv, quasi_optimality, reml
 from rpim_opt.convex.rules.selection import Selection
 
 __all__ = [
     "Selection",
     "compare",
-    "corner",
     "discrepancy",
     "gcv",
     "k_fold",
     "l_curve",
     "leave_one_out",
-    "ncp",
     "quasi_optimality",
     "reml",
-    "robust_gcv",
     "two_step",
 ]
 
@@ -60,15 +57,12 @@ def compare(program: Program) -> dict[str, Selection]:
 SELECTORS: dict[str, Callable[[Program], Selection]] = {
     "reml": reml,
     "l_curve": l_curve,
-    "corner": corner,
     "two_step": two_step,
     "gcv": gcv,
-    "robust_gcv": robust_gcv,
     "leave_one_out": leave_one_out,
     "k_fold": k_fold,
     "discrepancy": discrepancy,
     "quasi_optimality": quasi_optimality,
-    "ncp": ncp,
 }
 LEARNED = "learned"
 """Stands for hyperparameters that are estimated from the data, and no weight."""

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from rpim_opt.convex.quadratic import Quadratic, Ridge, identity, ridge, robot_alone
-from rpim_opt.convex.rules.scores import influence
 from rpim_opt.problem.linear import LinearModel
 from tests.convex.test_formulation import model
 
@@ -66,15 +65,6 @@ def test_freedom_noise_and_prior_are_their_definitions(name: str) -> None:
     assert form.prior(WEIGHT) == pytest.approx(prior, rel=1e-7, abs=1e-9)
     assert form.noise(WEIGHT) + form.prior(WEIGHT) == pytest.approx(inverse, rel=1e-7, abs=1e-9)
     assert form.undecided(WEIGHT).shape == (N, 0)
-
-
-@pytest.mark.parametrize("name", PENALTIES)
-def test_rows_of_the_influence_matrix(name: str) -> None:
-    m, p = model(condition=30.0), PENALTIES[name]
-    form = ridge(m, p)
-    Q, s2, _ = influence(m, form)
-    H = (Q * (s2 / (s2 + WEIGHT))) @ Q.T
-    assert pytest.approx(m.A @ np.linalg.inv(normal_matrix(m, p, WEIGHT)) @ m.A.T, abs=1e-8) == H
 
 
 @pytest.mark.parametrize("name", PENALTIES)

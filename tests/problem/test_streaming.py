@@ -169,7 +169,7 @@ def test_large_problems_are_solved_in_parts_of_whole_configurations(whole, monke
 
 def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:
     problem = partitioned(whole, parts[:1])
-    for rule in (ro.leave_one_out, ro.k_fold, ro.two_step, ro.ncp):
+    for rule in (ro.leave_one_out, ro.k_fold, ro.two_step):
         with pytest.raises(ro.InputError, match="QR factor"):
             ro.calibrate(problem, ro.tikhonov, rule)
     with pytest.raises(ro.InputError, match="data in blocks"):

@@ -37,7 +37,7 @@ def test_the_l_curve_marks_every_choice(ax, tmp_path) -> None:
 def test_the_choice_of_every_selector_can_be_drawn(ax) -> None:
     problem = ro.load("position").problem
     program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
-    for rule in (ro.corner, ro.gcv, ro.reml, ro.leave_one_out, ro.discrepancy, ro.quasi_optimality, ro.ncp):
+    for rule in (ro.gcv, ro.reml, ro.leave_one_out, ro.discrepancy, ro.quasi_optimality):
         ax.clear()
         chosen = rule(program)
         ro.plot.selection(chosen, ax)

@@ -10,7 +10,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.curve import l_curve
-from rpim_opt.convex.rules.scores import influence, linear_rule
+from rpim_opt.convex.rules.scores import linear_rule
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
@@ -194,9 +194,14 @@ def _of_squares(program: Program) -> Score:
 
     With f = s^2 / (s^2 + weight) and residuals r of all, r_g^- = (1 - Q_g diag(f) Q_g')^-1 r_g.
     """
-    Q, s2, target = influence(program.squared, program.ridge)
+    form, model = program.ridge, program.squared
+    s = form.s[form.seen]
+    # directions that the penalty leaves free stand beside the others with infinite s^2
+    s2 = np.concatenate([s**2, np.full(form.fixed, 1e300)])
+    Q = model.A @ np.hstack([form.B[:, form.seen] / s, form.free])
+    target = model.b - model.A @ form.offset
     projected = Q.T @ target
-    _, which, count = np.unique(program.squared.group, return_inverse=True, return_counts=True)
+    _, which, count = np.unique(model.group, return_inverse=True, return_counts=True)
     order, first = np.argsort(which, kind="stable"), np.cumsum(count) - count
     # configurations of k equations together
     places = [order[first[count == k][:, None] + np.arange(k)] for k in np.unique(count).tolist()]

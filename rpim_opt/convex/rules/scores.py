@@ -1,17 +1,16 @@
-"""Selection rules by a score of the linear estimator: REML, GCV, discrepancy, quasi-optimality, NCP."""
+"""Selection rules by a score of the linear estimator: REML, GCV, discrepancy, quasi-optimality."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from functools import partial
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.quadratic import Ridge, identity, ridge, robot_alone
+from rpim_opt.convex.quadratic import identity, ridge, robot_alone
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
@@ -20,9 +19,7 @@ from rpim_opt.convex.rules.selection import (
     least_between,
     on_squares,
     weight_grid,
-    with_rows,
 )
-from rpim_opt.problem.linear import LinearModel
 
 
 def linear_rule(
@@ -34,7 +31,7 @@ def linear_rule(
     """
     if program.penalty_form is None:
         found = f"formulation '{program.formulation.name}'"
-        accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
+        accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve or k_fold serve any"
         raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
         program.inlier_model(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
@@ -49,17 +46,6 @@ def linear_rule(
         return Selection(float(weights[best]), name, weights, score, False, edge(best))
     weight, _ = least_between(score_at, weights, best)
     return Selection(weight, name, weights, score, True, note)
-
-
-def influence(model: LinearModel, form: Ridge) -> tuple[Array, Array, Array]:
-    """Return Q (m, p), s^2 (p,) and the values y (m,) with influence matrix Q diag(s^2 / (s^2 + weight)) Q'.
-
-    Directions that the penalty leaves free stand beside the others with infinite s^2, and y is measured from the
-    penalty's centre.
-    """
-    s = form.s[form.seen]
-    s2 = np.concatenate([s**2, np.full(form.fixed, 1e300)])
-    return model.A @ np.hstack([form.B[:, form.seen] / s, form.free]), s2, model.b - model.A @ form.offset
 
 
 @on_squares
@@ -125,39 +111,16 @@ def gcv(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1', True)
     """
-    return linear_rule(program, "gcv", partial(_gcv, 1.0), "smallest generalized cross-validation error")
+    return linear_rule(program, "gcv", _gcv, "smallest generalized cross-validation error")
 
 
-@on_squares
-def robust_gcv(program: Program, gamma: float = 1.4) -> Selection:
-    """Choose by cross-validation that charges more for degrees of freedom: rho(w) / (m - gamma dof(w))^2.
-
-    Guards against GCV's occasional far too small weights (Cummins, Filloon and Nychka 2001, JASA 96:233).
-
-    ``gamma`` is the price of a degree of freedom, 1 in `gcv`. InputError for another penalty than a quadratic, and with
-    less than three equations for each direction, where it guards too much.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.robust_gcv)
-    >>> f"{result.weight:.2g}", result.selection.interior
-    ('1.9', True)
-    """
-    m = program.model.equations
-    rank = program.model.rank
-    if m < 3 * rank:
-        found = f"{m} equations for {rank} directions"
-        raise InputError("selector robust_gcv", found, "three equations per direction; gcv or reml with fewer")
-    note = f"smallest cross-validation error with gamma {gamma:g}"
-    return linear_rule(program, "robust_gcv", partial(_gcv, gamma), note)
-
-
-def _gcv(gamma: float, program: Program) -> Score:
-    """Return rho(w) / (m - gamma dof(w))^2; no weight serves that leaves no equation."""
+def _gcv(program: Program) -> Score:
+    """Return rho(w) / (m - dof(w))^2; no weight serves that leaves no equation."""
     beta2, s2, perp = program.ridge.filters
 
     def score(weights: Array) -> Array:
         g = weights[:, None] / (s2 + weights[:, None])
-        left = program.squared.equations - gamma * (program.ridge.fixed + np.sum(1 - g, axis=1))
+        left = program.squared.equations - program.ridge.fixed - np.sum(1 - g, axis=1)
         return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
 
     return score
@@ -229,37 +192,3 @@ def quasi_optimality(program: Program) -> Selection:
         return lambda weights: np.sum((weights[:, None] ** 2 * s2 * beta2) / (s2 + weights[:, None]) ** 4, axis=1)
 
     return linear_rule(program, "quasi_optimality", score_of, "least change of the solution", local=True)
-
-
-@on_squares
-def ncp(program: Program) -> Selection:
-    """Choose where the residual looks most like white noise: normalized cumulative periodogram (Hansen et al. 2006).
-
-    Minimizes the largest distance of the cumulative periodogram of the residual, in the order of the rows, from
-    a straight line. Needs rows in an order that means something, such as time or place. InputError for another penalty
-    than a quadratic.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.ncp)
-    >>> f"{result.weight:.2g}", result.selection.note
-    ('67', 'whitest residual')
-    """
-    with_rows(program, "ncp")
-
-    def score_of(program: Program) -> Score:
-        Q, s2, target = influence(program.squared, program.ridge)
-        projected = Q.T @ target
-        # transforms are linear: those of the columns say those of every residual
-        spectra = np.fft.rfft(np.vstack([Q.T, target]), axis=1)[:, 1:]
-        count = spectra.shape[1]
-        columns = np.hstack([spectra.real, spectra.imag])
-        line = np.arange(1, count + 1) / count
-
-        def farthest(weight: float) -> float:
-            left = columns[-1] - (s2 / (s2 + weight) * projected) @ columns[:-1]
-            cumulative = np.cumsum(left[:count] ** 2 + left[count:] ** 2)
-            return float(np.max(np.abs(cumulative / cumulative[-1] - line)))
-
-        return lambda weights: np.array([farthest(weight) for weight in weights])
-
-    return linear_rule(program, "ncp", score_of, "whitest residual")
