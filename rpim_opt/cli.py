@@ -419,7 +419,8 @@ def validate(
     exceeds allowed_sigmas with probability 0.01.
 
     Exit code 1 if an error is above the limit, the errors are significantly larger than those of the nominal robot
-    (mean difference of their squares above three standard errors), or an input mistake is likely.
+    (mean difference of their squares above three standard errors), or an input mistake is likely, a moved instrument
+    or base among them.
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
@@ -573,7 +574,7 @@ def compensate(
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
     units: Units = "",
     position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
-    tool: Annotated[Text, Option(help="TCP at the flange [mm, deg]: x,y,z,roll,pitch,yaw; default: reflector.")] = None,
+    tool: Annotated[Text, Option(help="TCP in the DH table's flange frame [mm, deg]: x,y,z,roll,pitch,yaw.")] = None,
     marker: Marker = None,
     base: Annotated[bool, Option("--base", help="Correct for deviations of the base as well.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
@@ -584,7 +585,8 @@ def compensate(
 ) -> Answer:
     """Correct joint commands so that the real robot goes where the nominal one would.
 
-    Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or above the limit.
+    Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or above the limit,
+    without one above twice its standard uncertainty.
     """
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)

@@ -17,7 +17,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
-from rpim_opt.calibration.held_out import excluded_by_fit, judged
+from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, judged
 from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
@@ -29,8 +29,6 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 
 Verdict = Literal["accepted", "rejected", "undecided"]
-FEWEST = 5
-"""Held-out rows below which they say too little of the intervals."""
 MOST = 3
 """Joints or rows that a reason names."""
 STATED = 1e9
@@ -226,7 +224,8 @@ class Acceptance:
             lines.append(
                 f"Expanded uncertainty of the position reached (U, {percent(asked.confidence)}): at most "
                 f"{1e3 * found.largest:.3f} mm (largest of {found.count} configurations, refined by a search), median "
-                f"{1e3 * found.typical:.3f} mm."
+                f"{1e3 * found.typical:.3f} mm. It is that of the reflector: for another point, the flange or a TCP, "
+                "`compensate --tool` states the uncertainty."
             )
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
@@ -337,8 +336,11 @@ def _held_out(
     apart = result.record.validation if data is None else data
     held = result.record.held_out
     excluded: list[str] = []
+    moved = ""
     if apart is not None:
-        error, (sigmas, allowed, coverage) = result.errors(apart), judged(result, apart)
+        found = judged(result, apart)
+        error, (sigmas, allowed, coverage) = result.errors(apart), found
+        moved = displaced(result, apart, found)
     elif held is not None:
         excluded = excluded_by_fit(result)
         kept = ~np.isin(held.label, excluded)
@@ -374,8 +376,8 @@ def _held_out(
         lacking.append(f"Lacking: at least {FEWEST} held-out rows; there are {rows}.")
     if beyond:
         lacking.append(
-            f"Lacking: valid prediction intervals. Rows outside theirs: {listed(beyond, MOST)}. Repeat these "
-            "measurements, or extend the model."
+            f"Lacking: valid prediction intervals. Rows outside theirs: {listed(beyond, MOST)}. "
+            + (moved or "Repeat these measurements, or extend the model.")
         )
     sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm, of "
     sentence += f"which the instrument may contribute {1e3 * instrument[inside].max(initial=0.0):.3f} mm"

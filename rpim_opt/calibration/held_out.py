@@ -17,7 +17,10 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import CONFIDENCE, HeldOut
+from rpim_opt.problem.registration.closed_forms import register, transformed
 
+FEWEST = 5
+"""Held-out rows below which they say too little."""
 RARE = 0.01
 """Probability that data like those of the calibration have any row that is named."""
 
@@ -63,6 +66,36 @@ def judged(result: Calibration, data: Dataset) -> Judged:
         inside.append(within[predicted][:, lengths].ravel())
     covered = np.concatenate(inside)
     return Judged(sigmas, allowed, float(covered.mean()) if len(covered) else None)
+
+
+def displaced(result: Calibration, data: Dataset, found: Judged) -> str:
+    """Say that measurements are displaced together, by the motion that registers them; empty where they are not.
+
+    It is said where rows are outside their prediction intervals and the motion takes more than half of the RMS error,
+    for its six degrees of freedom.
+    """
+    vectors = result.error_vectors(data)
+    rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
+    if len(rows) < FEWEST or not (found.sigmas > found.allowed)[rows].any():
+        return ""
+    measured = result.measured_positions(data)[rows]
+    predicted = measured - vectors[rows]
+    try:
+        motion = register(predicted, measured)
+    except InputError:  # points on a line
+        return ""
+    before = float(np.sqrt(np.mean(vectors[rows] ** 2)))
+    after = float(np.sqrt(np.sum((measured - transformed(motion, predicted)) ** 2) / (3 * len(rows) - 6)))
+    if after > before / 2:
+        return ""
+    centre = predicted.mean(axis=0)
+    shift = 1e3 * np.linalg.norm(transformed(motion, centre) - centre)
+    turn = 1e3 * np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))
+    return (
+        f"Likely: the instrument or the base moved. The measurements are displaced together by {shift:.3g} mm and "
+        f"{turn:.3g} mrad; registered again, their RMS error is {1e3 * np.sqrt(3) * after:.3g} mm in place of "
+        f"{1e3 * np.sqrt(3) * before:.3g} mm. `update --reset 'base_*'` registers it again."
+    )
 
 
 def excluded_by_fit(result: Calibration) -> list[str]:

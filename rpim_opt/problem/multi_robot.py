@@ -135,7 +135,7 @@ def _concatenated(tables: Sequence[Parameters]) -> Parameters:
 
     return Parameters(
         names=tuple(listed("names")), dimensions=tuple(listed("dimensions")),
-        own_frames=tuple(dict.fromkeys(listed("own_frames"))), terms=tuple(dict.fromkeys(listed("terms"))),
+        **{what: tuple(dict.fromkeys(listed(what))) for what in ("own_frames", "terms", "unstated_tools")},
         **{what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")},
     )  # fmt: skip
 

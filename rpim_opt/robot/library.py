@@ -79,9 +79,10 @@ class RobotSource(NamedTuple):
     origin: str
 
 
-def find_source(robot: str) -> RobotSource:
+def find_source(robot: str | Path) -> RobotSource:
     """Return the source of a robot that a command or a script names: a ready one by name, or a file, also a xacro."""
     endings = (*ROBOT_FILES, XACRO)
+    robot = str(robot)
     if not robot.endswith(endings):
         return RobotSource(find_robot(robot), f"a copy of the ready robot {robot}")
     file = Path(robot)

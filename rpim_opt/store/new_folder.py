@@ -78,7 +78,7 @@ class Started:
 
 def new_problem(
     folder: str | Path,
-    robot: str,
+    robot: str | Path,
     data: str | Path | Sequence[str | Path],
     *,
     measurement: str | None = None,
@@ -336,7 +336,7 @@ def _problem_text(
         sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
         base="" if base is None else _frame(base),
         how=how,
-        known="at the tip of the robot's file" if arm.tool.any() else "unknown, so identified from the flange's origin",
+        known="guessed at the tip of the robot's file" if arm.tool.any() else "unknown, so from the flange's origin",
         markers=[_subtable(marker) for marker in markers],
         tool=_frame(arm.tool),
         cameras=cameras,
@@ -402,7 +402,8 @@ def _frame(place: Array) -> str:
     lines = []
     for dimension, part in (("length", slice(3)), ("angle", slice(3, 6))):
         unit, numbers = exact(dimension, place[part])
-        lines += [f"{name}_{unit} = {number + 0.0!r}" for name, number in zip(FRAME[part], numbers, strict=True)]
+        for name, number in zip(FRAME[part], numbers, strict=True):
+            lines.append(f"{name}_{unit} = {round(number, 12) + 0.0!r}")
     return "\n".join(lines)
 
 

@@ -41,7 +41,8 @@ from rpim_opt.use.reading import Targets, read_targets
 SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
 REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
-KNOWN_TOOL = 0.01  # largest scale [m, rad] of a reflector that is known: a wider one states no TCP
+KNOWN_TOOL = 0.01  # largest scale [m, rad] of a reflector that is known: deviations of a wider one count as its own
+EXPANDED = 2.0  # standard uncertainties up to which an error left by the model does not show
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 BANK = 2000
 TRIALS = 12
@@ -64,7 +65,8 @@ class Compensation:
     ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where any of the
     latter leaves more than that. A row that would be ``"ok"`` is ``"extrapolated"`` beyond the measured joint ranges,
     where no measurement checked the model; ``outside`` are all rows there. ``note`` says why a robot is not delivered
-    that is used all the same, ``point`` which point is moved, with its place in the flange frame.
+    that is used all the same, ``point`` which point is moved, with its place in the flange frame. ``limit`` [m] is the
+    largest error that is accepted; infinite where none is stated.
     """
 
     robot: Robot
@@ -80,6 +82,7 @@ class Compensation:
     outside: Outside = field(default_factory=Outside)
     note: str = ""
     point: str = ""
+    limit: float = np.inf
 
     def __str__(self) -> str:
         """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
@@ -111,8 +114,14 @@ class Compensation:
 
     @property
     def missed(self) -> list[str]:
-        """The labels of rows whose commands miss the target: unreachable, or error above the limit."""
-        return [label for label, each in zip(self.label, self.status, strict=True) if each in (UNREACHABLE, ABOVE)]
+        """The labels of rows that miss their target: unreachable, or the position error is above the limit.
+
+        Without a limit an error counts that exceeds twice its standard uncertainty.
+        """
+        far = np.isin(self.status, (UNREACHABLE, ABOVE))
+        if not np.isfinite(self.limit):
+            far |= self.position_error > EXPANDED * self.std
+        return [self.label[i] for i in np.flatnonzero(far)]
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -193,9 +202,8 @@ def compensate(
 
     **Tool.** ``tool`` (6,) is in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the
     robot has exactly there. By default it is the reflector of the calibration (``marker`` of several): the controller's
-    robot has it at its nominal place (as stated, or where registration puts it), the real one as identified; a nominal
-    place that the identified one contradicts is no TCP, and both have it as identified. The flange frame is that of the
-    DH table, after the last joint.
+    robot has it where it is stated, the real one as identified. Where no place is stated, or the data contradict it,
+    both have it as identified. The flange frame is that of the DH table, after the last joint.
 
     **Loads.** Joints are in the middle of their backlash. ``torque`` (N, dof) [Nm] is required, and zero if need be,
     where compliances were identified from measured ones; ``payload`` [kg], one or (N,), and ``payload_centre`` (3,) in
@@ -252,7 +260,7 @@ def compensate(
     status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
     return Compensation(
-        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=tooled.point
+        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=tooled.point, limit=limit
     )
 
 
@@ -323,7 +331,7 @@ class _Tooled(NamedTuple):
 
     @classmethod
     def of(cls, result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str) -> _Tooled:
-        """Take a stated tool in the place of the first reflector, or a reflector: one that data contradict as found."""
+        """Take a stated tool in the place of the first reflector, or a reflector: as identified if no TCP is stated."""
         whole = result.problem.parameters
         places = whole.places_of(robot)
         p = whole.of_robot(robot)
@@ -354,15 +362,16 @@ class _Tooled(NamedTuple):
                 C = C[np.ix_(still, still)]
             point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
             return cls(replace(p, nominal=nominal, identified=identified), x, C, marker, point, True)
-        where = f"nominally (stated, or registered) at {placed(nominal[at])} in the flange frame"
-        if (np.abs(x[at]) > MISPLACED * (np.minimum(p.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)).any():
-            found = p.values(x)[at]
-            where = (
-                f"as identified at {placed(found)} in the flange frame; its nominal position is not used as TCP, since "
+        where = f"stated at {placed(nominal[at])} in the flange frame"
+        contradicted = np.abs(x[at]) > MISPLACED * (np.minimum(p.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)
+        unstated = marker in p.unstated_tools and p.identified[at].any()
+        if unstated or contradicted.any():
+            reason = (
+                "no place is stated" if unstated else f"the data contradict the stated place ({placed(nominal[at])})"
             )
-            where += f"the data contradict it ({placed(nominal[at])})"
-            nominal[at] = found
+            nominal[at] = p.values(x)[at]
             x[at] = 0.0
+            where = f"as identified at {placed(nominal[at])} in the flange frame, since {reason}"
         point = f"Target point: the reflector, {where}; a controller with another TCP needs --tool."
         return cls(replace(p, nominal=nominal), x, C, marker, point)
 

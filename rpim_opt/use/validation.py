@@ -13,7 +13,7 @@ from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import judged
+from rpim_opt.calibration.held_out import displaced, judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import REACH, arm_length, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
@@ -150,10 +150,11 @@ def validate(result: Calibration, data: Dataset) -> Validation:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
         remarks += [*contact_remarks(problem), *known_points(problem, data)]
+    found = judged(result, data)
     return Validation(
-        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *judged(result, data),
+        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *found,
         outside=result.outside(data), touched=touched, remarks=tuple(remarks),
-        mistake=misread(result, data) or _elsewhere(result, error),
+        mistake=misread(result, data) or displaced(result, data, found) or _elsewhere(result, error),
     )  # fmt: skip
 
 

@@ -363,8 +363,21 @@ def test_a_reflector_that_the_data_contradict_is_no_tcp() -> None:
     stated = replace(result, problem=result.problem.with_parameters(replace(far, nominal=nominal)), x=x[p.identified])
     assert found.q == pytest.approx(ro.use.compensate(stated, q, orientation=False).q, abs=1e-9)
     assert "as identified at" in found.point
-    assert "its nominal position is not used as TCP" in str(found)
-    assert "nominally (stated, or registered)" in ro.use.compensate(result, q).point
+    assert "since the data contradict the stated place" in str(found)
+    assert "the reflector, stated at" in ro.use.compensate(result, q).point
+    unstated = result.problem.with_parameters(replace(p, unstated_tools=("",)))
+    found = ro.use.compensate(replace(result, problem=unstated), q, orientation=False)
+    assert "since no place is stated" in found.point
+    at_identified = ro.use.compensate(result, q, orientation=False, tool=_identified_tool(result))
+    assert found.q == pytest.approx(at_identified.q, abs=1e-9)
+
+
+def _identified_tool(result: ro.calibration.Calibration) -> np.ndarray:
+    p = result.problem.parameters
+    x = np.zeros(len(p))
+    x[p.identified] = result.x
+    tool = dict(zip(p.names, p.values(x), strict=True))
+    return np.array([tool[f"tool_{c}"] for c in ("x", "y", "z", "rx", "ry", "rz")])
 
 
 def test_several_reflectors_and_torques() -> None:
@@ -497,3 +510,16 @@ def test_a_row_beyond_the_measured_joint_ranges_is_extrapolated_and_the_uncertai
     predicted = result.predict(found.q, of="reached")  # in the instrument's frame, with the base's uncertainty
     assert found.std == pytest.approx(np.linalg.norm(predicted.standard, axis=1), rel=1e-9)
     assert "position in the instrument's frame [mm], standard uncertainty" in str(found)
+
+
+def test_a_tool_that_nobody_stated_is_a_guess(tmp_path: Path) -> None:
+    folder = problems_folder() / "position"
+    made = tmp_path / "own"
+    ro.store.new_problem(made, find_robot("irb120"), folder / "identification.csv")
+    assert ro.load(made).problem.parameters.unstated_tools == ("",)
+    text = (made / "problem.toml").read_text(encoding="utf-8")
+    (made / "problem.toml").write_text(text.replace("\nguessed = true", ""), encoding="utf-8")
+    stated = ro.load(made).problem
+    assert stated.parameters.unstated_tools == ()
+    assert ro.problem_from(ARM, stated.data).parameters.unstated_tools == ("",)
+    assert ro.problem_from(ARM, stated.data, tool=[0.02, 0, 0.06, 0, 0, 0]).parameters.unstated_tools == ()

@@ -205,6 +205,12 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     (block,) = instance.validation.blocks
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.5, -0.2, 0.1])),))
     assert "registers it again" in ro.use.validate(result, moved).mistake
+    # less than the nominal robot's errors, many times the prediction intervals
+    moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.0005, -0.0006, 0.0002])),))
+    assert "displaced together by 0.80" in ro.use.validate(result, moved).mistake
+    accepted = ro.calibration.accept(result, ro.data.Requirement(limit=1e-2), moved)
+    assert accepted.verdict == "undecided"
+    assert "the instrument or the base moved" in str(accepted)
     assert not ro.use.validate(result, instance.validation).mistake
 
 
