@@ -91,12 +91,10 @@ LONG = {
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Give reports captions alone where a chart stands: charts, which other tests draw, take most of the time."""
-    from markupsafe import Markup
-
     from rpim_opt.report.page import Figure
 
     def figure(draw: Any, title: str, caption: str = "", height: float = 0.0) -> Figure:
-        return Figure(Markup(), caption)
+        return Figure("data:,", title, caption)
 
     monkeypatch.setattr("rpim_opt.report.report.figure", figure)
 

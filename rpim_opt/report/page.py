@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import base64
 import io
-import re
 from collections.abc import Callable, Iterable, Sequence
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
-from xml.etree import ElementTree
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
@@ -36,33 +34,26 @@ class Table(NamedTuple):
 
 
 class Figure(NamedTuple):
-    """A chart as SVG with its caption."""
+    """A chart as the source of an image, its alternative text, and its caption."""
 
-    svg: Markup
+    source: str
+    title: str
     caption: str
 
 
 WIDTH = 420.0
 HEIGHT = 270.0
 """Size of a chart [px]; the page scales it to its place."""
-SVG = "{http://www.w3.org/2000/svg}"
-ElementTree.register_namespace("", SVG[1:-1])
-ElementTree.register_namespace("xlink", "http://www.w3.org/1999/xlink")
 INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
 STYLE = {
     **dict.fromkeys(INKED, plot.COLORS["ink"]),
     "axes.spines.right": False, "axes.spines.top": False, "axes.grid": True, "grid.color": "#dfe3e8",
-    "axes.axisbelow": True, "svg.fonttype": "none", "font.size": 12.5, "savefig.transparent": True,
-    "text.parse_math": False,
+    "axes.axisbelow": True, "svg.fonttype": "none", "font.size": 12.5, "text.parse_math": False,
 }  # fmt: skip
 
 
 def figure(draw: Callable[..., Any], title: str, caption: str = "", height: float = HEIGHT) -> Figure:
-    """Return a figure drawn by ``draw`` on matplotlib axes ``ax``; the title is its alternative text.
-
-    The page's policy allows no style attributes: they become attributes of their own. The page's colours stand in the
-    place of the light ones, and marks have their ``hints`` as tooltips. A unit of the SVG is a pixel.
-    """
+    """Return a figure drawn by ``draw`` on matplotlib axes ``ax``, as an SVG image whose unit is a pixel."""
     from matplotlib import rc_context
     from matplotlib.figure import Figure as Drawing
 
@@ -70,38 +61,10 @@ def figure(draw: Callable[..., Any], title: str, caption: str = "", height: floa
     style: Any = {**STYLE, "svg.hashsalt": title}
     with rc_context(style):
         drawing = Drawing(figsize=(WIDTH / 72, height / 72), dpi=72, layout="constrained")
-        ax = drawing.add_subplot()
-        draw(ax=ax)
-        hinted: list[Any] = [artist for artist in ax.get_children() if len(getattr(artist, "hints", ()))]
-        for k, artist in enumerate(hinted):
-            artist.set_gid(f"hints{k}")
+        draw(ax=drawing.add_subplot())
         drawing.savefig(stream, format="svg", dpi=200, metadata={"Date": None})
-    root = ElementTree.fromstring(stream.getvalue())
-    root.remove(root[0])  # metadata
-    root.remove(root[0])  # a style sheet
-    groups = {group.get("id"): group for group in root.iter(f"{SVG}g")}
-    for k, artist in enumerate(hinted):
-        group = groups[f"hints{k}"]
-        drawn = group.iter(f"{SVG}use") if group.find(f".//{SVG}use") is not None else group.iter(f"{SVG}path")
-        for mark, hint in zip(drawn, artist.hints, strict=True):
-            ElementTree.SubElement(mark, f"{SVG}title").text = hint
-    for element in root.iter():
-        if element.tag == f"{SVG}g":
-            element.attrib.pop("id", None)
-        for name, value in re.findall(r"([\w-]+): ([^;]+)", element.attrib.pop("style", "")):
-            if name == "font":  # as one attribute there is none
-                name, value = "font-size", re.findall(r"[\d.]+px", value)[0]
-            if name != "font-family":
-                element.set(name, value)
-        for name, value in element.items():
-            element.set(name, re.sub(r"(\.\d\d)\d+", r"\1", value))  # hundredths of a pixel
-    for name in ("width", "height"):
-        del root.attrib[name]
-    root.attrib |= {"role": "img", "aria-label": title}
-    text = ElementTree.tostring(root, encoding="unicode")
-    for role, color in {**plot.COLORS, "grid": STYLE["grid.color"]}.items():
-        text = text.replace(color, f"var(--{role})")
-    return Figure(Markup(text), caption)
+    content = base64.b64encode(stream.getvalue()).decode()
+    return Figure(f"data:image/svg+xml;base64,{content}", title, caption)
 
 
 def coded(text: str) -> Markup:

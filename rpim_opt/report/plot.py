@@ -1,6 +1,6 @@
 """Figures of a calibration on matplotlib axes: each is drawn on ``ax`` or on new axes, and these are returned.
 
-The report's charts are the same figures. The tooltips that a page shows at marks are their attribute ``hints``.
+The report's charts are the same figures.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from rpim_opt.report.summary import mm
 if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
 
-__all__ = ["error_vectors", "errors", "l_curve", "parameters", "picard", "selection"]
+__all__ = ["error_vectors", "errors", "l_curve", "parameters"]
 
 Axes = Any  # matplotlib's, imported where axes are made
 
@@ -62,13 +62,12 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     few = len(labels) <= MANY_ROWS
     if few:
         ax.vlines(place, drawn["before"], drawn["after"], color=COLORS["before"])
-    for when, each in lengths.items():
-        hints = [f"{label}, {MODELS[when]}: {mm(e)} mm" for label, e in zip(labels, each, strict=True) if few]
-        _dots(ax, place, drawn[when], when, MODELS[when], hints, ms=5.0 if few else 2.0)
+    for when, each in drawn.items():
+        _dots(ax, place, each, when, MODELS[when], ms=5.0 if few else 2.0)
     flagged = {flag.label for flag in result.flagged} if data is result.problem.data else set()
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
-        _dots(ax, place[at], drawn["after"][at], "mark", "flagged", [f"{labels[i]}: flagged" for i in at])
+        _dots(ax, place[at], drawn["after"][at], "mark", "flagged")
     cut = int(np.sum(every < low))
     note = f"\n{cut} errors below {low:.2g} mm are drawn at the lower edge." if cut else ""
     ax.set(xlabel=f"row{note}", ylabel="error [mm]")
@@ -134,11 +133,9 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     bound = active_tolerance(result)[own] / si
     bounded = np.isfinite(bound)
     place = np.arange(1.0, len(own) + 1)
-    names = [free.names[i] for i in own]
-    hints = [f"{name}: {d:+z.4f} ± {s:.4f} {unit}" for name, d, s in zip(names, x, spread, strict=True)]
     ax.axvline(0, color=COLORS["before"], lw=1)
     ax.hlines(place, x - spread, x + spread, color=COLORS["after"])
-    _dots(ax, x, place, "after", f"deviation, {percent(confidence)} interval", hints)
+    _dots(ax, x, place, "after", f"deviation, {percent(confidence)} interval")
     if bounded.any():
         ends = np.concatenate([-bound[bounded], bound[bounded]])
         at = np.tile(place[bounded], 2)
@@ -150,7 +147,7 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     reach *= 1.1
     cut = "\nIntervals beyond the edge are cut." if (np.abs(x) + spread > reach).any() else ""
     ax.set(xlim=(-reach, reach), xlabel=f"deviation from nominal [{unit}]{cut}")
-    _name(ax, "y", names)
+    _name(ax, "y", [free.names[i] for i in own])
     return _with_legend(ax)
 
 
@@ -177,7 +174,6 @@ def active_tolerance(result: Calibration) -> Array:
 # --- the regularization weight -----------------------------------------------------------------------------
 
 VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
-FAINT = 1e-4  # coefficients of the data below this many standard deviations are not drawn
 
 
 def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
@@ -219,75 +215,14 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
         label = f"{name}, weight {marked[name]:.2g}"
         for x, y in at(marked[name]):
             if name == own:
-                _dots(ax, [x], [y], "mark", f"chosen: {label}", [f"chosen: {label}"], ms=9.0)
+                _dots(ax, [x], [y], "mark", f"chosen: {label}", ms=9.0)
                 continue
             style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
-            (dot,) = ax.plot([x], [y], color=f"C{k}", label=label, **style)
-            dot.hints = [label]
+            ax.plot([x], [y], color=f"C{k}", label=label, **style)
     ax.set(
         xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior standard deviations]"
     )
     _logarithmic(ax, "x")
-    _logarithmic(ax, "y")
-    return _with_legend(ax)
-
-
-def selection(of: Selection | Calibration, ax: Axes = None) -> Axes:
-    """Draw a selector's score over the weights, and its choice, dashed where it is at an edge.
-
-    Arguments as for `errors`. InputError for a calibration whose weight no selector chose.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ro.plot.selection(result).get_ylabel()
-    'score of reml'
-    """
-    selection = of.selection if isinstance(of, Calibration) else of
-    if selection is None:
-        raise InputError("plot.selection", "a calibration without a selected weight", "weight=ro.reml, or another rule")
-    ax = _axes(ax)
-    finite = np.isfinite(selection.score)
-    ax.plot(selection.weights[finite], selection.score[finite], color=COLORS["ink"], lw=1.5)
-    label = f"weight {selection.weight:.3g}"
-    ax.axvline(selection.weight, color=COLORS["mark"], ls="-" if selection.interior else "--", label=label)
-    ax.set(xlabel="weight", ylabel=f"score of {selection.name}")
-    _logarithmic(ax, "x")
-    return _with_legend(ax)
-
-
-def picard(of: Program | Calibration, weight: float = 0.0, ax: Axes = None) -> Axes:
-    """Draw Picard's condition: singular values, coefficients of the data, and coefficients of the solution.
-
-    Where the data |u'b| sink to the noise, at 1, while the singular values sink below it, coefficients |u'b| / s are
-    noise; the weight, by default that of a result, damps the directions with s below its root (Hansen 1990,
-    BIT 30:658). Arguments as for `l_curve`.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-    >>> ax = ro.plot.picard(result)
-    >>> [text.get_text() for text in ax.get_legend().get_texts()]
-    ['singular value s', "coefficient |u'b| / s", "data |u'b|", 'square root of the weight']
-    """
-    ax = _axes(ax)
-    program = of.program if isinstance(of, Calibration) else of
-    if isinstance(of, Calibration) and not weight:
-        weight = of.weight
-    beta, s, _ = program.model.svd
-    k = np.flatnonzero(s > 0)
-    data = np.abs(beta[k])
-    solution = data / s[k]
-    ax.plot(k + 1, s[k], color=COLORS["ink"], lw=1.5, label="singular value s")
-    ratios = [f"direction {i + 1}: coefficient {ratio:.3g}" for i, ratio in zip(k, solution, strict=True)]
-    _dots(ax, k + 1, solution, "other", "coefficient |u'b| / s", ratios, ms=3.5)
-    hints = [f"direction {i + 1}: data {abs(beta[i]):.3g}, s {s[i]:.3g}" for i in k]
-    _dots(ax, k + 1, data, "after", "data |u'b|", hints)
-    every = np.concatenate([s[k], data, [1.0]])
-    if weight > 0:
-        level = float(np.sqrt(weight))
-        ax.axhline(level, color=COLORS["mark"], ls="--", label="square root of the weight")
-        every = np.append(every, level)
-    low, high = max(float(every.min()), FAINT), max(float(every.max()), float(solution.max(initial=0.0)))
-    ax.set(xlabel="singular direction", ylabel="magnitude, whitened and scaled [1]", ylim=(0.7 * low, 1.4 * high))
     _logarithmic(ax, "y")
     return _with_legend(ax)
 
@@ -324,8 +259,7 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
         text = f"to {mm(level)} mm, above the limit" if over else f"to {mm(min(level, limit or np.inf))} mm"
         style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "label": text}
         i, j = column[which], row[which]
-        hints = [f"{mm(value)} mm" for value in worst[which]]
-        _boxes(ax, x[i], x[i + 1], y[j], y[j + 1], hints, **style)
+        ax.bar(x[i], y[j + 1] - y[j], x[i + 1] - x[i], y[j], align="edge", lw=0, **style)
     if box is not None:
         (a, b), (c, d) = box[across], box[up]
         ax.plot([a, b, b, a, a], [c, c, d, d, c], color=COLORS["ink"])
@@ -345,10 +279,8 @@ def checks(found: Monitoring, ax: Axes) -> None:
     beyond = list(found.beyond)
     within = np.setdiff1d(np.arange(len(place)), beyond).tolist()
     for at, role, label in ((within, "after", "check"), (beyond, "mark", "")):
-        figures = zip([found.label[i] for i in at], found.sigmas[at], found.error[at], strict=True)
-        hints = [f"{name}: {sigmas:.1f} standard deviations, {mm(1e3 * e)} mm" for name, sigmas, e in figures]
         if at:
-            _dots(ax, place[at], found.sigmas[at], role, label, hints)
+            _dots(ax, place[at], found.sigmas[at], role, label)
     ax.set(ylabel="residual [standard deviations]")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
@@ -361,7 +293,7 @@ def cumulative_sum(found: Monitoring, ax: Axes) -> None:
     ax.plot(place, found.sums, color=COLORS["after"], lw=1.5, label="sum")
     if found.alarm is not None:
         at = [found.alarm]
-        _dots(ax, place[at], found.sums[at], "mark", hints=[f"alarm at {found.label[found.alarm]}"])
+        _dots(ax, place[at], found.sums[at], "mark")
     ax.set(ylabel="cumulative sum")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
@@ -401,21 +333,8 @@ def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:
     return ax
 
 
-def _dots(
-    ax: Axes, x: Any, y: Any, role: str, label: str = "", hints: Sequence[str] = (), ms: float = 5.0, **style: Any
-) -> None:
-    (dots,) = ax.plot(x, y, "o", color=COLORS[role], label=label, ms=ms, rasterized=len(x) > MANY_DOTS, **style)
-    dots.hints = hints
-
-
-def _boxes(ax: Axes, left: Array, right: Array, low: Array, high: Array, hints: Sequence[str], **style: Any) -> None:
-    from matplotlib.collections import PolyCollection
-
-    corners = np.array([[left, low], [left, high], [right, high], [right, low]]).transpose(2, 0, 1)
-    boxes: Any = ax.add_collection(PolyCollection(list(corners), lw=0, **style))
-    boxes.hints = hints
-    boxes.sticky_edges.y.extend(low)
-    ax.autoscale_view()
+def _dots(ax: Axes, x: Any, y: Any, role: str, label: str = "", ms: float = 5.0) -> None:
+    ax.plot(x, y, "o", color=COLORS[role], label=label, ms=ms, rasterized=len(x) > MANY_DOTS)
 
 
 def _logarithmic(ax: Axes, which: str) -> None:

@@ -90,12 +90,13 @@ def page(result: Calibration) -> str:
     if found is not None and not np.isfinite(found.expanded).all():
         found = None
     content = Content(result, accepted, found, composition)
+    sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
         f"Calibration: {heading}",
         f"Robot calibration report, {result.record.made[:10]}",
         heading,
         [*_headline(content), ("notes", warnings)],
-        [(name, list(section(content))) for name, section in SECTIONS],
+        [(name, blocks) for name, blocks in sections if blocks],
     )
 
 
@@ -488,9 +489,6 @@ def _noise(block: Rows) -> str:
 
 WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
 L_CURVE_HEIGHT = 430.0
-PICARD = (
-    "Picard condition at the solution: the penalty damps directions below the line; data coefficients near 1 are noise."
-)
 
 
 def _regularization(content: Content) -> Iterator[Block]:
@@ -500,8 +498,6 @@ def _regularization(content: Content) -> Iterator[Block]:
     has_path = formulation.penalty is not None and formulation.solvable and not result.record.earlier
     if has_path and result.weight > 0:
         yield from _weight(result)
-    draw = partial(plot.picard, result.program, result.penalty_weight)
-    yield "figures", [figure(draw, "Singular values and coefficients of the data", PICARD)]
 
 
 def _weight(result: Calibration) -> Iterator[Block]:

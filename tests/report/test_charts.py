@@ -1,9 +1,12 @@
-"""A page shows the figures of ``ro.plot``, with its own colours and with tooltips."""
+"""A page shows the figures of ``ro.plot``, in its own colours."""
 
 from __future__ import annotations
 
 import re
+from base64 import b64decode
+from collections.abc import Callable
 from functools import partial
+from typing import Any
 from xml.etree import ElementTree
 
 import matplotlib as mpl
@@ -11,13 +14,11 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.report.page import TEMPLATES, figure
 from rpim_opt.report.plot import COLORS
 from rpim_opt.report.summary import signed_errors
 
 mpl.use("Agg")
-from matplotlib import pyplot as plt
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -27,29 +28,26 @@ def result() -> ro.calibration.Calibration:
     return ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
 
 
-def test_a_chart_has_a_tooltip_at_every_mark_and_its_texts_as_text(result) -> None:
-    svg, _ = figure(partial(ro.plot.errors, result), "Errors & more")
-    root = ElementTree.fromstring(svg)
-    assert root.get("aria-label") == "Errors & more"
-    hints = [title.text for title in root.iter(f"{SVG}title")]
-    assert len(hints) == 2 * len(result.problem.data)
-    label, error = result.problem.data.label[3], 1e3 * result.errors()[3]
-    assert f"{label}, identified: {error:.3f} mm" in hints
+def svg(draw: Callable[..., Any], title: str) -> str:
+    return b64decode(figure(draw, title).source.removeprefix("data:image/svg+xml;base64,")).decode()
+
+
+def test_a_chart_has_its_texts_as_text(result) -> None:
+    root = ElementTree.fromstring(svg(partial(ro.plot.errors, result), "Errors"))
+    label = result.problem.data.label[3]
     assert {"error [mm]", "row", "nominal", "identified", label} <= {text.text for text in root.iter(f"{SVG}text")}
 
 
-def test_a_chart_has_no_style_and_nothing_is_loaded(result) -> None:
-    svg, _ = figure(partial(ro.plot.parameters, result), "Deviations")
-    assert "style" not in svg
-    assert "url(" not in re.sub(r"url\(#\w+\)", "", svg)
-    assert svg == figure(partial(ro.plot.parameters, result), "Deviations")[0]
+def test_a_chart_is_the_same_again(result) -> None:
+    again = [figure(partial(ro.plot.parameters, result), "Deviations") for _ in range(2)]
+    assert again[0] == again[1]
 
 
 def test_thousands_of_rows_are_one_picture(result) -> None:
     data = result.problem.data.take(np.arange(3000) % len(result.problem.data))
-    svg, _ = figure(partial(ro.plot.errors, result, data), "Errors")
-    assert svg.count("data:image/png") >= 1
-    assert len(svg) < 500_000
+    drawn = svg(partial(ro.plot.errors, result, data), "Errors")
+    assert drawn.count("data:image/png") >= 1
+    assert len(drawn) < 500_000
 
 
 def test_paper_has_the_colours_of_the_page_in_light() -> None:
@@ -59,15 +57,6 @@ def test_paper_has_the_colours_of_the_page_in_light() -> None:
         role: light[role] for role in ("before", "after", "mark", "other")
     }
     assert COLORS["ink"] == light["soft"]
-
-
-@pytest.mark.parametrize(("low", "high"), [(0.05, 2.0), (0.02, 0.9), (0.4, 30.0)])
-def test_an_axis_of_little_more_than_a_decade_has_more_than_one_tick(low: float, high: float) -> None:
-    weights = np.geomspace(low, high, 9)
-    ax = ro.plot.selection(Selection(float(weights[4]), "mine", weights, weights, True))
-    ends = ax.get_xlim()
-    assert sum(ends[0] <= tick <= ends[1] for tick in ax.get_xticks()) >= 3
-    plt.close(ax.figure)
 
 
 def test_errors_of_touches_are_along_the_axes_of_the_robot(result) -> None:

@@ -34,17 +34,6 @@ def test_the_l_curve_marks_every_choice(ax, tmp_path) -> None:
     ax.figure.savefig(tmp_path / "l.svg")
 
 
-def test_the_choice_of_every_selector_can_be_drawn(ax) -> None:
-    problem = ro.load("position").problem
-    program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
-    for rule in (ro.gcv, ro.reml, ro.leave_one_out, ro.discrepancy, ro.quasi_optimality):
-        ax.clear()
-        chosen = rule(program)
-        ro.plot.selection(chosen, ax)
-        assert ax.lines[1].get_xdata()[0] == chosen.weight
-        assert chosen.name in ax.get_ylabel()
-
-
 def drawn(ax, label: str):
     """Return the line of a label."""
     return next(line for line in ax.lines if line.get_label() == label)
@@ -76,12 +65,6 @@ def test_figures_show_the_numbers_of_the_result(ax, fitted) -> None:
     (tolerance,) = [each for each in ax.collections if each.get_label() == "tolerance"]
     ends = np.array(tolerance.get_segments())[:, :, 0]
     assert set(np.abs(ends.ravel())) == {1.5}  # the tolerance that the file states
-    ax.clear()
-    ro.plot.picard(result.program, result.weight, ax)
-    beta, s, _ = result.program.model.svd
-    assert np.array_equal(drawn(ax, "singular value s").get_ydata(), s[s > 0])
-    assert np.array_equal(drawn(ax, "data |u'b|").get_ydata(), np.abs(beta[s > 0]))
-    assert drawn(ax, "square root of the weight").get_ydata() == pytest.approx(np.sqrt([result.weight] * 2), rel=1e-12)
 
 
 def overlapping(axis) -> int:
@@ -115,7 +98,7 @@ def test_axes_are_made_and_carry_units(fitted) -> None:
     _, result = fitted
     axes = [
         ro.plot.errors(result), ro.plot.parameters(result),
-        ro.plot.parameters(result, "angle"), ro.plot.picard(result.program), ro.plot.error_vectors(result),
+        ro.plot.parameters(result, "angle"), ro.plot.error_vectors(result),
     ]  # fmt: skip
     said = [ax.get_xlabel() + ax.get_ylabel() for ax in axes]
     assert all("[" in text for text in said)
@@ -134,11 +117,3 @@ def test_errors_have_a_direction_where_a_position_was_measured() -> None:
         want = result.nominal_errors() if nominal else result.errors()
         assert length[positions] == pytest.approx(want[positions], rel=1e-12)
     assert np.isfinite(result.measured_positions()).all()
-
-
-def test_the_choice_of_a_calibration_can_be_drawn(ax) -> None:
-    problem = ro.load("position").problem
-    result = ro.calibrate(problem, ro.tikhonov, weight=ro.reml)
-    assert ro.plot.selection(result, ax).lines[1].get_xdata()[0] == result.selection.weight
-    with pytest.raises(ro.InputError, match="a calibration without a selected weight"):
-        ro.plot.selection(ro.calibrate(problem, ro.tikhonov, weight=1.0), ax)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import re
+from base64 import b64decode
 from dataclasses import replace
 from functools import cache
 
@@ -135,8 +137,9 @@ def test_the_command(monkeypatch, capsys, tmp_path) -> None:
     assert document["rows"][0]["time"] == "2026-03-01"
     assert document["left_out"] == []
     text = page.read_text(encoding="utf-8")
-    assert "days since the first check" in text
-    assert text.count("<svg") == 2
+    charts = [b64decode(chart).decode() for chart in re.findall(r"svg\+xml;base64,([^\"]+)", text)]
+    assert all("days since the first check" in chart for chart in charts)
+    assert len(charts) == 2
     assert text.count("<td>above ") == len(document["beyond"])
     assert text.count("<td>alarm ") == 1
     assert run(monkeypatch, "monitor", str(tmp_path), str(file), "--out", str(tmp_path / "checks.csv.txt")) == 2
