@@ -27,10 +27,8 @@ __all__ = [
     "by_kind",
     "by_link",
     "differences",
-    "equal",
     "in_ball",
     "parse",
-    "signed",
     "within_tolerance",
 ]
 
@@ -173,58 +171,6 @@ def at_nominal(*patterns: str) -> Box:
 def _at_nominal(parameters: Parameters, *patterns: str) -> tuple[Array, Array]:
     chosen = matching(parameters, patterns, "at_nominal")
     return np.where(chosen, 0.0, -np.inf), np.where(chosen, 0.0, np.inf)
-
-
-def signed(sign: int, *patterns: str) -> Box:
-    """Keep the deviations that match one of the patterns on one side: sign z_i >= 0, with sign +1 or -1.
-
-    >>> import cvxpy as cp
-    >>> import rpim_opt as ro
-    >>> positive = ro.constraints.signed(+1, "a?")
-    >>> longer = ro.Formulation("no link is shorter", penalty=cp.sum_squares, constraints=(positive,))
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, longer, weight=1e-3)
-    >>> bool((result.robot.mdh[:, 1] >= result.problem.robot.mdh[:, 1]).all())
-    True
-    """
-    if sign not in (1, -1):
-        raise InputError("signed", f"sign {sign}", "+1 or -1")
-    return Box("signed", Ready("signed", _signed, (sign, *patterns)))
-
-
-def _signed(parameters: Parameters, sign: int, *patterns: str) -> tuple[Array, Array]:
-    chosen = matching(parameters, patterns, "signed")
-    return np.where(chosen & (sign > 0), 0.0, -np.inf), np.where(chosen & (sign < 0), 0.0, np.inf)
-
-
-def equal(*names: str) -> Constraint:
-    """Constrain parameters to equal values (nominal plus deviation): equal link lengths, parallel axes.
-
-    InputError for names that are not identified, fewer than two, or of different dimensions.
-
-    >>> import cvxpy as cp
-    >>> import rpim_opt as ro
-    >>> parallel = ro.constraints.equal("alpha3", "alpha4")
-    >>> stated = ro.Formulation("axes 2 to 4", penalty=cp.sum_squares, constraints=(parallel,))
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
-    >>> (1e3 * result.robot.mdh[2:4, 0]).round(3)  # [mrad]
-    array([-0.124, -0.124])
-    """
-    return Ready("equal", _equal, names)
-
-
-def _equal(z: Any, parameters: Parameters, *names: str) -> Any:
-    k = [parameters.names.index(n) for n in names if n in parameters.names]
-    if len(k) < len(names) or len(k) < 2:
-        missing = next((n for n in names if n not in parameters.names), names[0] if names else "")
-        accepted = "identified parameters, two or more: " + choices(missing, parameters.names)
-        raise InputError("equal", f"'{missing}'", accepted)
-    if len({parameters.dimensions[i] for i in k}) > 1:
-        found = ", ".join(f"{parameters.names[i]} ({parameters.dimensions[i]})" for i in k)
-        raise InputError("equal", found, "parameters of one dimension")
-    scale, nominal = parameters.scale[k], parameters.nominal[k]
-    unit = scale.max()
-    value = cp.multiply(scale / unit, z[k]) + nominal / unit
-    return value[1:] == value[0]
 
 
 def in_ball(radius: float, *patterns: str) -> Constraint:

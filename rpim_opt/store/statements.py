@@ -19,7 +19,7 @@ from rpim_opt.basics.units import fits, number, quantities, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
-from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse, signed
+from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, parse
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.record import CONFIDENCE, Requirement
@@ -79,27 +79,19 @@ class Constraints(Table):
     """The keys of ``[constraints]``."""
 
     at_nominal: list[Name] = Field(default_factory=list)
-    positive: list[Name] = Field(default_factory=list)
-    negative: list[Name] = Field(default_factory=list)
-    equal: list[list[Name]] = Field(default_factory=list)
     stated: list[str] = Field(default_factory=list)
     places: dict[Name, dict[str, Any]] = Field(default_factory=dict)
 
     def all(self, robot: Robot, data: Dataset) -> tuple[Constraint, ...]:
         """Return the constraint functions for a problem with this robot and identification data."""
-        boxes = (
-            (self.at_nominal, at_nominal),
-            (self.positive, partial(signed, 1)),
-            (self.negative, partial(signed, -1)),
-        )
-        made = [make(*patterns) for patterns, make in boxes if patterns]
+        made = [at_nominal(*self.at_nominal)] if self.at_nominal else []
         places: dict[str, Any] = {MEASURED: _rows(data, None)}
         for name, table in self.places.items():
             where = f"key constraints.places.{name}"
             if name in (MEASURED, WORKSPACE):
                 raise InputError(where, "a predefined place", "another name")
             places[name] = _place(table, robot, data, where)
-        return (*made, *(equal(*names) for names in self.equal), *(parse(text, places) for text in self.stated))
+        return (*made, *(parse(text, places) for text in self.stated))
 
 
 def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) -> Any:
