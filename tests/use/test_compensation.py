@@ -521,5 +521,5 @@ def test_a_tool_that_nobody_stated_is_a_guess(tmp_path: Path) -> None:
     (made / "problem.toml").write_text(text.replace("\nguessed = true", ""), encoding="utf-8")
     stated = ro.load(made).problem
     assert stated.parameters.unstated_tools == ()
-    assert ro.problem_from(ARM, stated.data).parameters.unstated_tools == ("",)
-    assert ro.problem_from(ARM, stated.data, tool=[0.02, 0, 0.06, 0, 0, 0]).parameters.unstated_tools == ()
+    assert ro.problem_from("irb120", stated.data).parameters.unstated_tools == ("",)
+    assert ro.problem_from("irb120", stated.data, tool=[0.02, 0, 0.06, 0, 0, 0]).parameters.unstated_tools == ()
