@@ -40,7 +40,7 @@ from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, 
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip, urdf_text
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
-from rpim_opt.robot.library import find_source, read_arm
+from rpim_opt.robot.library import RobotSource, find_source, read_arm
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import frame_of
 from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
@@ -131,8 +131,15 @@ def new_problem(
     columns = found.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
-    tables = {names[IDENTIFICATION]: columns}
+    held = np.zeros(len(rows), dtype=bool)
     said = f'# validation = "{names[VALIDATION]}"   # a table that is used for no choice; none was given'
+    if hold_out is not None:
+        held = _held_out(rows, hold_out, seed)
+        said = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
+    tables = {names[IDENTIFICATION]: _rows(columns, ~held)}
+    if hold_out is not None:
+        tables[names[VALIDATION]] = _rows(columns, held)
+        rows = rows.take(np.flatnonzero(~held))
     if validation is not None:
         other = understand_of(arm, [validation], kind.name, found.options)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
@@ -140,16 +147,6 @@ def new_problem(
         if understood is not None:
             understood(other)
         said = f'validation = "{names[VALIDATION]}"\n# from {Path(validation).name}; used for no choice'
-    elif hold_out is not None:
-        known = len(np.unique(rows.configuration))
-        if not 0 < hold_out < 1 or known < 2:
-            part = f"{hold_out:g} of {known} configurations"
-            raise InputError("--hold-out", part, "a fraction between 0 and 1 of two or more configurations")
-        drawn = rows.configurations(min(max(round(hold_out * known), 1), known - 1), seed)
-        held = np.isin(rows.configuration, drawn.configuration)
-        tables = {names[IDENTIFICATION]: _rows(columns, ~held), names[VALIDATION]: _rows(columns, held)}
-        rows = rows.take(np.flatnonzero(~held))
-        said = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
     if board.table:
         tables[names[TARGET]] = board.table
     handed = [Path(file) for file in (*paths, validation) if file is not None]
@@ -176,20 +173,10 @@ def new_problem(
         text, guessed = _problem_text(arm, kind, rows, noise, context)
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
     contents["problem.toml"] = before + text.encode()
-    with ExitStack() as stack:
-        if before:
-            write_files({folder / name: content for name, content in contents.items()})
-        else:  # beside its place, and moved there when it is whole
-            make_folder(folder.parent, stack.enter_context(undoing()))
-            made = stack.enter_context(scratch_folder(folder)) / folder.name
-            write_files({made / name: content for name, content in contents.items()})
-            if chain:
-                write_bytes(made / ROBOT_OF_CHAINS, urdf_text(source.file))
-            elif source.file.suffix == ".toml":
-                write_text(made / "robot.toml", read_text(source.file))  # with its comments
-            else:
-                write_robot(arm.robot, made / "robot.toml")
-            made.rename(folder)
+    if before:
+        write_files({folder / name: content for name, content in contents.items()})
+    else:
+        _write_whole(folder, contents, arm, source, bool(chain))
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
     notes = [
@@ -226,6 +213,33 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
     if read_bytes(folder / ROBOT_OF_CHAINS) != urdf_text(robot):
         raise InputError("the robot", f"another one than {ROBOT_OF_CHAINS}", "the same URDF for all chains", robot)
     return read_bytes(folder / "problem.toml")
+
+
+def _write_whole(
+    folder: Path, contents: Mapping[str, bytes], arm: Described, source: RobotSource, chains: bool
+) -> None:
+    """Write a new folder with its robot beside its place, and move it there when it is whole."""
+    with ExitStack() as stack:
+        make_folder(folder.parent, stack.enter_context(undoing()))
+        made = stack.enter_context(scratch_folder(folder)) / folder.name
+        write_files({made / name: content for name, content in contents.items()})
+        if chains:
+            write_bytes(made / ROBOT_OF_CHAINS, urdf_text(source.file))
+        elif source.file.suffix == ".toml":
+            write_text(made / "robot.toml", read_text(source.file))  # with its comments
+        else:
+            write_robot(arm.robot, made / "robot.toml")
+        made.rename(folder)
+
+
+def _held_out(rows: Dataset, part: float, seed: int) -> np.ndarray:
+    """Return which rows (N,) are held out: those of a part of the configurations, drawn at random."""
+    known = len(np.unique(rows.configuration))
+    if not 0 < part < 1 or known < 2:
+        found = f"{part:g} of {known} configurations"
+        raise InputError("--hold-out", found, "a fraction between 0 and 1 of two or more configurations")
+    drawn = rows.configurations(min(max(round(part * known), 1), known - 1), seed)
+    return np.isin(rows.configuration, drawn.configuration)
 
 
 def _rows(columns: Columns, chosen: np.ndarray) -> Columns:
