@@ -16,6 +16,7 @@ from .calibration import influence as influence
 from .convex import Formulation as Formulation
 from .convex import bounded as bounded
 from .convex import constraints as constraints
+from .convex import corner as corner
 from .convex import discrepancy as discrepancy
 from .convex import gcv as gcv
 from .convex import group_lasso as group_lasso

@@ -17,6 +17,7 @@ from .given import given as given
 from .program import Estimate as Estimate
 from .program import Program as Program
 from .program import pose as pose
+from .rules.curve import corner as corner
 from .rules.curve import l_curve as l_curve
 from .rules.folds import k_fold as k_fold
 from .rules.folds import leave_one_out as leave_one_out

@@ -10,7 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, pick
 from rpim_opt.convex.program import Program
-from rpim_opt.convex.rules.curve import l_curve
+from rpim_opt.convex.rules.curve import corner, l_curve
 from rpim_opt.convex.rules.folds import k_fold, leave_one_out, two_step
 from rpim_opt.convex.rules.scores import discrepancy, gcv, quasi_optimality, reml
 from rpim_opt.convex.rules.selection import Selection
@@ -18,6 +18,7 @@ from rpim_opt.convex.rules.selection import Selection
 __all__ = [
     "Selection",
     "compare",
+    "corner",
     "discrepancy",
     "gcv",
     "k_fold",
@@ -57,6 +58,7 @@ def compare(program: Program) -> dict[str, Selection]:
 SELECTORS: dict[str, Callable[[Program], Selection]] = {
     "reml": reml,
     "l_curve": l_curve,
+    "corner": corner,
     "two_step": two_step,
     "gcv": gcv,
     "leave_one_out": leave_one_out,

@@ -234,7 +234,7 @@ def test_some_rows_of_many_give_the_minimum_of_all(loss: Any, over: str) -> None
 
 
 @pytest.mark.parametrize("formulation", ["robust", "sum_of_norms"])
-@pytest.mark.parametrize("rule", ["reml", "l_curve", "gcv", "quasi_optimality"])
+@pytest.mark.parametrize("rule", ["reml", "l_curve", "corner", "gcv", "quasi_optimality"])
 def test_storage_decides_nothing(formulation: str, rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """The same rows in one table, in two blocks and in seven that are never in memory together have the same result."""
     monkeypatch.setattr(ro.problem.PartitionedProblem, "gathered", lambda self: None)
@@ -291,7 +291,7 @@ def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.Monke
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("rule", [ro.leave_one_out, ro.k_fold, ro.l_curve, ro.two_step])
+@pytest.mark.parametrize("rule", [ro.leave_one_out, ro.k_fold, ro.l_curve, ro.corner, ro.two_step])
 @pytest.mark.parametrize(
     ("loss", "penalty", "constraints"),
     [("huber", "squares", "ball"), ("squares", "groups", "none"), ("tail", "squares", "none"),

@@ -149,7 +149,7 @@ def test_a_corner_at_an_edge_is_none(best: int, said: str, monkeypatch: pytest.M
     assert (none.weight, none.interior) == (grid[0], False)
 
 
-@pytest.mark.parametrize("rule", [ro.l_curve, ro.gcv, ro.k_fold])
+@pytest.mark.parametrize("rule", [ro.l_curve, ro.corner, ro.gcv, ro.k_fold])
 def test_every_rule_sees_a_robust_loss_as_the_squares_of_its_inliers(rule: Any) -> None:
     model = simulated(configurations=30, noise=1e-4, seed=3)[0].linearize(np.zeros(34))
     program = ro.convex.pose(ro.robust, model)
@@ -258,7 +258,7 @@ def test_two_steps_are_those_of_the_paper() -> None:
 def test_all_selectors_are_compared_where_they_are_quick() -> None:
     assert set(ro.select.compare(PROGRAM)) == set(SELECTORS)
     lasso = ro.select.compare(ro.convex.pose(ro.lasso, NOISY))
-    assert set(lasso) == {"l_curve"}
+    assert set(lasso) == {"l_curve", "corner"}
 
 
 def test_frames_tell_nothing_of_how_large_deviations_are() -> None:
@@ -269,3 +269,14 @@ def test_frames_tell_nothing_of_how_large_deviations_are() -> None:
     shifted = m.with_values(m.b + m.A[:, frames] @ np.full(int(frames.sum()), 50.0))
     pair = [ro.reml(ro.convex.pose(ro.tikhonov, each)).weight for each in (m, shifted)]
     assert pair[0] == pytest.approx(pair[1], rel=1e-3)
+
+
+def test_a_corner_by_sections_is_found_to_a_hundredth() -> None:
+    """Of ln weight: both neighbours of the corner that were solved are as near, and the grid's corner is the same."""
+    chosen = ro.corner(PROGRAM)
+    t = np.log(chosen.weights)
+    k = int(np.argmin(np.abs(t - np.log(chosen.weight))))
+    assert 0 < k < len(t) - 1
+    assert t[k + 1] - t[k - 1] <= 0.01 * (1 + 1e-9)
+    program = ro.convex.pose(ro.tikhonov, model(condition=1e5))
+    assert abs(np.log(ro.corner(program).weight / ro.l_curve(program).weight)) < 0.5

@@ -163,7 +163,7 @@ def test_reml_says_what_it_cannot_choose() -> None:
     assert "stated noise and scales are used" in chosen.note
 
 
-RULES = [ro.l_curve, ro.k_fold, ro.leave_one_out, ro.two_step]
+RULES = [ro.l_curve, ro.corner, ro.k_fold, ro.leave_one_out, ro.two_step]
 
 
 @pytest.mark.parametrize("rule", RULES, ids=lambda rule: rule.__name__)

@@ -24,7 +24,7 @@ def ax():
 def test_the_l_curve_marks_every_choice(ax, tmp_path) -> None:
     problem = ro.load("position").problem
     program = ro.convex.pose(ro.tikhonov, problem.linearize(np.zeros(len(problem.parameters.free))))
-    selections = {rule.__name__: rule(program) for rule in (ro.l_curve, ro.gcv, ro.reml)}
+    selections = {rule.__name__: rule(program) for rule in (ro.l_curve, ro.corner, ro.gcv, ro.reml)}
     ro.plot.l_curve(program, selections, ax)
     assert [text.get_text().split(",")[0] for text in ax.get_legend().get_texts()] == list(selections)
     curve, *marks = ax.lines

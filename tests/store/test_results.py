@@ -64,7 +64,7 @@ def test_a_file_says_when_and_from_what_it_was_made(monkeypatch, tmp_path) -> No
 
 
 @pytest.mark.parametrize(
-    "selector", [ro.l_curve, ro.gcv, lambda program: ro.select.Selection(1.0, "mine", np.ones(1), np.ones(1), True)]
+    "selector", [ro.corner, ro.gcv, lambda program: ro.select.Selection(1.0, "mine", np.ones(1), np.ones(1), True)]
 )
 def test_the_evidence_for_the_weight_is_kept(tmp_path: Path, selector) -> None:
     problem, _ = simulated(noise=5e-5)

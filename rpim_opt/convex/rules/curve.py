@@ -1,4 +1,4 @@
-"""Selection rule by the corner of the L-curve."""
+"""Selection rules by the corner of the L-curve."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ SHARP = 0.5
 """Part of the largest curvature from which a path with kinks has another corner."""
 GRID = 60
 """Weights among which a corner is sought where each takes solving."""
+GOLDEN = (1 + 5**0.5) / 2
 
 
 @on_squares
@@ -111,3 +112,56 @@ def menger(points: Array) -> Array:
     # points that coincide have no circle; neither have those that differ by rounding
     inner = np.divide(2 * cross, product, out=np.zeros(len(cross)), where=product > 1e-18)
     return np.concatenate([[0.0], inner, [0.0]])
+
+
+@on_squares
+def corner(program: Program, tolerance: float = 0.01) -> Selection:
+    """Search the corner of the L-curve without a grid: golden sections by Menger curvature, any formulation.
+
+    Cultrera and Callegaro 2020 (IOP SciNotes 1:025004): of four points on the curve the inner one with the larger
+    curvature stays, and the interval shrinks to its neighbours; one new solution a step.
+
+    It ends at a length ``tolerance`` of the interval of ln weight. InputError for a formulation without penalty.
+
+    >>> import rpim_opt as ro
+    >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
+    >>> f"{result.weight:.1g}", result.selection.note
+    ('0.7', 'corner of the L-curve by golden sections')
+    """
+    low, high = np.log(weight_grid(program, 2))
+    seen: dict[float, Array] = {}
+
+    def curvature(*places: float) -> float:
+        for t in places:
+            if t not in seen:
+                seen[t] = _points(solved(program, [float(np.exp(t))]))[0]
+        return float(menger(np.array([seen[t] for t in places]))[1])
+
+    # of the two inner points the one with the larger curvature stays, until they meet
+    begin, end = low, high
+    left = (end + GOLDEN * begin) / (1 + GOLDEN)
+    right = begin + end - left
+    best = left
+    while end - begin > tolerance:
+        on_the_right = curvature(left, right, end)
+        while on_the_right < 0 and end - begin > tolerance:
+            # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
+            end, right = right, left
+            left = (end + GOLDEN * begin) / (1 + GOLDEN)
+            on_the_right = curvature(left, right, end)
+        if curvature(begin, left, right) > on_the_right:
+            best, end, right = left, right, left
+            left = (end + GOLDEN * begin) / (1 + GOLDEN)
+        else:
+            best, begin, left = right, left, right
+            right = begin + end - left
+    order = [t for t in sorted(seen) if np.isfinite(seen[t]).all()]
+    if not order:
+        program.solve(float(np.exp(best)))  # raises what the solver says
+    points = np.array([seen[t] for t in order])
+    interior = bool(low + 0.1 < best < high - 0.1)
+    note = "corner of the L-curve by golden sections"
+    if not interior:
+        note = "the search ended at an edge: the L-curve has no corner"
+    note += skipped(len(seen) - len(order))
+    return Selection(float(np.exp(best)), "corner", np.exp(order), menger(points), interior, note)
