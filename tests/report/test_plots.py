@@ -30,7 +30,7 @@ def test_the_l_curve_marks_every_choice(ax, tmp_path) -> None:
     curve, *marks = ax.lines
     assert (np.diff(curve.get_xdata()) > 0).all()  # the residual grows with the weight, the solution shrinks
     assert (np.diff(curve.get_ydata()) < 0).all()
-    assert len(marks) == 3
+    assert len(marks) == 4
     ax.figure.savefig(tmp_path / "l.svg")
 
 
