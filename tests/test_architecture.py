@@ -24,7 +24,8 @@ FLOORS: dict[str, set[str]] = {
     "robot": {"casadi", "pydantic", "xacro"},
     # casadi: what an instrument sees is differentiated; table libraries are loaded by name in basics.tables
     "data": {"casadi"},
-    "problem": {"casadi"},
+    # clarabel: where a problem starts is the optimum of a relaxation, of which the programs above know nothing
+    "problem": {"casadi", "clarabel"},
     "convex": {"clarabel", "cvxpy"},
     "bayes": set(),
     # casadi: a reflector's transform is a measurement, too; pandas: a data frame, where one is asked for

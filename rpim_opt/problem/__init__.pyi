@@ -13,11 +13,11 @@ from .multi_robot import together as together
 from .noise import Repeatability as Repeatability
 from .problem import CalibrationProblem as CalibrationProblem
 from .registration.camera import view_pose as view_pose
+from .registration.certified import CertifiedStart as CertifiedStart
+from .registration.certified import certified_hand_eye as certified_hand_eye
 from .registration.closed_forms import register as register
 from .registration.frames import fitted_frames as fitted_frames
 from .registration.frames import problem_from as problem_from
 from .registration.frames import starting_parameters as starting_parameters
-from .registration.hand_eye import HandEye as HandEye
-from .registration.hand_eye import hand_eye as hand_eye
 from .workspace import configurations_at as configurations_at
 from .workspace import visible_configurations as visible_configurations

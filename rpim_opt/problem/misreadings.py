@@ -16,9 +16,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import transforms
 from rpim_opt.problem.registration.global_start import described, explained, rms, search
-from rpim_opt.problem.registration.hand_eye import UNKNOWN, hand_eye
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, lengths_of, mirrored, points_of
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import forward_kinematics
@@ -73,7 +73,7 @@ def pose_misfit(robot: Robot, data: Dataset) -> float:
     measured = transforms(block.y)
     flange = forward_kinematics(robot, block.q[:, 0])
     try:
-        start = hand_eye(flange, measured)
+        start = certified_hand_eye(flange, measured)
     except InputError:  # two poses
         return float(np.pi)
     if start.uncertainty > UNKNOWN:

@@ -384,15 +384,14 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     rows = posed(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):
         return arm.base, "The base is that of the robot's file: these measurements do not depend on it."
-    found, _, doubt = locate(arm.robot, rows, tools)
+    found, _, verdict = locate(arm.robot, rows, tools)
     if same_place(found, arm.base):
         offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
         how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
         return arm.base, how
     if np.linalg.norm(found[:3]) > FARTHEST:
-        doubt = "implausibly far away: are the units right?"
-    reason = f" ({doubt})" if doubt else ""
-    return None, f"Guessed: the data put the base at {placed(found)}, {kind.words.frame}{reason}."
+        verdict = "implausibly far away: are the units right?"
+    return None, f"Guessed: the data put the base at {placed(found)}, {kind.words.frame} ({verdict})."
 
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:

@@ -30,8 +30,7 @@ INTENDED = {
     "paper_arm:parallel_axes": CONDITIONAL,
     "constrained:drawing": ("x",),  # cones: an interior point is exact to 1e-10 of the objective, not of x
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
-    # x counts from where registration puts the base, which was exact to the root of rounding alone
-    "mixed": ("x",),
+    # x counts from where registration puts the base, which is exact to the root of rounding
     "seven_axis": ("x",),
     "tracker": ("x",),
     "scara": ("x",),  # 1.2e-9: derivatives by the noise are summed in another order

@@ -1,0 +1,549 @@
+"""Certified registration: base and tool from closed loops, with or without outliers, with an optimality certificate."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, field
+from functools import lru_cache
+from importlib import import_module
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from scipy.linalg import solve_triangular
+from scipy.special import chdtri
+
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.threads import one_blas_thread, phase
+from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, proper, rigid
+
+GAP = 1e-3  # what cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer
+UNKNOWN = 0.1  # standard deviation of a rotation [rad] from which it is not determined
+FAR = 0.5  # angle [rad] within which all starts have to be that fit as well, for there to be one
+AS_WELL = 1e-4  # probability that the truth fits worse than what counts as fitting as well
+RIDGE = 1e-6
+"""How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
+LOSSES = ("squares", "truncated")
+QUANTILE = 0.99
+"""Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
+FEWEST = 3  # measurements that have to have a weight
+MOST_PAIRED = 2000  # measurements up to which all pairs are compared
+TRIED, FEW = 40, 10  # measurements, evenly spread, whose compatible sets are tried, and the most sets that are
+SURPRISE = 1e-4  # probability that a good measurement is off by more than counts as good
+LINEAR = 6  # unknowns that are eliminated exactly: the translations t of the tool and u of the base
+
+
+@dataclass(frozen=True, eq=False)
+class CertifiedStart:
+    """Base and tool from closed loops, with an optimality certificate.
+
+    ::
+
+        cost   = sum_i loss(|r_i|) + |t - expected|^2 / spread^2,   r_i in standard deviations
+        bound <= cost of any base and tool whatever
+        gap    = (cost - bound) / (1 + cost)
+
+    Angles are in rad; ``bound`` and ``radius`` are proven. Where outliers are left out, the bound is that of the sum of
+    squares of the others. ``certified`` says that the optimum is global, the only one and determined, and, where
+    outliers were expected, that so many measurements agree with it that no other can have as many.
+    """
+
+    base: Array  # (4, 4) transform of the robot's base in the instrument's frame [m]
+    tool: Array  # (4, 4) of the target in the flange frame; not turned by positions alone
+    cost: float
+    bound: float
+    gap: float
+    rank_ratio: float  # second over first eigenvalue of the moment matrix: zero where the relaxation is tight
+    uncertainty: float  # standard deviation of the least certain rotation
+    radius: float  # angle from these rotations beyond which all others fit worse by more than noise explains
+    weights: Array  # (N,) that the loss gives the measurements; one for those that count
+    certified: bool
+    reason: str  # why it is certified or not, in a sentence
+
+
+@one_blas_thread
+def certified_hand_eye(
+    flange: Array,
+    measured: Array,
+    *,
+    sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
+    expected: Place = (0, 0, 0),
+    spread: float = np.inf,
+    loss: str = "squares",
+) -> CertifiedStart:
+    """Return base Z and tool X of A X = Z B, measured_i = Z flange_i X, with an optimality certificate.
+
+    ::
+
+        minimize  sum_i loss(|r_i|),   |r_i|^2 = |Z_R'y_i - A_R,i t - A_t,i - u|^2 / sigma_position^2
+                                               + |B_R,i X_R' - Z_R A_R,i|^2 / (2 sigma_orientation^2)
+
+    over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t. The translations are eliminated exactly; the
+    rotations are relaxed to a moment matrix (`relax`).
+
+    ``flange`` (N, 4, 4) are transforms of the flange in the robot's base [m], ``measured`` (N, 4, 4) of the tool in the
+    instrument's frame, NaN for rotations that were not measured; or positions (N, 3). ``sigma`` are the standard
+    deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of the robot,
+    which differs from the nominal one. The tool is ``expected`` (3,) in the flange frame [m] with the standard
+    deviation ``spread`` [m]; a direction that the measurements do not show stays there in any case. The loss is
+    "squares", or "truncated", which leaves outliers out. InputError for fewer than three measurements, and what is no
+    transform.
+
+    >>> import numpy as np
+    >>> import rpim_opt as ro
+    >>> arm = ro.load("paper_arm").problem
+    >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
+    >>> base, tool = np.eye(4), np.eye(4)
+    >>> base[:3, 3], tool[:3, 3] = [2.0, 0.0, 0.5], [0.0, 0.02, 0.06]
+    >>> seen = base @ flange @ tool
+    >>> seen[0, 0, 3] += 0.5  # one of them is wrong
+    >>> start = ro.problem.certified_hand_eye(flange, seen, loss="truncated")
+    >>> bool(np.abs(start.base - base).max() < 1e-6), bool(np.abs(start.tool - tool).max() < 1e-6)
+    (True, True)
+    >>> start.certified, int(np.sum(start.weights == 0))
+    (True, 1)
+    """
+    flange, measured, turned = _checked(flange, measured, loss)
+    N = len(flange)
+    deviations = np.stack([np.broadcast_to(np.asarray(each, dtype=float), N) for each in sigma], axis=1)
+    if not (np.isfinite(deviations).all() and (deviations > 0).all()):
+        raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
+    equations = np.where(turned, 6, 3)
+    beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
+    expected = np.asarray(expected, dtype=float)[:3]
+    loops = _Loops(*_equations(flange, measured, turned, deviations, expected, spread), beyond)
+    several = False  # whether other measurements than those of full weight may be as many that agree
+    if loss == "squares":
+        solved = loops.weighted(np.ones(N))
+    else:
+        pairs = _compatible(flange, measured, turned, deviations[:, 1], beyond)
+        solved = _truncated(loops, pairs)
+        agreeing = solved.weights > 0
+        count = int(np.sum(agreeing))
+        if count < N // 2 + 2:  # no majority: none of the others is in a core of that size but what a good one may be
+            strange = ~agreeing & (solved.squares > chdtri(equations, SURPRISE))
+            several = count < 2 or bool((_core(pairs, count) & strange).any())
+    best = solved.smallest
+    first, *last = best.rotations
+    t, u = solved.v[:LINEAR].reshape(2, 3)
+    excess = best.value - best.bound
+    gap = excess / (1 + solved.cost)
+    weakest = float(np.linalg.eigvalsh(best.information)[0])
+    uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
+    radius = best.radius(float(chdtri(LINEAR + 3 * len(best.rotations), AS_WELL)))
+    full = int(np.sum(solved.weights))
+    causes = {
+        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): rotations about two axes "
+        "would": (uncertainty > UNKNOWN),
+        f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
+        f"another start, up to {radius:.2g} rad away, may fit as well: measure more or other poses to decide": radius
+        > FAR,
+        "the weights of the loss did not converge": not np.array_equal(solved.squares <= beyond, solved.weights),
+        f"{full} of {N} measurements agree, and as many others may agree with another start": several,
+    }
+    cause = next((text for text, true in causes.items() if true), "")
+    return CertifiedStart(
+        base=rigid(first, first @ u), tool=rigid(last[0].T if last else np.eye(3), t), cost=solved.cost,
+        bound=solved.cost - excess, gap=gap, rank_ratio=best.rank_ratio, uncertainty=uncertainty, radius=radius,
+        weights=solved.weights, certified=not cause,
+        reason=cause or f"globally optimal (relative optimality gap at most {GAP:g})",
+    )  # fmt: skip
+
+
+def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, np.ndarray]:
+    """Return transforms and which were measured to turn; refuse what is none."""
+    flange = np.asarray(flange, dtype=float)
+    measured = np.asarray(measured, dtype=float)
+    N = len(flange)
+    if loss not in LOSSES:
+        raise InputError("loss", repr(loss), ", ".join(LOSSES))
+    if flange.shape != (N, 4, 4) or measured.shape not in ((N, 4, 4), (N, 3)):
+        found = f"shapes {flange.shape}, {measured.shape}"
+        raise InputError("transforms", found, "(N, 4, 4) both, or positions (N, 3)")
+    if N < FEWEST:
+        raise InputError("poses", f"{N}", f"{FEWEST} or more")
+    points = measured if measured.ndim == 2 else measured[:, :3, 3]
+    poses = rigid(np.eye(3), points)
+    turned = np.zeros(N, dtype=bool)
+    if measured.ndim == 3:
+        turned = np.asarray(~np.isnan(measured[:, :3, :3]).any(axis=(1, 2)))
+        poses[turned] = measured[turned]
+    if not (np.isfinite(flange).all() and np.isfinite(poses).all()):
+        raise InputError("transforms", "numbers that are not finite", "finite numbers")
+    for R in (flange[:, :3, :3], poses[:, :3, :3]):
+        off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+        wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
+        if len(wrong):
+            found = f"a matrix that misses R R' = 1 by {off[wrong[0]]:.2g}"
+            raise InputError(f"pose {wrong[0] + 1}", found, "a rotation")
+    return flange, poses, turned
+
+
+# --- closed loops -------------------------------------------------------------------------------------------------
+
+
+def _equations(
+    flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float
+) -> tuple[Array, Array]:
+    """Return the loops ``measured = base flange tool``, and what is expected of t, as equations of v (`_Loops`).
+
+    ::
+
+        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
+        (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
+
+    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
+    """
+    N = len(flange)
+    eye = np.eye(3)
+    A = flange[:, :3, :3]
+    one = LINEAR
+    of_base = slice(LINEAR + 1, LINEAR + 10)
+    J = np.zeros((N, 12, LINEAR + 1 + 9 * (1 + turned.any())))
+    J[:, :3, :3] = -A
+    J[:, :3, 3:6] = -eye
+    J[:, :3, one] = -flange[:, :3, 3]
+    J[:, :3, of_base] = np.einsum("nb,ac->nabc", measured[:, :3, 3], eye).reshape(N, 3, 9)
+    if turned.any():
+        J[:, 3:, of_base] = -np.einsum("ai,njb->nabij", eye, A).reshape(N, 9, 9)
+        J[:, 3:, of_base.stop :] = np.einsum("nai,bj->nabij", measured[:, :3, :3], eye).reshape(N, 9, 9)
+    J[:, :3] /= sigma[:, 0, None, None]
+    J[:, 3:] *= (turned / (np.sqrt(2) * sigma[:, 1]))[:, None, None]
+    certainty = max(1 / spread, RIDGE * float(np.sqrt(np.sum(sigma[:, 0] ** -2))))
+    prior = np.zeros((3, J.shape[2]))
+    prior[:, :3] = certainty * eye
+    prior[:, one] = -certainty * expected
+    return J, prior
+
+
+class _Solved(NamedTuple):
+    """Where a loss of closed loops is least."""
+
+    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
+    smallest: Smallest  # of the last weighted problem
+    weights: Array  # (N,) that the loss gives the measurements; one for a square
+    squares: Array  # (N,) squared residuals
+    cost: float  # the loss, summed, and what is expected of translations
+
+
+class _Loops(NamedTuple):
+    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first."""
+
+    rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
+    prior: Array  # (3, n) residuals of what is expected of t
+    beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
+
+    def weighted(self, weights: Array, start: Array | None = None, bounded: bool = True) -> _Solved:
+        """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps alone.
+
+        With T (n, n), upper, |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2: its last rows are the least over
+        translations (a Schur complement), its first ones say which these are.
+        """
+        n = self.rows.shape[2]
+        rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
+        T = np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
+        L = T[LINEAR:, LINEAR:]
+        best = smallest(L, start, bounded)
+        x = lifted(best.rotations)
+        v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
+        squares = np.sum((self.rows @ v) ** 2, axis=1)
+        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
+        return _Solved(v, best, weights, squares, cost)
+
+    def repeated(self, solved: _Solved) -> _Solved:
+        """Return the fixed point of weights and solution, the last of which is the relaxation's."""
+        for _ in range(100):
+            weights = (solved.squares <= self.beyond).astype(float)
+            same = np.array_equal(weights, solved.weights)
+            if weights.sum() < FEWEST or (same and np.isfinite(solved.smallest.bound)):
+                break
+            solved = self.weighted(weights, solved.smallest.rotations, bounded=same)
+        if not np.isfinite(solved.smallest.bound):
+            solved = self.weighted(solved.weights, solved.smallest.rotations)
+        return solved
+
+    def graduated(self, among: np.ndarray) -> _Solved:
+        """Return a least of the truncated loss by graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127).
+
+        Losses of some measurements (N,) from squares to the truncated one, each from the last: that of parameter mu has
+        weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them sqrt(mu (mu + 1) c^2 / r^2) - mu.
+        """
+        solved = self.weighted(among.astype(float))
+        mu = 1 / max(2 * float(np.max(among * solved.squares / self.beyond)) - 1, 1e-3)
+        for _ in range(100):
+            between = np.sqrt(mu * (mu + 1) * self.beyond / np.maximum(solved.squares, 1e-300)) - mu
+            weights = among * np.clip(between, 0.0, 1.0)
+            if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
+                break
+            solved = self.weighted(weights, solved.smallest.rotations, bounded=False)
+            mu *= 1.6
+        return self.repeated(solved)
+
+
+def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
+    """Return the least of the truncated loss min(r^2, c^2) of r = |J_i v|, c^2 being a quantile of chi-squared.
+
+    It begins with the largest core of measurements that turn alike, of which ``pairs`` (N, N) can agree, and if not all
+    of that agree, with all of them and with parts of it.
+    """
+    first = _likeliest(pairs)
+    found = [loops.graduated(first)]
+    if not np.array_equal(found[0].weights > 0, first):
+        found.append(loops.graduated(np.ones(len(pairs), dtype=bool)))
+    most = max(each.weights.sum() for each in found)
+    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
+        members = np.flatnonzero(first)
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
+        parts = [_likeliest(some) for some in around]
+        if len(members) <= FEW:  # turning alike, one may be wrong all the same
+            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
+        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
+        found += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
+    least = min(each.cost for each in found)
+    return next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
+
+
+def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:
+    """Return which two measurements (N, N) can both have squared residuals up to c^2, for some frames.
+
+    ::
+
+        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
+
+    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
+    """
+    N = len(beyond)
+    if N > MOST_PAIRED:
+        return np.ones((N, N), dtype=bool)
+    angles = []
+    rough = np.zeros(N)
+    for given in (flange[:, :3, :3], measured[:, :3, :3]):
+        rotations = proper(given)
+        rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
+        flat = rotations.reshape(-1, 9)
+        angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
+    chord = sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
+    off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
+    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~np.outer(turned, turned)
+
+
+def _core(pairs: np.ndarray, count: int) -> np.ndarray:
+    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
+
+    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
+    ICRA, find outliers so).
+    """
+    left = np.ones(len(pairs), dtype=bool)
+    while True:
+        kept = left & (np.sum(pairs[:, left], axis=1) >= count)
+        if np.array_equal(kept, left):
+            return left
+        left = kept
+
+
+def _likeliest(pairs: np.ndarray) -> np.ndarray:
+    """Return the core (N,) of the largest count that leaves any."""
+    counts = range(len(pairs) + 2)
+    return _core(pairs, bisect_left(counts, True, key=lambda count: not _core(pairs, count).any()) - 1)
+
+
+# --- quadratic forms of rotations: relaxation, rounding, refinement and a lower bound -----------------------------
+
+TOLERANCE, FINE = 1e-8, 1e-12
+"""Of gap and feasibility, the form being of size one: what follows refines rotations and multipliers; the finer one
+where moments are those of several rotations."""
+SPREAD = 1e-3
+"""Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
+CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))  # the matrices of the cross products e_a x
+
+
+@lru_cache
+def rotation_constraints(count: int) -> Array:
+    """Return C (c, n, n) with x'C x = 0 for x = (1, vec R_1, ..., vec R_count), rows first, and no other quadratic.
+
+    Of every rotation the twenty independent ones: R R' = 1 and R'R = 1, of which one diagonal entry follows from the
+    others, and each row the cross product of the next two, which says that R is right-handed.
+    """
+    C = np.zeros((20 * count, 1 + 9 * count, 1 + 9 * count))
+    number = 0
+    for k in range(count):
+        at = 1 + 9 * k + np.arange(9).reshape(3, 3)
+        orthonormal = [(entries, i, j) for entries in (at, at.T) for i in range(3) for j in range(i, 3)]
+        for entries, i, j in orthonormal[:-1]:  # both sums of squares are three
+            C[number, entries[i], entries[j]] = 1.0
+            C[number, 0, 0] = -float(i == j)
+            number += 1
+        for i in range(3):
+            p, q, r = np.roll(at, -i, axis=0)
+            for a in range(3):
+                b, c = (a + 1) % 3, (a + 2) % 3
+                C[number, [p[b], p[c], 0], [q[c], q[b], r[a]]] = [1.0, -1.0, -1.0]
+                number += 1
+    return (C + C.swapaxes(1, 2)) / 2
+
+
+class Moments(NamedTuple):
+    """The relaxation of `relax`: its moment matrix is x x' where rotations are its solution."""
+
+    matrix: Array  # (n, n)
+    multipliers: Array  # (20 k,)
+    rank_ratio: float  # second eigenvalue of the matrix over the first: zero where it is of rank one
+
+
+def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
+    """Return the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), with 20 k + 1 unknowns.
+
+    ::
+
+        maximize    bound
+        subject to  Q - bound e e' - sum_j multipliers_j C_j  positive semidefinite,    e = (1, 0, ..., 0)
+
+    For rotations the left side of the constraint times x x' is x'Q x - bound >= 0: no rotation has a smaller value. The
+    constraint's own multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with
+    M_00 = 1 and <C_j, M> = 0.
+    """
+    clarabel = import_module("clarabel")
+
+    n = len(Q)
+    first = np.zeros((1, n, n))
+    first[0, 0, 0] = 1.0
+    columns, rows = np.tril_indices(n)
+    root = np.where(rows == columns, 1.0, np.sqrt(2))  # the cone's norm is that of the matrix
+    C = np.concatenate([first, rotation_constraints((n - 1) // 9)])
+    A = scipy.sparse.csc_matrix((root * C[:, rows, columns]).T)
+    size = float(np.abs(Q).max()) or 1.0
+    b = root * Q[rows, columns] / size
+    q = np.zeros(A.shape[1])
+    q[0] = -1.0
+    settings = clarabel.DefaultSettings()
+    settings.verbose = False
+    settings.max_threads = 1
+    settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    P = scipy.sparse.csc_matrix((len(q), len(q)))
+    with phase("solve"):
+        found = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
+    M = np.zeros((n, n))
+    M[rows, columns] = M[columns, rows] = np.array(found.z) / root
+    eigenvalues = np.linalg.eigvalsh(M)
+    return Moments(M, size * np.array(found.x)[1:], float(abs(eigenvalues[-2]) / eigenvalues[-1]))
+
+
+@dataclass(frozen=True, eq=False)
+class Smallest:
+    """The rotations (k, 3, 3) that minimize |L x|^2 over x = (1, vec R_1, ..., vec R_k), and what is known of that."""
+
+    rotations: Array
+    value: float
+    bound: float = -np.inf  # no rotations have less, up to rounding
+    rank_ratio: float = np.inf  # of the moment matrix
+    information: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (3k, 3k) half the Hessian by turns [1/rad^2]
+    steepness: float = 0.0  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
+
+    def radius(self, excess: float) -> float:
+        """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
+
+        Both x have the length n = 1 + 3 k, squared, so that c = x'x_best / n has 1 - c^2 = |x_other|^2 / n, and
+        |x - x_best|^2 = 2 n (1 - c), of which one rotation has 8 sin^2(angle / 2). A trace of -1 or more keeps c above
+        (1 - k) / n.
+        """
+        if self.steepness <= 0:
+            return float(np.pi)
+        k = len(self.rotations)
+        n = 1 + 3 * k
+        square = 1 - (excess + self.value - self.bound) / (self.steepness * n)
+        if square <= ((1 - k) / n) ** 2:
+            return float(np.pi)
+        apart = 2 * n * (1 - np.sqrt(square))
+        return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
+
+
+def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smallest:
+    """Return the best of what the relaxation and a start (k, 3, 3) lead to, with the relaxation's bound.
+
+    If that is not wanted, the stationary rotations near the start, of which nothing is known.
+
+    ::
+
+        Q - f e e' - sum_j multipliers_j C_j  >=  mu 1,    mu <= 0
+        x'Q x  >=  f + mu |x|^2  =  f + mu (1 + 3 k)    for every x = (1, vec R_1, ..., vec R_k)
+
+    The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
+    their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
+    """
+    near = [] if start is None else [_refined(L, start)]
+    if near and not bounded:
+        return Smallest(near[0], _value(L, near[0]))
+    Q = L.T @ L
+    moments = relax(Q)
+    if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
+        moments = relax(Q, FINE)
+    lifts = [moments.matrix[:, 0]]  # the mean of the rotations that the moments stand for
+    if moments.rank_ratio > SPREAD:  # and some that are drawn from them
+        eigenvalues, vectors = np.linalg.eigh(moments.matrix)
+        normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
+        drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
+        lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
+    found = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
+    best = min([*found, *near], key=lambda R: _value(L, R))
+    value = _value(L, best)
+    x = lifted(best)
+    C = rotation_constraints(len(best))
+    S = Q - np.tensordot(moments.multipliers, C, axes=1)
+    S[0, 0] -= value
+    moves = np.linalg.lstsq((C @ x).T, S @ x, rcond=1e-12)[0]
+    eigenvalues = np.linalg.eigvalsh(S - np.tensordot(moves, C, axes=1))
+    bound = value + min(0.0, float(eigenvalues[0])) * float(x @ x)
+    steepness = max(0.0, float(eigenvalues[1]))
+    return Smallest(best, value, bound, moments.rank_ratio, _derivatives(L, best)[1] / 2, steepness)
+
+
+def lifted(rotations: Array) -> Array:
+    """Return x = (1, vec R_1, ..., vec R_k), rows first."""
+    return np.concatenate([[1.0], rotations.ravel()])
+
+
+def _value(L: Array, rotations: Array) -> float:
+    return float(np.sum((L @ lifted(rotations)) ** 2))
+
+
+def _derivatives(L: Array, rotations: Array) -> tuple[Array, Array]:
+    """Return first (3k,) and second derivatives (3k, 3k) of |L x|^2 by rotation vectors w, R_i exp([w_i] x)."""
+    k = len(rotations)
+    residual = L @ lifted(rotations)
+    G = (2 * L.T @ residual)[1:].reshape(k, 3, 3)
+    D = np.zeros((L.shape[1], 3 * k))
+    B = np.zeros((3 * k, 3 * k))
+    for i, R in enumerate(rotations):
+        own = slice(3 * i, 3 * i + 3)
+        D[1 + 9 * i : 10 + 9 * i, own] = (R @ CROSS).reshape(3, 9).T
+        M = R.T @ G[i]
+        # the second order of exp([w] x) is ([w] x)^2 / 2 = (w w' - |w|^2) / 2
+        B[own, own] = (M + M.T) / 2 - np.trace(M) * np.eye(3)
+    J = L @ D
+    return 2 * J.T @ residual, 2 * J.T @ J + B
+
+
+def _refined(L: Array, rotations: Array) -> Array:
+    """Return the stationary rotations to which Newton's steps lead, uphill directions turned, long steps halved."""
+    value = _value(L, rotations)
+    for _ in range(50):
+        slope, curvature = _derivatives(L, rotations)
+        eigenvalues, V = np.linalg.eigh(curvature)
+        sizes = np.maximum(np.abs(eigenvalues), 1e-14 * np.abs(eigenvalues).max() + 1e-300)
+        step = -V @ ((V.T @ slope) / sizes)
+        step *= min(1.0, 1.0 / max(np.linalg.norm(step), 1e-300))
+        for halved in step / 2.0 ** np.arange(12)[:, None]:
+            turn = scipy.spatial.transform.Rotation.from_rotvec(halved.reshape(-1, 3)).as_matrix()
+            candidate = proper(rotations @ turn)
+            lower = _value(L, candidate)
+            if lower < value:
+                break
+        else:
+            return rotations
+        rotations = candidate
+        value = lower
+        if np.linalg.norm(step) < 1e-13:  # rad
+            break
+    return rotations
