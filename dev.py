@@ -124,7 +124,7 @@ def minima(python: str, *tests: str) -> int:
     extras = project["optional-dependencies"]
     wanted = [
         *project["dependencies"],
-        *(each for name in ("tables", "xacro", "studies") for each in extras[name]),
+        *(each for name in ("tables", "studies") for each in extras[name]),
     ]
     wanted += [each for each in extras["dev"] if each.startswith(("hypothesis", "polars", "pytest"))]
     lowest = sorted({each.replace(">=", "==") for each in wanted})

@@ -342,24 +342,20 @@ def calibrate(
     limit: Tolerance = None,
     box: Box = None,
     out: Folder = None,
-    profile: Annotated[bool, Option("--profile", help="Print the time of each phase.")] = False,
 ) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
     Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if the test is inconclusive.
     """
     with console.progress() as say:
-        from rpim_opt.basics.threads import clock
-        from rpim_opt.report.summary import describe, describe_times, summary
+        from rpim_opt.report.summary import describe, summary
         from rpim_opt.store.instances import load
 
         say("reading the problem")
         instance = load(problem, variant)
         requirement = console.required(limit, box, instance.record.requirement)
         instance = replace(instance, record=replace(instance.record, requirement=requirement))
-        with clock() as running:
-            result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
-            times = dict(running.rows())
+        result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
         without: list[str] = []
         if drop_outliers:
             without = [flag.label for flag in result.flagged if flag.label not in result.clustered]
@@ -379,9 +375,6 @@ def calibrate(
             f"Refitted without {', '.join(without)}." if without else "No flagged row to drop: nothing was refitted."
         )
         text = f"{refitted}\n\n{text}"
-    if profile:
-        text = f"{text}\n\n{describe_times(times)}"
-        found = {**found, "seconds": times}
     code = CODES[(found["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
     return Answer(text, {**found, "refitted_without": without}, code, _saved(result, out))
 

@@ -25,7 +25,7 @@ import numpy as np
 
 import rpim_opt as ro
 from rpim_opt.basics.text import markdown
-from rpim_opt.basics.threads import clock, cores, on_all_cores, one_blas_thread
+from rpim_opt.basics.threads import cores, on_all_cores, one_blas_thread
 from rpim_opt.convex.formulation import FORMULATIONS
 from rpim_opt.problem.blocks import ROWS, PartitionedProblem, partitions, reduced
 from rpim_opt.problem.linear import reduced_rows
@@ -154,7 +154,7 @@ def _median(work: Callable[[], Any], runs: int = 31, now: Callable[[], float] = 
 
 
 def _small() -> dict[str, Any]:
-    """Return medians for 52 configurations, and the time of the phases."""
+    """Return medians for 52 configurations."""
     problem = _arm(bounds=False)
     times: dict[str, float | None] = {
         "L-curve": _median(lambda: ro.calibrate(problem, ro.tikhonov, ro.l_curve)),
@@ -173,11 +173,7 @@ def _small() -> dict[str, Any]:
     lasso = ro.convex.pose(ro.lasso, bounded.linearize(np.zeros(n)))  # a box has an active set, and needs no Clarabel
     times["program once"] = _median(lambda: lasso.solve(10.0))
     times["Clarabel once"] = _clarabel(lasso)
-    with clock() as running:
-        for _ in range(20):
-            ro.calibrate(bounded, ro.bounded, 1.0)
-    phases = {name: seconds / 20 for name, seconds in running.rows()}
-    return {**times, "held": float(np.mean(np.array(inside) > 0.99)), "phases": phases}
+    return {**times, "held": float(np.mean(np.array(inside) > 0.99))}
 
 
 def _clarabel(program: Any) -> float | None:
@@ -231,20 +227,18 @@ def _tables(folder: Path, count: int) -> tuple[PartitionedProblem, np.ndarray]:
 
 
 def _rows(count: int) -> dict[str, Any]:
-    """Return seconds, passes, memory and phases of a calibration that reads its rows from Parquet."""
+    """Return seconds, passes and memory of a calibration that reads its rows from Parquet."""
     with tempfile.TemporaryDirectory() as folder:
         problem, truth = _tables(Path(folder), count)
         first = problem.parts[0]()
         warm = CalibrationProblem(problem.robot, problem.parameters, first)
         reduced(warm, 0 * truth)  # compiles, where that pays
         ro.calibrate(warm.on(first.take(range(500))), ro.tikhonov, ro.reml)
-        with clock() as running:
-            start = time.perf_counter()
-            worked = time.process_time()
-            result = ro.calibrate(problem, ro.tikhonov, ro.reml)
-            worked = time.process_time() - worked
-            seconds = time.perf_counter() - start
-        phases = dict(running.rows())
+        start = time.perf_counter()
+        worked = time.process_time()
+        result = ro.calibrate(problem, ro.tikhonov, ro.reml)
+        worked = time.process_time() - worked
+        seconds = time.perf_counter() - start
     block = np.random.default_rng(0).normal(size=(3 * ROWS, len(truth) + 1))
     target = np.empty_like(block)
     columns = np.asfortranarray(block)  # as LAPACK asks for them
@@ -262,7 +256,6 @@ def _rows(count: int) -> dict[str, Any]:
         "passes": len(result.history) + 1,  # one linearization more than steps
         "converged": result.converged,
         "peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
-        "phases": phases,
         "worked": worked,
         "floor_us": 1e6 * _median(alone, 11) / ROWS,
         "floor_worked_us": 1e6 * _median(alone, 11, time.process_time) / ROWS,
@@ -307,7 +300,7 @@ def _cluster(count: int) -> dict[str, Any]:
 
 
 def report(rows: list[dict[str, Any]]) -> Report:
-    """Return times and ratios, time and memory over the number of rows, and the phases with their floors."""
+    """Return times and ratios, time and memory over the number of rows, and floors."""
     small = next(row for row in rows if row["part"] == "small")
     boot = next(row for row in rows if row["part"] == "bootstrap")
     counted = [row for row in rows if row["part"] == "rows"]
@@ -349,14 +342,10 @@ def report(rows: list[dict[str, Any]]) -> Report:
     parted = [row["peak_mb"] for row in counted if row["count"] >= 2 * PART]
     metrics["peak memory, largest over smallest"] = parted[-1] / parted[0]
     work = last["count"] * last["passes"] / 1e6
-    phases = [
-        [name, f"{1e6 * small['phases'][name]:.0f}", f"{last['phases'][name] / work:.2f}"] for name in last["phases"]
-    ]
     text = TEXT.format(
         times=markdown(["52 configurations, 35 parameters", "ms", "over ours"], lines),
         other=markdown(["also", "time"], other),
         rows=markdown(["configurations", "seconds", "passes", "us each and pass", "peak memory [MB]"], table),
-        phases=markdown(["phase", "bounded, 52 configurations [us]", f"{last['count']:,} [us each and pass]"], phases),
         held=100 * small["held"],
         program=1e3 * small["program once"],
         clarabel=_ms_or_none(small["Clarabel once"]),
@@ -364,9 +353,7 @@ def report(rows: list[dict[str, Any]]) -> Report:
         worked=last["worked"] / work,
         worked_over=last["worked"] / work / last["floor_worked_us"],
         qr=last["qr_us"],
-        reduction=last["phases"]["reduction"] / work,
         copy=last["copy_us"],
-        evaluation=last["phases"]["evaluation"] / work,
         cores=cores(),
         floor=last["floor_together_us"],
         over=metrics["us per configuration and pass"] / last["floor_together_us"],
@@ -475,12 +462,9 @@ On {held:.0f} % of the path some bound holds.
 
 Positions, 33 parameters, read from Parquet in tables of 50,000 rows at every pass, Tikhonov with REML to convergence.
 
-{phases}
-
 Floors, in one thread each: to copy the same rows and to reduce them by LAPACK's usual QR (geqrf) takes {lapack:.2f} us
-a configuration; by its recursive one (geqrt), which is used, {qr:.2f}, where the reduction takes {reduction:.2f} a
-core; a copy of the whitened rows takes {copy:.2f} us, where their evaluation takes {evaluation:.2f}. `other` is the
-reading of the tables and Python. Copy and usual QR on {cores} cores at once take {floor:.2f} us a configuration by the
+a configuration; by its recursive one (geqrt), which is used, {qr:.2f}; a copy of the whitened rows takes {copy:.2f}
+us. Copy and usual QR on {cores} cores at once take {floor:.2f} us a configuration by the
 clock, the pass {over:.2g} times that. In processor time, which other work on the machine disturbs less, a pass takes
 {worked:.2f} us of all cores together, {worked_over:.2g} times the floor.
 One lasso takes {program:.2f} ms, of which Clarabel itself {clarabel}.

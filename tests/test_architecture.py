@@ -21,7 +21,7 @@ FLOORS: dict[str, set[str]] = {
     # pydantic checks files, rich writes tables of text, threadpoolctl holds linear algebra to one thread
     "basics": {"pydantic", "pydantic_core", "rich", "threadpoolctl"},
     # pydantic: the schema of robot.toml
-    "robot": {"casadi", "pydantic", "xacro"},
+    "robot": {"casadi", "pydantic"},
     # casadi: what an instrument sees is differentiated; table libraries are loaded by name in basics.tables
     "data": {"casadi"},
     # clarabel: where a problem starts is the optimum of a relaxation, of which the programs above know nothing

@@ -12,14 +12,6 @@ import rpim_opt as ro
 from tests.test_cli import run
 
 
-def test_times_are_told_on_demand(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
-    assert run(monkeypatch, "calibrate", "paper_arm", "--profile") == 0
-    said = capsys.readouterr().out
-    assert "solve" in said
-    assert run(monkeypatch, "calibrate", "paper_arm") == 0
-    assert len(capsys.readouterr().out) < len(said)
-
-
 def test_what_is_measured_already_counts_in_a_design(monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     asked = ["design", "position", "--count", "4", "--candidates", "20", "--criterion", "D", "--json"]
     values = []

@@ -1,14 +1,11 @@
-"""Threads and timing: all cores for blocks of rows, one BLAS thread for small matrices, seconds by phase."""
+"""Threads: all cores for blocks of rows, one BLAS thread for small matrices."""
 
 from __future__ import annotations
 
 import os
 import threading
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
-from contextvars import ContextVar
 from functools import lru_cache, wraps
 from typing import Any, TypeVar
 
@@ -17,8 +14,6 @@ from threadpoolctl import ThreadpoolController
 Function = TypeVar("Function", bound=Callable[..., Any])
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-PHASES = ("evaluation", "reduction", "canonicalization", "solve", "selection")
-_running: ContextVar[Clock | None] = ContextVar("clock", default=None)
 _worker = threading.local()
 
 
@@ -33,7 +28,7 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     """Return a function's results for items, in their order, computed on all cores.
 
     What the items are does not depend on the number of cores, and so neither does any digit of the answers. Inside a
-    thread of its own it works one by one. Phases of a clock are the caller's.
+    thread of its own it works one by one.
     """
     waiting = list(items)
     workers = min(cores(), len(waiting))
@@ -83,53 +78,3 @@ def one_blas_thread(function: Function) -> Function:
                     _limit.__exit__(None, None, None)
 
     return limited  # type: ignore[return-value]
-
-
-class Clock:
-    """Seconds by phase; the time of a nested phase counts for that phase alone."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = dict.fromkeys(PHASES, 0.0)
-        self.started = self._since = time.perf_counter()
-        self.stack: list[str] = []
-
-    def switch(self, phase: str | None) -> None:
-        """Begin a phase, or end the current one."""
-        now = time.perf_counter()
-        if self.stack:
-            self.seconds[self.stack[-1]] += now - self._since
-        self._since = now
-        if phase is None:
-            self.stack.pop()
-        else:
-            self.stack.append(phase)
-
-    def rows(self) -> list[tuple[str, float]]:
-        """Return the seconds of every phase, and the rest of the time since the clock was made."""
-        other = time.perf_counter() - self.started - sum(self.seconds.values())
-        return [*self.seconds.items(), ("other", other)]
-
-
-@contextmanager
-def clock() -> Iterator[Clock]:
-    """Time a block of code by phases: ``with clock() as c: calibrate(...)``, then ``c.rows()``."""
-    running = Clock()
-    token = _running.set(running)
-    try:
-        yield running
-    finally:
-        _running.reset(token)
-
-
-@contextmanager
-def phase(name: str) -> Iterator[None]:
-    """Time a block of code as a phase, if a clock is running: ``with phase("solve"): ...``."""
-    running = _running.get()
-    if running is None:
-        yield
-        return
-    running.switch(name)
-    try:
-        yield
-    finally:
-        running.switch(None)

@@ -11,7 +11,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, joined
-from rpim_opt.basics.threads import phase
 from rpim_opt.bayes.evidence import (
     FARTHEST,
     Evidence,
@@ -253,8 +252,7 @@ class Estimator:
         starts = [] if known is None else [known]
         if several:
             starts += sides(problem, evidence)
-        with phase("selection"):
-            point, *others = evidence.optima(starts)
+        point, *others = evidence.optima(starts)
         scale = p.scale.copy()
         scale[p.identified] *= stated.scale * np.sqrt(point.v)
         repeatability = replace(evidence.repeatability(point.logs), at=parameter_values(problem, x))

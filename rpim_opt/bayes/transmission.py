@@ -13,7 +13,6 @@ from functools import partial
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.threads import phase
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
@@ -81,26 +80,25 @@ def admitted(
     models = Models(bare, estimator, deviation, skip=(SECOND,))
     used = np.isin(models.names, p.free.names)
     before = named(fit.problem, fit.point.v)
-    with phase("selection"):
-        given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
-        start = np.log([max(getattr(fit.laid.repeatability, kind), LEAST) for kind in models.columns.noise])
-        plain = given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
-        found = _most_likely(given, models, plain)
-        if found is None:
-            return None
-        point, curves, columns = found
-        rest = _integrated(models.columns, columns, point)
-        kept = {"gravity"}.intersection(trials[0].extensions)
+    given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
+    start = np.log([max(getattr(fit.laid.repeatability, kind), LEAST) for kind in models.columns.noise])
+    plain = given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
+    found = _most_likely(given, models, plain)
+    if found is None:
+        return None
+    point, curves, columns = found
+    rest = _integrated(models.columns, columns, point)
+    kept = {"gravity"}.intersection(trials[0].extensions)
 
-        def price(extensions: tuple[str, ...]) -> Candidate:
-            model = rest.restricted(models.members(extensions))
-            best = model.optima(model.starts()[:1])[0]
-            price = EXTENSION_GAIN * questions(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
-            if not kept.issubset(extensions):
-                price = np.inf
-            return Candidate(best.value + price, extensions, best)
+    def price(extensions: tuple[str, ...]) -> Candidate:
+        model = rest.restricted(models.members(extensions))
+        best = model.optima(model.starts()[:1])[0]
+        price = EXTENSION_GAIN * questions(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
+        if not kept.issubset(extensions):
+            price = np.inf
+        return Candidate(best.value + price, extensions, best)
 
-        compared = sorted(models.compared(price), key=lambda each: each.price)
+    compared = sorted(models.compared(price), key=lambda each: each.price)
     best = compared[0]
     problem = extended(bare, models.added(best.extensions))
     prior = estimator.prior.stated(problem.parameters)

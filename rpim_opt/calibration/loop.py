@@ -11,7 +11,6 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
-from rpim_opt.basics.threads import phase
 from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.weight_choice import WeightChoice, weight_choice
 from rpim_opt.convex.formulation import Formulation
@@ -246,9 +245,8 @@ class Loop:
     def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
         weight = state.choice.weight
         how = {key: getattr(self.options, key) for key in ("solver", "settings", "verbose")}
-        with phase("solve"):
-            damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
-            estimate = program.solve(weight, damping=damping, accuracy=accuracy, **how)
+        damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
+        estimate = program.solve(weight, damping=damping, accuracy=accuracy, **how)
         return program.inside(estimate.z, state.z, weight)
 
     def _curved(self, state: State, straight: Array) -> Array:
@@ -421,9 +419,8 @@ def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Arr
     if model.equations < len(z) and unpenalized:
         found = f"{model.equations} equations for {len(z)} parameters"
         raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
-    with phase("canonicalization"):
-        program = pose(formulation, model)
-        nearest = program.nearest(z)
+    program = pose(formulation, model)
+    nearest = program.nearest(z)
     if (nearest != z).any():
         z = nearest
         program = program.on(loop.linearized(z))

@@ -8,7 +8,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.threads import phase
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, Selection, Selector, require_weight
 from rpim_opt.convex.select import weight_of
@@ -47,8 +46,7 @@ class WeightChoice:
         """Return the choice of the rule for a program, unless the weight is final."""
         if self.settled or self.rule is None:
             return self
-        with phase("selection"):
-            selection = self.rule(program)
+        selection = self.rule(program)
         name = getattr(self.rule, "__name__", "selector")
         if isinstance(selection, int | float | np.integer | np.floating) and not isinstance(selection, bool):
             selection = Selection(float(selection), name, np.empty(0), np.empty(0), True)

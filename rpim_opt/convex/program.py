@@ -14,7 +14,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import Brief
-from rpim_opt.basics.threads import one_blas_thread, phase
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.convex.constraints import Box
 from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
@@ -449,8 +449,7 @@ class Program(Brief):
         """Return the minimum by the structure of the loss; where that fails, CVXPY's."""
         of = self.structure.loss, self._rows, self._warm, weight, self._squares
         try:
-            with phase("solve"):
-                found = minimum(*of, damping, accuracy)
+            found = minimum(*of, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)

@@ -13,7 +13,7 @@ from scipy.linalg import svd as scipy_svd
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Brief, counted
-from rpim_opt.basics.threads import on_all_cores, phase
+from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.parameters import Parameters
 
 RANK_TOLERANCE = 1e-10
@@ -61,16 +61,14 @@ class LinearModel(Brief):
     def svd(self) -> tuple[Array, Array, Array]:
         """U'b (n,), s (n,), V' (n, n) of A = U diag(s) V'; s below `RANK_TOLERANCE` times the largest are zero."""
         n, R = self.A.shape[1], self.triangle
-        with phase("reduction"):
-            U, s, Vt = svd(R[:n, :n])
+        U, s, Vt = svd(R[:n, :n])
         s = np.where(s > RANK_TOLERANCE * s[0], s, 0.0)
         return U.T @ R[:n, n], s, Vt
 
     @cached_property
     def triangle(self) -> Array:
         """Upper triangle R (n+1, n+1) of [A b] = QR: |A z - b| = |R [z; -1]| for every z."""
-        with phase("reduction"):
-            return triangle_of(self.A, self.b)
+        return triangle_of(self.A, self.b)
 
     @cached_property
     def members(self) -> tuple[np.ndarray, np.ndarray]:
@@ -141,8 +139,7 @@ def reduced_models(models: Iterable[LinearModel]) -> LinearModel:
     for last in models:
         equations += last.equations
         offset += last.offset
-        with phase("reduction"):
-            R = reduced_rows(np.column_stack([last.A, last.b]), R)
+        R = reduced_rows(np.column_stack([last.A, last.b]), R)
     if last is None or R is None:
         raise InputError("data", "no row", "at least one")
     group = np.zeros(len(R), dtype=int)

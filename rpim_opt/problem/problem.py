@@ -14,7 +14,6 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import Tabled, counted
-from rpim_opt.basics.threads import phase
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
@@ -345,8 +344,7 @@ class CalibrationProblem(RobotModel):
             shifted = [(own == prefix).astype(float)[:, None] for prefix in prefixes]
             self._arguments[block] = np.hstack([*loads_in(self.arms[block.robot], block), *shifted, block.y])
         function = self.functions(block)[what]
-        with phase("evaluation"):
-            return call_rows(function, [x, self.parameters.nominal], self._arguments[block])
+        return call_rows(function, [x, self.parameters.nominal], self._arguments[block])
 
     def _values(self, block: Block, what: str, x: Array) -> Array:
         return self._evaluated(block, what, x)[0][:, 0]

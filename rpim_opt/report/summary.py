@@ -322,10 +322,3 @@ def describe(result: Calibration, document: Mapping[str, Any]) -> str:
     if document["orientation"]:
         lines += ["", table(["orientation error [mrad]", *COLUMNS], cells(document["orientation"], "mrad"))]
     return "\n".join([*lines, "", words.parameter_table(result)])
-
-
-def describe_times(seconds: Mapping[str, float]) -> str:
-    """Return the seconds of a calibration's phases as a table [ms]."""
-    whole = sum(seconds.values())
-    rows = [[phase, f"{1e3 * each:.2f}", f"{each / whole:.0%}"] for phase, each in seconds.items()]
-    return table(["phase", "ms", "share"], [*rows, ["all", f"{1e3 * whole:.2f}", "100%"]])

@@ -217,7 +217,6 @@ def _turned(angle: float, near: float) -> float:
 
 # Numbers in the files of robots
 
-XACRO = ".xacro"
 ROUNDING = 1e-14
 """Of numbers of an arm of a metre, and of an angle's cosine."""
 

@@ -10,13 +10,13 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
-from rpim_opt.robot.chain import XACRO, Described
+from rpim_opt.robot.chain import Described
 from rpim_opt.robot.formats.tables import read_robot, read_sheet
 
 READY = Path(__file__).resolve().parent / "ready"
 ROBOT_FILES = (".toml", ".urdf", ".csv", ".json", ".yaml", ".yml")
 REFUSED = {
-    XACRO: "a xacro file, which is executed and so may be named by commands and scripts only",
+    ".xacro": "a xacro file, which ROS's command expands (xacro arm.urdf.xacro > arm.urdf)",
     ".xml": "an XML file, of MuJoCo or others",
     ".mjcf": "a model of MuJoCo",
     ".sdf": "an SDF file",
@@ -55,7 +55,7 @@ def read_arm(
     file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "", origins: bool = False
 ) -> Described:
     """Return the robot of a file, with base and tool if a URDF or a standard DH table states them."""
-    if file.suffix in (".urdf", XACRO):
+    if file.suffix == ".urdf":
         from rpim_opt.robot.formats.urdf import read_urdf
 
         return read_urdf(file, urdf_base, urdf_tip, origins)
@@ -80,13 +80,12 @@ class RobotSource(NamedTuple):
 
 
 def find_source(robot: str | Path) -> RobotSource:
-    """Return the source of a robot that a command or a script names: a ready one by name, or a file, also a xacro."""
-    endings = (*ROBOT_FILES, XACRO)
+    """Return the source of a robot that a command or a script names: a ready one by name, or a file."""
     robot = str(robot)
-    if not robot.endswith(endings):
+    if not robot.endswith(ROBOT_FILES):
         return RobotSource(find_robot(robot), f"a copy of the ready robot {robot}")
     file = Path(robot)
     if not file.exists():
-        raise InputError("the robot", "no such file", f"a file {', '.join(endings)}, or a ready robot", file)
+        raise InputError("the robot", "no such file", f"a file {', '.join(ROBOT_FILES)}, or a ready robot", file)
     require_file(file)
     return RobotSource(file, f"modified DH table, from {file.name}")

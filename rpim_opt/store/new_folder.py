@@ -38,7 +38,7 @@ from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, placed, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
-from rpim_opt.robot.formats.urdf import branching_tip, urdf_text
+from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import RobotSource, find_source, read_arm
 from rpim_opt.robot.mdh import MDH
@@ -210,7 +210,7 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
         raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
     if chain in known:
         raise InputError("--chain", f"'{chain}', which is there", "a unique name for every chain", folder)
-    if read_bytes(folder / ROBOT_OF_CHAINS) != urdf_text(robot):
+    if read_bytes(folder / ROBOT_OF_CHAINS) != read_bytes(robot):
         raise InputError("the robot", f"another one than {ROBOT_OF_CHAINS}", "the same URDF for all chains", robot)
     return read_bytes(folder / "problem.toml")
 
@@ -224,7 +224,7 @@ def _write_whole(
         made = stack.enter_context(scratch_folder(folder)) / folder.name
         write_files({made / name: content for name, content in contents.items()})
         if chains:
-            write_bytes(made / ROBOT_OF_CHAINS, urdf_text(source.file))
+            write_bytes(made / ROBOT_OF_CHAINS, read_bytes(source.file))
         elif source.file.suffix == ".toml":
             write_text(made / "robot.toml", read_text(source.file))  # with its comments
         else:

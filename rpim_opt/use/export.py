@@ -372,7 +372,7 @@ def noted(text: str, ending: str, note: str) -> str:
         header, *rows = csv.reader(text.splitlines())
         cells = [note, *[""] * len(rows)]
         return csv_text([*header, "note"], [[*row, cell] for row, cell in zip(rows, cells, strict=False)])
-    if ending not in (".urdf", ".xml", ".xacro"):
+    if ending not in (".urdf", ".xml"):
         return f"# {note}\n{text}"
     declaration, mark, rest = text.rpartition("?>")
     return f"{declaration}{mark}\n<!-- {note.replace('--', '-')} -->\n{rest.lstrip()}".lstrip()

@@ -1,7 +1,7 @@
 """URDF: reading of a chain between two links, and writing of identified origins with all other bytes unchanged.
 
 A URDF is untrusted input. It goes through expat, which reports where in the file an element stands; document types, and
-with them entities and other files, are refused. A xacro file is expanded by the package that ROS has for it.
+with them entities and other files, are refused, as are macros (xacro), which are carried out.
 """
 
 from __future__ import annotations
@@ -29,7 +29,6 @@ from rpim_opt.robot.chain import (
     MOUNT,
     ORIGIN,
     ROUNDING,
-    XACRO,
     Carried,
     Chain,
     Described,
@@ -47,6 +46,7 @@ from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import Gravity, Robot, Vector
 from rpim_opt.robot.terms import Model, Term
 
+EXPANDED = "what ROS's command makes of it: xacro arm.urdf.xacro > arm.urdf"
 DEEPEST = 100
 """How deep elements may be nested."""
 LARGEST_NUMBER = 1e6
@@ -68,11 +68,10 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of the chain's highest link, wherever the first
     axis points, and pulls at the masses that the file states; where joints move the base itself, no masses are read.
 
-    ``path`` is a URDF file, or a file ``.xacro``, which the package xacro expands by its own defaults
-    (``rpim-opt[xacro]``); ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the
-    base. An error names the file, the element, what was found and what is accepted: document types and entities, links
-    or joints that are missing, twice or in a cycle, values that are no finite numbers, floating and planar joints
-    between base and tip, no or several candidates for base or tip.
+    ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the base. An error names the
+    file, the element, what was found and what is accepted: document types and entities, links or joints that are
+    missing, twice or in a cycle, values that are no finite numbers, floating and planar joints between base and tip, no
+    or several candidates for base or tip.
 
     With ``origins`` the parameters to identify are not those of the table but the origins of the file's joints, six
     numbers each, ``origin_{joint}_x`` to ``_rz``, of fixed joints at the chain's ends ``mount_{joint}_x``: the same in
@@ -118,7 +117,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
 
 def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
     """Return a name for the chain between two links that goes up through joints that move; nothing for another one."""
-    if path.suffix not in (".urdf", XACRO):
+    if path.suffix != ".urdf":
         return ""
     steps = _read(path).steps_between(base, tip)
     up = any(step.up and step.joint.kind for step in steps)
@@ -136,16 +135,14 @@ def write_urdf(
 ) -> None:
     """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
 
-    ``source`` is the original, or a file ``.xacro``: then what it expands to is; its `read_urdf` with the same ``base``
-    and ``tip`` has to be the robot whose parameters were identified. ``target`` may be ``source``, unless that is a
-    xacro file. ``robot`` has the identified parameters (`Calibration.robot`, `use.identified`), ``base_frame`` and
-    ``tool_frame`` (6,) are identified base and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's.
+    ``source`` is the original; its `read_urdf` with the same ``base`` and ``tip`` has to be the robot whose parameters
+    were identified. ``target`` may be ``source``. ``robot`` has the identified parameters
+    (`Calibration.robot`, `use.identified`), ``base_frame`` and ``tool_frame`` (6,) are identified base and tool, x, y,
+    z [m], roll, pitch, yaw [rad]; by default the original's.
 
     An origin that does not change stays as it is written; numbers are written so that they read back exactly. Refused
     are another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
     """
-    if Path(target).suffix.lower() == XACRO:
-        raise InputError("the target", "a xacro file", "a file .urdf, for what it expands to", target)
     urdf = _read(Path(source))
     way = _Way(urdf, urdf.steps_between(base, tip))
     table, T_base, T_tool, G = describe(way.chain)
@@ -357,7 +354,7 @@ class _Joint:
         if numbers is None:
             wanted = "a finite number" if count == 1 else f"{count} finite numbers"
             if "$" in text:
-                wanted += "; a file with xacro's expressions ends in .xacro"
+                wanted += f"; {EXPANDED}"
             raise self.error(f"{tag} {attribute}", repr(text[:40]), wanted)
         return numbers
 
@@ -541,13 +538,13 @@ class _Urdf:
 
 def _read(path: Path) -> _Urdf:
     """Return the tree of links and joints of a file."""
-    data = urdf_text(path)
+    data = read_bytes(path)
     root = _root_element(data, path)
     if root.tag != "robot":
         raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF", path)
     for element in root:
         if element.tag.startswith("xacro:"):
-            raise InputError(f"element <{element.tag}>", "xacro in a file .urdf", "URDF, or a file .xacro", path)
+            raise InputError(f"element <{element.tag}>", "a xacro file", EXPANDED, path)
     links = _named(root.findall("link"), path)
     if not links:
         raise InputError("the robot", "no links", "elements <link> and <joint>", path)
@@ -610,28 +607,6 @@ def _root_element(data: bytes, path: Path) -> _Element:
     except (LookupError, ValueError) as error:
         raise InputError("the XML declaration", str(error), "UTF-8 text", path) from None
     return top[0]
-
-
-def urdf_text(path: Path) -> bytes:
-    """Return the content of a URDF file, or what a xacro file says with its own defaults.
-
-    Expressions are carried out and other files included: problem folders, which may be untrusted, name no xacro.
-    """
-    content = read_bytes(path)
-    if path.suffix.lower() != XACRO:
-        return content
-    try:
-        import xacro
-    except ImportError:
-        accepted = "URDF, or the package that expands it: pip install 'rpim-opt[xacro]'"
-        raise InputError("the robot", "a xacro file", accepted, path) from None
-    try:
-        document: Any = xacro.process_file(str(path))
-    except Exception as error:  # of expressions, XML, missing files and packages: xacro has no type of error for all
-        found = " ".join(str(error).split())
-        accepted = "a file that expands without arguments, or what the command xacro makes of it with them"
-        raise InputError("the robot", found, accepted, path) from None
-    return bytes(document.documentElement.toxml("utf-8"))
 
 
 # Masses
