@@ -15,7 +15,7 @@ from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.threads import one_blas_thread, phase
+from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, Place, proper, rigid
 
 GAP = 1e-3  # what cost and bound may differ by, in units of one plus the cost: a chi-squared means nothing finer
@@ -422,8 +422,7 @@ def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
     settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     P = scipy.sparse.csc_matrix((len(q), len(q)))
-    with phase("solve"):
-        found = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
+    found = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
     M = np.zeros((n, n))
     M[rows, columns] = M[columns, rows] = np.array(found.z) / root
     eigenvalues = np.linalg.eigvalsh(M)
