@@ -5,9 +5,12 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from collections import defaultdict
 from typing import Any
 
 import pytest
+
+from tests.durations import cases
 
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
@@ -32,6 +35,8 @@ SMOKE = (
     "tests/use/test_iso9283.py",
 )
 """Files of which each holds a folder's foundations; together they take less than half a minute."""
+SNIPPETS = ("tests/test_docstrings.py", "tests/test_readme.py")
+"""Files that run the examples of docstrings, README and guides."""
 DEFAULT = {
     "tests/convex/test_mechanism.py::test_storage_decides_nothing": ("reml-robust", "l_curve-sum_of_norms"),
     "tests/calibration/test_conditional.py::test_widths_are_those_of_repeated_measurements": ("box",),
@@ -57,35 +62,6 @@ DEFAULT = {
     "tests/study/test_comparison.py::test_a_journal_of_other_arguments_is_not_resumed": ("change0-set of methods",),
 }
 """Cases that the default suite takes of a test whose every case is long; the others are slow."""
-LONG = {
-    "tests/calibration/test_causes.py::test_a_mistake_is_named": (
-        "iiwa7-tracker moved by 300 mm",
-        "ur5e-joint 5 frozen",
-        "iiwa7-a column in centimetres",
-        "iiwa7-joint 2 from 90 degrees and joint 3 reversed",
-        "irb120-values a row too low",
-        "ur5e-joints 4 and 6 exchanged",
-        "irb120-joint 3 coupled to 2",
-    ),
-    "tests/calibration/test_causes.py::test_another_unit_from_halfway_on_is_named": ("",),
-    "tests/store/test_problems.py::test_a_simulated_problem_reproduces_its_reference": ("camera",),
-    "tests/test_commands.py::test_two_units_that_are_wrong_are_both_named": ("",),
-    "tests/calibration/test_causes.py::test_misread_orientations_are_named": ("",),
-    "tests/calibration/test_causes.py::test_a_table_in_the_standard_convention_is_named": ("",),
-    "tests/calibration/test_causes.py::test_an_exchanged_reflector_is_no_moved_foot": ("",),
-    "tests/bayes/test_transmission.py::test_after_an_update_files_hold_the_geometry_alone": ("",),
-    "tests/convex/test_grid.py::test_a_calibration_ends_where_plain_cvxpy_ends": (
-        "Tikhonov, matrix inequality, rank_deficient",
-        "parameters in the loss, markers",
-        "squares and L1 + squares, seven_axis",
-    ),
-    "tests/convex/test_cones.py::test_a_constraint_is_met": (
-        "matrix inequality, markers, 0.1, squared",
-        "matrix inequality, position, 1, Huber",
-        "matrix inequality, distance, 0.5, Huber",
-    ),
-}
-"""Long cases of a test whose others are short, ``""`` for a test without cases."""
 
 
 @pytest.fixture
@@ -99,6 +75,12 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rpim_opt.report.report.figure", figure)
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Declare the markers that the lists of this file give."""
+    config.addinivalue_line("markers", "long: slow by cases.toml, which python -m tests.durations makes")
+    config.addinivalue_line("markers", "snippet: an example of a docstring, the README or a guide; run by .ci/run")
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: Any, log: Any) -> Any:
     """Leave most tests of a module to one worker, which makes their fixtures once."""
@@ -108,11 +90,25 @@ def pytest_xdist_make_scheduler(config: Any, log: Any) -> Any:
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Mark each test by the lists above."""
+    """Mark each test by the lists above, by `cases.toml`, and those that run what texts show."""
+    of_test: dict[str, list[pytest.Item]] = defaultdict(list)
     for item in items:
         test, _, case = item.nodeid.partition("[")
         case = case.removesuffix("]")
-        if case not in DEFAULT.get(test, (case,)) or case in LONG.get(test, ()):
+        if item.nodeid.startswith(SNIPPETS):
             item.add_marker(pytest.mark.slow)
-        elif item.nodeid.startswith(SMOKE):
+            item.add_marker(pytest.mark.snippet)
+        elif case not in DEFAULT.get(test, (case,)):
+            item.add_marker(pytest.mark.slow)
+        else:
+            of_test[test].append(item)
+    for test, count in cases().items():
+        known = of_test.get(test, [])
+        taken = {i * len(known) // count for i in range(count)}
+        for i, item in enumerate(known):
+            if i not in taken:
+                item.add_marker(pytest.mark.slow)
+                item.add_marker(pytest.mark.long)
+    for item in items:
+        if item.nodeid.startswith(SMOKE) and item.get_closest_marker("slow") is None:
             item.add_marker(pytest.mark.smoke)

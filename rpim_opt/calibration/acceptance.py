@@ -224,9 +224,9 @@ class Acceptance:
             lines.append(
                 f"Expanded uncertainty of the position reached (U, {percent(asked.confidence)}): at most "
                 f"{1e3 * found.largest:.3f} mm (largest of {found.count} configurations, refined by a search), median "
-                f"{1e3 * found.typical:.3f} mm. It is that of the reflector: for another point, the flange or a TCP, "
-                "`compensate --tool` states the uncertainty."
+                f"{1e3 * found.typical:.3f} mm."
             )
+            lines.append("It is the uncertainty of the reflector; `compensate --tool` states that of another point.")
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
         return [*lines, *self.reasons]

@@ -94,7 +94,8 @@ def displaced(result: Calibration, data: Dataset, found: Judged) -> str:
     return (
         f"Likely: the instrument or the base moved. The measurements are displaced together by {shift:.3g} mm and "
         f"{turn:.3g} mrad; registered again, their RMS error is {1e3 * np.sqrt(3) * after:.3g} mm in place of "
-        f"{1e3 * np.sqrt(3) * before:.3g} mm. `update --reset 'base_*'` registers it again."
+        f"{1e3 * np.sqrt(3) * before:.3g} mm. `update --reset 'base_*'` registers it again. If neither moved, "
+        "the robot errs alike at these configurations."
     )
 
 
