@@ -411,14 +411,14 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     mapping = None if explained(robot, points) else search(robot, points)
     if mapping is not None:
         words = described(robot.joint_types, mapping.sign, mapping.zero)
-        what, remedy = words, "write sign and theta_deg of these joints in robot.toml"
+        remedy = "write sign and theta_deg of these joints in robot.toml"
         if mapping.mirrored:
-            what = f"the measured frame mirrored (left-handed), or {words}"
+            words = f"the measured frame mirrored (left-handed), or {words}"
             remedy = (
-                "change the sign of one coordinate (or exchange two), or write sign and theta_deg of these joints in "
-                "robot.toml; a known direction in the instrument's frame, up for instance, tells which"
+                f"change the sign of one coordinate (or exchange two), or {remedy}; a known direction in the "
+                "instrument's frame, up for instance, tells which"
             )
-        return Better(what, remedy, mapping.nominal, mapping.left)
+        return Better(words, remedy, mapping.nominal, mapping.left)
     stated = float(misfits(robot, [points])[0])  # with zeros fitted, as of every other reading
     if not np.isfinite(stated):
         return None
@@ -427,34 +427,42 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         for readings in (_factors, _orders, _other_robots):
             if not left < BETTER * stated:
                 chain, left = _best(robot, points, list(readings(robot, points)))
-    if not left < BETTER * stated or (left > LEFT and not points.seen):
-        # a ready robot of nearly the same nominal parameters, a UR10 for a UR10e
-        own = misfit(robot, points)
-        for each in [] if points.seen else _other_robots(robot, points):
-            if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
-                left = misfit(each.robot, points)
-                if left < SIBLING_BETTER * own:
-                    return Better(each.what, each.remedy, own * points.extent, left * points.extent)
-        return None
-    # each mistake with what fits as well in its place: some are the same but for base and tool
+    if left < BETTER * stated and (left <= LEFT or points.seen):
+        return _told(robot, points, chain, stated, left)
+    return None if points.seen else _sibling(robot, points)
+
+
+def _sibling(robot: Robot, points: Points) -> Better | None:
+    """Return a ready robot of nearly the same nominal parameters that fits better, a UR10 for a UR10e."""
+    own = misfit(robot, points)
+    for each in _other_robots(robot, points):
+        if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
+            left = misfit(each.robot, points)
+            if left < SIBLING_BETTER * own:
+                return Better(each.what, each.remedy, own * points.extent, left * points.extent)
+    return None
+
+
+def _told(robot: Robot, points: Points, chain: Sequence[Reading], stated: float, left: float) -> Better:
+    """Return a chain of mistakes in words, each with what fits as well in its place: some differ by base and tool."""
     same = []
-    changed = points
     for i, each in enumerate(chain):
         behind = chain[i + 1 :]
+        changed = each.change(points)
         alike = [each]
         for other in each.others:
-            tried = other.change(changed)
-            as_many = len(tried.row) == len(each.change(changed).row)  # the mistakes behind it are of so many rows
-            if behind and as_many:
+            tried = other.change(points)
+            as_well = len(tried.row) == len(changed.row)  # the mistakes behind it are of so many rows
+            if behind and as_well:
                 whole = reduce(lambda now, mistake: mistake.change(now), behind, tried)
-                as_many = bool(misfits(robot, [whole])[0] <= SAME * left)
-            if as_many or not behind:
+                as_well = bool(misfits(robot, [whole])[0] <= SAME * left)
+            if as_well or not behind:
                 alike.append(other)
         same.append(alike)
-        changed = each.change(changed)
+        points = changed
     what = " and ".join(", or ".join(each.what for each in alike) for alike in same)
     remedy = "; ".join(", or ".join(each.remedy for each in alike) for alike in same)
-    return Better(what, remedy, stated * changed.extent, left * changed.extent)
+    return Better(what, remedy, stated * points.extent, left * points.extent)
 
 
 def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:

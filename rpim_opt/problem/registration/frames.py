@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -269,28 +269,40 @@ def starting_parameters(
         # a board or a camera that is turned otherwise is not in sight
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
-    entries: dict[str, tuple[str, float]] = {}
-    fixtures: set[str] = set()
-    for block in data.blocks:
-        kind = block.measurement
-        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
-        given: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
-        if names and not given and kind.start is not None:  # where the nominal robot puts the fixture
-            tool = numeric_frame(places[block.markers[0]])
-            T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
-            given = kind.start(T[:, :3, 3], block.y)
-            fixtures |= {names[name] for name in given}
-        for name, dimension in kind.parameters.items():
-            entries[names[name]] = (dimension, float(given.get(name, 0.0)))
+    values, fixtures = _of_measurements(robot, data, base, places, own)
     if temperature is None and len(data.temperatures):
         temperature = float(data.temperatures.mean())
     named = sorted({*data.sessions, *sessions})
     frames = dict.fromkeys(of_fixture(f"{name}_", b.fixture) for b in data.blocks for name in b.measurement.frames)
-    parameters = model_parameters(robot, base, tools, entries, tuple(frames), named, temperature)
-    if not fixtures:
-        return parameters
-    # Fixtures at the least squares of the nominal robot, reflectors fitted beside them: a start that takes reflectors
-    # for known is off by more than these are, a long cable's anchor by metres.
+    parameters = model_parameters(robot, base, tools, values, tuple(frames), named, temperature)
+    return _with_fitted(robot, data, parameters, fixtures) if fixtures else parameters
+
+
+def _of_measurements(
+    robot: Robot, data: Dataset, base: Place, tools: Mapping[str, Place], own: Mapping[str, float]
+) -> tuple[dict[str, tuple[str, float]], set[str]]:
+    """Return dimension and value [SI] of the measurements' own parameters, and which the nominal robot locates."""
+    values: dict[str, tuple[str, float]] = {}
+    located: set[str] = set()
+    for block in data.blocks:
+        kind = block.measurement
+        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
+        given: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
+        if names and not given and kind.start is not None:
+            tool = numeric_frame(tools[block.markers[0]])
+            T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
+            given = kind.start(T[:, :3, 3], block.y)
+            located |= {names[name] for name in given}
+        values |= {full: (kind.parameters[name], float(given.get(name, 0.0))) for name, full in names.items()}
+    return values, located
+
+
+def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: Collection[str]) -> Parameters:
+    """Return parameters with fixtures at the least squares of the nominal robot, reflectors fitted beside them.
+
+    A start that takes reflectors for known is off by more than these are, a long cable's anchor by metres. Gross
+    outliers are left out; where the data do not determine a fit, fixtures stay where they are.
+    """
     fitted = np.isin(parameters.names, list(fixtures))
     markers = {marker for block in data.blocks for marker in block.markers}
     reflectors = np.isin(parameters.names, [tool_prefix(marker) + c for marker in markers for c in "xyz"])
@@ -298,7 +310,7 @@ def starting_parameters(
     free = replace(parameters, identified=fitted | reflectors, scale=scale)
     problem = whole = CalibrationProblem(robot, free, data)
     x = np.zeros(len(free.free))
-    for _ in range(TRIMMED):  # gross outliers would pull the start
+    for _ in range(TRIMMED):
         try:
             x = settled(problem, STEPS)
             error = np.nan_to_num(whole.errors(x))
