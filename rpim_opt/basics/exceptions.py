@@ -12,6 +12,8 @@ from typing import NamedTuple, TypeVar
 Named = TypeVar("Named")
 LONGEST = 1000
 """Characters of a part of a sentence."""
+MANY = 24
+"""Names that are listed one by one."""
 LONGEST_COMPARED = 200
 """Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
 
@@ -155,12 +157,12 @@ class NoSolutionFound(RpimError):
         )
 
 
-def choices(found: str, known: Iterable[str], many: int = 24) -> str:
-    """Return the valid names as text; of more than ``many`` those similar to ``found`` and the number of the others."""
+def choices(found: str, known: Iterable[str]) -> str:
+    """Return the valid names as text; of more than `MANY` those similar to ``found`` and the number of the others."""
     names = list(known)
     found = found[:LONGEST_COMPARED]
     listed = ", ".join(names) or "nothing"
-    if len(names) > many:
+    if len(names) > MANY:
         near = difflib.get_close_matches(found, names, n=8, cutoff=0.0)
         listed = ", ".join(name for name in names if name in near) + f" and {len(names) - len(near)} others"
     close = difflib.get_close_matches(found, names, n=2, cutoff=0.6)

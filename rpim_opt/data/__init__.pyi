@@ -7,9 +7,9 @@ from .measurements.contact import KnownDistance as KnownDistance
 from .measurements.contact import touches as touches
 from .measurements.contact import with_known as with_known
 from .measurements.measurement import Measurement as Measurement
-from .noise import LaserTracker as LaserTracker
 from .record import HeldOut as HeldOut
 from .record import Record as Record
 from .record import Requirement as Requirement
 from .tables.formats.registry import TableOptions as TableOptions
+from .tables.reading import LaserTracker as LaserTracker
 from .tables.reading import read_data as read_data

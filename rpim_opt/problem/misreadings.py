@@ -29,9 +29,9 @@ STEPS, FIRST_STEPS, MANY = 20, 8, 40
 """Steps of a fit of base and reflectors, joint zeros too if they are free."""
 
 
-def placed(robot: Robot, points: Points, zeros: bool = False) -> Fit:
-    """Return where base and reflectors fit best, joint zeros too if asked; of poses their positions."""
-    fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, zeros=zeros, robust=True)
+def placed(robot: Robot, points: Points) -> Fit:
+    """Return where base and reflectors fit best; of poses their positions."""
+    fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
     every = 1 if points.turns is None else 4
     of_points = {name: getattr(fit, name)[0, ::every] for name in ("modelled", "error", "tools")}
     return Fit(*(each[0] for each in fit))._replace(**of_points)

@@ -32,7 +32,7 @@ from rpim_opt.problem.row_functions import (
     require_loads,
     require_same_torques,
 )
-from rpim_opt.robot.chain import ORIGIN, carried_by
+from rpim_opt.robot.chain import NEAR_PARALLEL, ORIGIN, carried_by
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import (
@@ -626,19 +626,20 @@ def _inverse_root(covariance: Array) -> Array:
         raise InputError("covariance", "a matrix that is not positive definite", "one that is") from None
 
 
-def near_parallel(robot: Robot, within: float = 0.1) -> tuple[str, ...]:
+def near_parallel(robot: Robot) -> tuple[str, ...]:
     """Return the Hayati parameters that a robot needs: ``beta{i}`` if the axes of joints i and i+1 are near parallel.
 
     Two parallel revolute axes have no single common normal: d and theta then change without bound under a small
-    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). ``within`` [rad] is how far
-    from parallel an axis pair still counts. None where the origins of a URDF's joints are identified.
+    tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). None where the origins of a URDF's
+    joints are identified.
     """
     if carried_by(robot.model.terms):
         return ()
     return tuple(
         f"beta{i}"
         for i in range(1, len(robot.mdh))
-        if abs(np.sin(robot.mdh[i, 0])) < np.sin(within) and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
+        if abs(np.sin(robot.mdh[i, 0])) < np.sin(NEAR_PARALLEL)
+        and robot.joint_types[i - 1 : i + 1] == ("revolute",) * 2
     )
 
 

@@ -46,13 +46,11 @@ def predicted(
     return Predicted(position - slope @ x, slope)
 
 
-def moved(
-    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, at: Array | None = None
-) -> Predicted:
+def moved(problem: CalibrationProblem, q: Array, marker: str | None, at: Array | None = None) -> Predicted:
     """Return the displacement of a reflector by the robot's parameters with frames fixed; arguments as before."""
     own = ~problem.parameters.free.of_frames
-    found = predicted(problem, q, marker, torque, None if at is None else at * own)
-    nominal = _there(problem, q, marker, torque).modelled(np.zeros(len(own)))[0]
+    found = predicted(problem, q, marker, at=None if at is None else at * own)
+    nominal = _there(problem, q, marker).modelled(np.zeros(len(own)))[0]
     return Predicted(found.position - nominal, found.slope * own)
 
 

@@ -16,7 +16,7 @@ from rpim_opt.data.measurements.camera import CAMERAS
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.pose import quaternion, rotation_between
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.data.noise import LaserTracker
+from rpim_opt.data.tables.reading import LaserTracker
 
 KINDS = [name for name in MEASUREMENTS if name not in CAMERAS]  # whose points have to be in sight: test_camera
 TYPES = ("revolute", "prismatic")

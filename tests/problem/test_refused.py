@@ -14,7 +14,7 @@ from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touche
 from rpim_opt.data.measurements.plane import plane
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
-from rpim_opt.data.noise import declared_noise
+from rpim_opt.data.tables.reading import declared_noise
 from rpim_opt.problem.blocks import partitions
 from rpim_opt.problem.registration.camera import posed, starting_camera
 from rpim_opt.problem.registration.frames import locate

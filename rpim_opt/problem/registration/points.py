@@ -94,7 +94,7 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
     return whole.take(np.argsort(whole.row, kind="stable")).evenly(most)
 
 
-def lengths_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
+def lengths_of(problem: CalibrationProblem) -> Points | None:
     """Return the lengths of a cable or of distances, all by the same reflectors and anchor; None for others, or few."""
     blocks = problem.data.blocks
     kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
@@ -115,7 +115,7 @@ def lengths_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | N
         row=row,
         names=tuple(names),
     )
-    return whole.take(np.argsort(row, kind="stable")).evenly(most)
+    return whole.take(np.argsort(row, kind="stable")).evenly(MOST_ROWS)
 
 
 def mirrored(points: Points) -> Points:
