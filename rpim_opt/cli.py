@@ -705,12 +705,12 @@ def compare(
     against: Annotated[Text, Option(help="Reference method, such as 'tikhonov, reml'.")] = None,
     workers: Workers = 1,
     resume: Resume = None,
-    out: Annotated[File, Option(help="Folder for the page, the replicates and the figure.")] = None,
+    out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,
     as_json: Json = False,
 ) -> Answer:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
-    With --out every replicate is written down when it is finished, and a page index.html in the end.
+    With --out every replicate is written down when it is finished, and README.md with the figure in the end.
     """
     from rpim_opt.study.comparison import compare
     from rpim_opt.study.methods import USUAL

@@ -17,7 +17,7 @@ import numpy as np
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import markdown
-from rpim_opt.calibration.baselines import gauss_newton, gradient_descent, linear_least_squares
+from rpim_opt.calibration.baselines import gauss_newton, linear_least_squares
 from rpim_opt.convex.rules.selection import weight_grid
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.store.problem_file import problems_folder
@@ -87,12 +87,36 @@ def raw_condition(problem: CalibrationProblem, units: tuple[float, float]) -> fl
     return float(np.linalg.cond(problem.linearize(np.zeros(len(free))).A / free.scale * columns))
 
 
+def gradient_descent(problem: CalibrationProblem, iterations: int = 1000) -> Array:
+    """Return the deviations (n,) of descent on the sum of squares in m and rad, with exact steps of the model."""
+    scale = problem.parameters.free.scale
+    x = np.zeros_like(scale)
+    model = problem.linearize(x)
+    r = -model.b
+    for _ in range(iterations):
+        J = model.A / scale
+        g = J.T @ r
+        if np.linalg.norm(g) <= 1e-12 * max(1.0, float(np.linalg.norm(r))):
+            break
+        step = -(g @ g) / float(np.sum((J @ g) ** 2)) * g
+        for _ in range(30):
+            model = problem.linearize(x + step)
+            after = model.A @ ((x + step) / scale) - model.b
+            if after @ after <= r @ r:
+                break
+            step = step / 2
+        else:
+            break
+        x, r = x + step, after
+    return x
+
+
 def _identified(problem: CalibrationProblem, weight: Any) -> dict[str, Array]:
     """Return the deviations (n,) [SI] by method; the one step in m and rad with the paper's last weight."""
     return {
         "NC": np.zeros(len(problem.parameters.free)),
         "LSM": linear_least_squares(problem).x,
-        "GD": gradient_descent(problem).x,
+        "GD": gradient_descent(problem),
         "GN": gauss_newton(problem).x,
         "GN, cut-off 1e-12": gauss_newton(problem, cutoff=1e-12).x,
         "Eq. (11) once": raw_path(problem, np.array([3.063e-14]), UNITS["m and rad"])[0],

@@ -13,7 +13,6 @@ from rpim_opt.problem.problem import CalibrationProblem
 
 __all__ = [
     "gauss_newton",
-    "gradient_descent",
     "levenberg_marquardt",
     "linear_least_squares",
 ]
@@ -77,36 +76,3 @@ def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
         residual, np.zeros_like(scale), jac=jac, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200
     )
     return Baseline(scale * found.x, int(found.nfev), "Levenberg-Marquardt")
-
-
-def gradient_descent(problem: CalibrationProblem, iterations: int = 1000, preconditioned: bool = False) -> Baseline:
-    """Gradient descent on the sum of squares, with exact steps of the linear model.
-
-    As in the paper it works on raw parameters (metres and radians); with ``preconditioned`` on deviations divided by
-    the column norms of the Jacobian, which is what makes it move at all along the weak directions.
-    """
-    scale = problem.parameters.free.scale
-    model = problem.linearize(np.zeros_like(scale))
-    unit = np.ones_like(scale)
-    if preconditioned:
-        norms = np.linalg.norm(model.A, axis=0) / scale
-        unit = 1 / np.where(norms > 0, norms, norms.max())
-    x, k = np.zeros_like(scale), 0
-    r = model.A @ (x / scale) - model.b
-    while k < iterations:
-        k += 1
-        J = model.A / scale * unit
-        g = J.T @ r
-        if np.linalg.norm(g) <= 1e-12 * max(1.0, float(np.linalg.norm(r))):
-            break
-        step = -(g @ g) / float(np.sum((J @ g) ** 2)) * g * unit
-        for _ in range(30):
-            model = problem.linearize(x + step)
-            after = model.A @ ((x + step) / scale) - model.b
-            if after @ after <= r @ r:
-                break
-            step = step / 2
-        else:
-            break
-        x, r = x + step, after
-    return Baseline(x, k, "gradient descent, preconditioned" if preconditioned else "gradient descent")

@@ -25,11 +25,11 @@ Block = tuple[str, Any]
 
 
 class Table(NamedTuple):
-    """Caption, header and rows of texts, or of texts with a class; with ``prose`` the last column is running text."""
+    """Caption, header and rows of texts; with ``prose`` the last column is running text."""
 
     caption: str
     header: Sequence[str]
-    rows: Sequence[Sequence[Any]]
+    rows: Sequence[Sequence[str]]
     prose: bool = False
 
 

@@ -14,12 +14,13 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import refused
-from rpim_opt.basics.tables import frame_of
-from rpim_opt.basics.text import counted, progress_bar
+from rpim_opt.basics.tables import csv_text, frame_of
+from rpim_opt.basics.text import counted, markdown, progress_bar
 from rpim_opt.study import replicates
-from rpim_opt.study.methods import FOLDER, USUAL, methods_of, metrics_of, replicate, sources_of, splits_of
-from rpim_opt.study.ranking import WITH_FIGURES, Summary, figures, summarize
+from rpim_opt.study.methods import FOLDER, METRICS, USUAL, methods_of, metrics_of, replicate, sources_of, splits_of
+from rpim_opt.study.ranking import WITH_FIGURES, Summary, figures, number, summarize
 from rpim_opt.study.replicates import Row, content_hash, require_package, run_cases
+from rpim_opt.study.studies import Report, write
 
 MOST_DRAWS = 100_000
 """Each is a calibration of its own, and is listed before the first begins."""
@@ -85,7 +86,7 @@ def compare(
     journal
         A file that every finished replicate is written to at once. A call with the same code and arguments goes on
         with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is refused, and
-        so is an argument whose content cannot be hashed. Code is that of the Python files that are loaded; other files
+        so is an argument that cannot be pickled. Code is that of the Python files that are loaded; other files
         that a function reads are not known to it.
     resume
         False to begin the journal anew; None refuses to drop what an interrupted run has computed.
@@ -143,7 +144,9 @@ def compare(
     code: dict[str, str] = {}
     if path is not None:
         require_package("joblib", "journal")
-        stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values()), "metrics": figured}
+        stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values())}
+        own = {name: metric for name, metric in figured.items() if METRICS.get(name) is not metric}
+        stated["metrics"] = tuple(figured), own
         hashes = {f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}
         code = replicates.package_code() | replicates.script_code() | hashes
         with refused(path):
@@ -194,9 +197,9 @@ class Comparison:
     Comparison: 2 methods on 1 problem, 10 replicates (10 ok)
     >>> found.summary().standings[0].method, len(found.to_frame()), len(found.plot("max_mm").axes)
     ('tikhonov, learned', 10, 1)
-    >>> page = found.report("arms_compared")
-    >>> page.name, sorted(path.name for path in page.parent.iterdir())
-    ('index.html', ['comparison.png', 'comparison.svg', 'index.html', 'replicates.csv'])
+    >>> written = found.report("arms_compared")
+    >>> written.name, sorted(path.name for path in written.parent.iterdir())
+    ('README.md', ['README.md', 'comparison.png', 'comparison.svg', 'metrics.json', 'replicates.csv'])
     """
 
     rows: tuple[Row, ...]
@@ -242,13 +245,33 @@ class Comparison:
         return comparison_figure(self.rows, self.summary(metric, against))
 
     def report(self, folder: str | Path, metric: str | None = None, against: str | None = None) -> Path:
-        """Write a page ``index.html`` that needs no network, with ``replicates.csv`` and the figure; return its path.
+        """Write ``README.md`` with the summary and the medians by problem, the figure, and ``replicates.csv``.
 
-        The folder is made; other arguments as for `summary`.
+        The folder is made; other arguments as for `summary`. Return the path of ``README.md``.
         """
-        from rpim_opt.study.figures import write_page
-
-        return write_page(Path(folder), self.rows, self.summary(metric, against), self.asked, self.made)
+        summary = self.summary(metric, against)
+        of = figures(self.rows, summary.metric)
+        medians = []
+        for each in summary.standings:
+            by_problem = [[v for pair, v in of[each.method].items() if pair[0] == name] for name in self.problems]
+            medians.append([each.method, *(number(float(np.median(v))) if v else "-" for v in by_problem)])
+        text = "\n\n".join([
+            f"{summary.metric} of the held-out rows; * 95 % interval excludes 1",
+            markdown(summary.header, summary.cells()),
+            *summary.notes,
+            f"Median {summary.metric} by problem:",
+            markdown(["method", *self.problems], medians),
+            *(f"{name}: {what}" for name, what in self.asked.items()),
+        ])  # fmt: skip
+        names = list(self.rows[0])
+        cells = [["" if row[name] is None else str(row[name]) for name in names] for row in self.rows]
+        where = ", ".join(self.problems) if len(self.problems) <= 3 else f"{len(self.problems)} problems"
+        ratios = {each.method: each.ratio for each in summary.standings if each.ratio is not None}
+        report = Report(text, ratios, {"comparison": self.plot(metric, against)})
+        made = "\n\n".join(f"{name}: {what}" for name, what in self.made.items())
+        title = f"{len(self.methods)} methods on {where}"
+        write(Path(folder), title, report, made, {"replicates.csv": csv_text(names, cells).encode()})
+        return Path(folder) / "README.md"
 
     def reference(self, metric: str | None = None, against: str | None = None) -> str:
         """Return the label of the method that others are compared with; arguments as for `summary`."""

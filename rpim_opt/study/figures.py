@@ -1,11 +1,9 @@
-"""Figures and page of a comparison, and figures of studies (imported only when drawing)."""
+"""Figures of comparisons and studies (imported only when drawing)."""
 
 from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
-from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,17 +11,12 @@ from matplotlib import rc_context
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarFormatter, StrMethodFormatter
 
-from rpim_opt.basics.files import refused, write_files
-from rpim_opt.basics.tables import csv_text
-from rpim_opt.report.page import HEIGHT, Block, Table, figure, render
-from rpim_opt.study.ranking import Rows, Summary, figures, number
+from rpim_opt.study.ranking import Rows, Summary, figures
 
 ROW_INCHES = 0.25
 """Height of a method."""
 LARGEST_RATIO = 30.0
 """Ratios beyond are drawn at the edge, with an arrow."""
-SHADES = (1.02, 1.1, 1.3, 2.0, 5.0)
-"""Ratios to the best of a problem between which a cell's shade changes."""
 
 
 def picture(figure: Any, name: str, kind: str) -> bytes:
@@ -64,15 +57,10 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
 
 
 def comparison_figure(rows: Rows, summary: Summary) -> Any:
-    """Return the figure: methods from best to worst, with every replicate's ratio to the reference."""
+    """Return the figure: methods from best to worst, ratios of replicates as dots, the mean with its interval."""
     height = max(ROW_INCHES * len(summary.standings) + 1.5, 3.5)
     figure = Figure(figsize=(7, height), dpi=150, layout="constrained")
-    _ratios(rows, summary, figure.add_subplot())
-    return figure
-
-
-def _ratios(rows: Rows, summary: Summary, ax: Any) -> None:
-    """Draw every replicate's ratio as a dot, and the mean with its interval."""
+    ax = figure.add_subplot()
     of = figures(rows, summary.metric)
     other = of[summary.reference]
     top = len(summary.standings) - 1
@@ -110,80 +98,8 @@ def _ratios(rows: Rows, summary: Summary, ax: Any) -> None:
     ax.xaxis.set_minor_locator(NullLocator())
     ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
     ax.xaxis.set_minor_formatter(NullFormatter())
+    return figure
 
 
 def _inside(ratios: Any) -> Any:
     return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
-
-
-# --- the page --------------------------------------------------------------------------------------------------------
-
-RATIOS = (
-    "Metric of every replicate over that of the reference on the same data, and the geometric mean with its "
-    "95 % interval (green or red if the interval excludes 1)."
-)
-
-
-def write_page(
-    folder: Path, rows: Rows, summary: Summary, axes: Mapping[str, str], provenance: Mapping[str, str]
-) -> Path:
-    """Write the page, the replicates and the figure into a folder: all of them, or none; return the page's path."""
-    problems = list(dict.fromkeys(row["problem"] for row in rows))
-    where = ", ".join(problems) if len(problems) <= 3 else f"{len(problems)} problems"
-    heading = f"{len({row['method'] for row in rows})} methods on {where}"
-    height = max(18.0 * len(summary.standings) + 90, HEIGHT)
-    ratios = figure(partial(_ratios, rows, summary), "Ratios to the reference by method", RATIOS, height)
-    title = f"{summary.metric} of the held-out rows; * 95 % interval excludes 1"
-    ranking: list[Block] = [("table", Table(title, summary.header, summary.cells())), ("bullets", summary.notes)]
-    sections: list[tuple[str, list[Block]]] = [
-        ("Methods", ranking),
-        ("By problem", [("table", _medians(rows, summary, problems))]),
-        ("Provenance", [("facts", [*axes.items(), *provenance.items()])]),
-    ]
-    top: list[Block] = [("lead", {"text": headline(summary), "alarm": False}), ("figures", [ratios])]
-    kind = f"Comparison of calibrations, {provenance.get('Made', '')[:10]}"
-    drawing = comparison_figure(rows, summary)
-    names = list(rows[0])
-    cells = [["" if row[name] is None else str(row[name]) for name in names] for row in rows]
-    files = {
-        "index.html": render(f"Comparison: {heading}", kind, heading, top, sections).encode(),
-        "replicates.csv": csv_text(names, cells).encode(),
-        "comparison.svg": picture(drawing, "comparison", "svg"),
-        "comparison.png": picture(drawing, "comparison", "png"),
-    }
-    with refused(folder):
-        write_files({folder / name: content for name, content in files.items()})
-    return folder / "index.html"
-
-
-def headline(summary: Summary) -> str:
-    """Return sentences on the best method."""
-    best = summary.standings[0]
-    better = [each for each in summary.standings if each.different and (each.ratio or 1) < 1]
-    if best.method == summary.reference and not better:
-        return f"No method is better than {summary.reference} in the geometric mean of {summary.metric}."
-    between = ""
-    if best.low is not None and best.high is not None:
-        between = f" (95 % interval {number(best.low)} to {number(best.high)})"
-    chance = "" if best.different else " These replicates do not show a significant difference."
-    return (
-        f"{best.method} has the lowest {summary.metric}: {number(best.ratio)} times that of {summary.reference} in the "
-        f"geometric mean{between}.{chance}"
-    )
-
-
-def _medians(rows: Rows, summary: Summary, problems: list[str]) -> Table:
-    """Return every method's median on every problem, shaded by how near it is to the best."""
-    of = figures(rows, summary.metric)
-    table: list[list[Any]] = [[each.method] for each in summary.standings]
-    for problem in problems:
-        values = [[v for pair, v in of[each.method].items() if pair[0] == problem] for each in summary.standings]
-        medians = [float(np.median(each)) if each else None for each in values]
-        best = max(min((m for m in medians if m is not None), default=1.0), np.finfo(float).tiny)
-        for cells, median in zip(table, medians, strict=True):
-            shade = ("-", "none")
-            if median is not None:
-                shade = (number(median), f"shade{np.searchsorted(SHADES, median / best)}")
-            cells.append(shade)
-    caption = f"Median {summary.metric} by problem; darker is farther from the best"
-    return Table(caption, ["method", *problems], table)

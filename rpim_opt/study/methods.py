@@ -295,10 +295,14 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
             methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
     for label, each in _listed(functions):
         name, function = _named(label, each, BASELINES, "methods", "the problem")
-        methods.append(Method(name, lambda instance, function=function: function(instance.problem)))
+        methods.append(Method(name, partial(_of_problem, function)))
     if not methods:
         raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
     return each_once("methods", methods, "...")
+
+
+def _of_problem(function: Callable[[CalibrationProblem], Any], instance: Instance) -> Any:
+    return function(instance.problem)
 
 
 def _listed(stated: Any) -> list[tuple[str, Any]]:

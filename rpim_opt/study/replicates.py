@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import pickle
 import platform
 import signal
 import sqlite3
@@ -17,10 +18,7 @@ from datetime import UTC, datetime
 from hashlib import sha256
 from importlib.util import find_spec
 from pathlib import Path
-from types import FunctionType, MappingProxyType
 from typing import Any
-
-import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, RpimError
 from rpim_opt.basics.files import LARGEST_DATA, parse_json, refused, require_file
@@ -264,55 +262,25 @@ def script_code() -> dict[str, str]:
 
 
 def content_hash(thing: Any, where: str) -> str:
-    """Return the SHA-256 of a value or an object by joblib, which hashes what can be pickled.
+    """Return the hash of a value or an object by joblib, of what can be pickled.
 
-    Functions count by their names, defaults and closures: their code is that of `script_code`. InputError names what
-    has no content that can be hashed, such as a generator, and functions of an interactive session, which has no file.
+    Functions count by their names: their code is that of `script_code`. InputError for what cannot be pickled, such as
+    a lambda or a generator, and for functions of an interactive session, which has no file.
     """
     from joblib.hashing import NumpyHasher
 
     class Hasher(NumpyHasher):
-        def save(self, obj: Any) -> None:
-            if isinstance(obj, MappingProxyType):
-                obj = dict(obj)
-            elif isinstance(obj, frozenset):
-                obj = (frozenset, sorted(content_hash(each, where) for each in obj))
-            elif isinstance(obj, np.ndarray):  # joblib tells layouts apart, and sees no mask
-                obj = np.ascontiguousarray(obj) if type(obj) is np.ndarray else (type(obj), obj.__reduce__())
-            try:
-                super().save(obj)
-            except InputError:
-                raise
-            except Exception as error:  # of any library's own making
-                found = f"a {type(obj).__module__}.{type(obj).__qualname__}, whose content cannot be hashed ({error})"
-                accepted = "arguments that joblib can hash by their content, or no journal"
-                raise InputError(where, found, accepted) from None
+        def reducer_override(self, obj: Any) -> Any:
+            own = type(obj).__module__.startswith("rpim_opt.") and type(obj).__reduce__ is object.__reduce__
+            if own and is_dataclass(obj) and not isinstance(obj, type):  # without what it cached
+                return type(obj), tuple(getattr(obj, each.name) for each in fields(obj))
+            return NotImplemented
 
-        def reducer_override(self, thing: Any) -> Any:
-            if isinstance(thing, FunctionType):
-                if thing.__module__ == "__main__" and not hasattr(sys.modules["__main__"], "__file__"):
-                    raise InputError(where, f"{thing.__qualname__} of an interactive session", "functions of a file")
-                content: Any = (thing.__module__, thing.__qualname__, thing.__defaults__, thing.__kwdefaults__)
-                content += (_closure(thing), dict(vars(thing)))
-            elif type(thing).__module__.startswith("rpim_opt.") and is_dataclass(thing) and not isinstance(thing, type):
-                content = {each.name: getattr(thing, each.name) for each in fields(thing)}  # without what it cached
-            else:
-                return NotImplemented
-            return _Content, (type(thing).__qualname__,), content  # as a state: circles end
-
-    return str(Hasher("sha256").hash(thing))
-
-
-class _Content:
-    """Stands for a thing of which the content follows."""
-
-    def __init__(self, kind: str) -> None:
-        self.kind = kind
-
-
-def _closure(function: FunctionType) -> dict[str, Any]:
-    found = {}
-    for name, cell in zip(function.__code__.co_freevars, function.__closure__ or (), strict=True):
-        with suppress(ValueError):  # it holds nothing yet
-            found[name] = cell.cell_contents
-    return found
+    try:
+        session = not hasattr(sys.modules["__main__"], "__file__")
+        if not (session and b"__main__" in pickle.dumps(thing)):
+            return str(Hasher("sha256").hash(thing))
+        found = "a function of an interactive session"
+    except Exception as error:  # of any library's own making
+        found = f"something that cannot be pickled ({error})"
+    raise InputError(where, found, "what can be pickled, with functions of a file by their names; or no journal")

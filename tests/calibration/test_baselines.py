@@ -13,10 +13,6 @@ PROBLEM, TRUTH = simulated(("a[234]", "d5", "theta[23]"), noise=1e-6, sigma=1e-6
 SCALE = PROBLEM.parameters.free.scale
 
 
-def squares(x: np.ndarray) -> float:
-    return float(np.sum(PROBLEM.whitened_residual(x) ** 2))
-
-
 def test_one_linear_step_is_that_of_the_normal_equations() -> None:
     m = PROBLEM.linearize(0 * SCALE)
     found = baselines.linear_least_squares(PROBLEM)
@@ -28,30 +24,9 @@ def test_one_linear_step_is_that_of_the_normal_equations() -> None:
 def test_passes_are_counted_and_limited() -> None:
     for most in (1, 2, 3):
         assert baselines.gauss_newton(PROBLEM, iterations=most, tolerance=0.0).iterations == most
-        found = baselines.gradient_descent(PROBLEM, iterations=most)
-        assert (found.iterations, found.method) == (most, "gradient descent")
     loose = baselines.gauss_newton(PROBLEM, tolerance=1e-1)
     tight = baselines.gauss_newton(PROBLEM)
     assert loose.iterations < tight.iterations < 20
-
-
-def test_a_step_of_descent_is_the_exact_one_of_the_linear_model() -> None:
-    m = PROBLEM.linearize(0 * SCALE)
-    for preconditioned in (False, True):
-        J = m.A / SCALE
-        unit = 1 / np.linalg.norm(J, axis=0) if preconditioned else np.ones(len(SCALE))
-        J = J * unit
-        g = -J.T @ m.b
-        want = -(g @ g) / np.sum((J @ g) ** 2) * g * unit
-        found = baselines.gradient_descent(PROBLEM, iterations=1, preconditioned=preconditioned)
-        assert found.x == pytest.approx(want, rel=1e-9)
-        assert found.method.endswith("preconditioned") == preconditioned
-
-
-def test_descent_falls_at_every_step() -> None:
-    falls = [squares(baselines.gradient_descent(PROBLEM, iterations=k, preconditioned=True).x) for k in range(5)]
-    assert (np.diff(falls) < 0).all()
-    assert falls[-1] < 0.1 * falls[0]
 
 
 def test_all_end_where_the_data_decide() -> None:

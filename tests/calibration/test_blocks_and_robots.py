@@ -11,7 +11,6 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import influence, likely_causes
-from rpim_opt.calibration.baselines import gradient_descent
 from rpim_opt.calibration.held_out import refit_all
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.data.record import Requirement
@@ -102,15 +101,3 @@ def test_influence_of_a_loss_by_equation_is_that_of_the_squares_it_ends_with() -
     assert found.weight.argmin() == 7
     with pytest.raises(ro.InputError, match="a loss that weighs its equations"):
         influence(replace(robust, formulation=replace(stated, loss=lambda r: cp.norm2(r) + cp.max(r))))
-
-
-def test_a_descent_that_has_arrived_stops() -> None:
-    exact = one(0.0)
-    settled = gradient_descent(exact.on(replace(exact.data, blocks=(at_nominal(exact),))), 50)
-    assert not settled.x.any()
-
-
-def at_nominal(problem: ro.CalibrationProblem) -> object:
-    """Return the first block as the nominal robot would be seen."""
-    y = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
-    return replace(problem.data.blocks[0], y=y)

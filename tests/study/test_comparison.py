@@ -7,7 +7,6 @@ import math
 import sqlite3
 import warnings
 from contextlib import closing
-from html import unescape
 from pathlib import Path
 
 import cvxpy as cp
@@ -241,16 +240,22 @@ def test_a_killed_comparison_goes_on_with_equal_results(tmp_path: Path) -> None:
     assert len(entries(journal)) == 16
 
 
+class Ridge:
+    """A method with a matrix."""
+
+    def __init__(self, size: float):
+        self.matrix = scipy.sparse.diags_array(np.full(34, size))
+
+    def __call__(self, problem: ro.CalibrationProblem) -> np.ndarray:
+        return ro.calibrate(problem, ro.tikhonov, self.matrix.trace()).x
+
+
 def test_a_journal_returns_no_figures_of_another_matrix(tmp_path: Path) -> None:
     journal = tmp_path / "journal.sqlite"
 
     def errors(size: float) -> float:
-        matrix = scipy.sparse.diags_array(np.full(34, size))
-
-        def ridge(problem: ro.CalibrationProblem) -> np.ndarray:
-            return ro.calibrate(problem, ro.tikhonov, matrix.trace()).x
-
-        return ro.compare("position", selectors=1.0, methods=[ridge], journal=journal, progress=False).rows[1]["rms_mm"]
+        asked = {"selectors": 1.0, "methods": {"ridge": Ridge(size)}, "journal": journal, "progress": False}
+        return ro.compare("position", **asked).rows[1]["rms_mm"]
 
     before = errors(1e-3)
     assert errors(1e-3) == before
@@ -263,7 +268,7 @@ def test_a_journal_returns_no_figures_of_another_matrix(tmp_path: Path) -> None:
 def test_what_a_journal_cannot_know_is_refused_before_anything_is_computed(tmp_path: Path) -> None:
     numbers = (k for k in range(3))
     asked = {"problems": "position", "selectors": 1.0, "methods": {"mine": lambda problem: [next(numbers)] * 34}}
-    with pytest.raises(ro.InputError, match=r"journal: found a builtins.generator, whose content cannot be hashed"):
+    with pytest.raises(ro.InputError, match="journal: found something that cannot be pickled"):
         ro.compare(**asked, journal=tmp_path / "journal.sqlite", progress=False)
     assert ro.compare(**asked, progress=False).rows[1]["status"] == "ok"
 
@@ -412,14 +417,11 @@ def test_few_problems_say_that_intervals_are_of_these() -> None:
 
 
 @pytest.mark.slow
-def test_a_report_is_a_page_that_loads_nothing(tmp_path: Path) -> None:
-    nasty = "<script>alert(1)</script>"
-    found = ro.compare({nasty: "position"}, ["tikhonov", "lasso"], ["learned", "reml"], splits=5, progress=False)
-    page = found.report(tmp_path / "out").read_text()
-    assert nasty not in page
-    assert "default-src 'none'" in unescape(page)
-    for part in ("Provenance", "SHA-256", "Selector reml: found formulation", "<img"):
-        assert part in page
+def test_a_report_is_written_whole_and_again(tmp_path: Path) -> None:
+    found = ro.compare("position", ["tikhonov", "lasso"], ["learned", "reml"], splits=5, progress=False)
+    text = found.report(tmp_path / "out").read_text()
+    for part in ("Package: rpim-opt", "SHA-256", "Selector reml: found formulation", "(comparison.svg)"):
+        assert part in text
     lines = (tmp_path / "out" / "replicates.csv").read_text().splitlines()
     assert len(lines) == 1 + 20
     before = {path.name: path.read_bytes() for path in (tmp_path / "out").iterdir()}
@@ -439,7 +441,7 @@ def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
     said = capsys.readouterr().out
     assert "Comparison: 4 methods on 1 problem, 4 replicates (3 ok, 1 impossible)" in said
     assert sorted(path.name for path in out.iterdir()) == [
-        "comparison.png", "comparison.svg", "index.html", "replicates.csv",
+        "README.md", "comparison.png", "comparison.svg", "metrics.json", "replicates.csv",
     ]  # fmt: skip
     assert run(monkeypatch, *asked[:-2], "--splits", "2", "--seeds", "2", "--json") == 0
     document = json.loads(capsys.readouterr().out)
