@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -15,9 +15,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
-from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import Quadratic
-from rpim_opt.problem.blocks import Source
 from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
 FIXED = -1
@@ -285,36 +283,8 @@ def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
 # --- an earlier result -----------------------------------------------------------------------------------------------
 
 
-class Result(Protocol):
-    """Protocol of the attributes of a `Calibration` that priors and model comparison use."""
-
-    @property
-    def problem(self) -> Source:
-        """The calibrated problem."""
-        ...
-
-    @property
-    def x(self) -> Array:
-        """Deviations (n,) [SI]."""
-        ...
-
-    @property
-    def program(self) -> Program:
-        """The convex program at the solution."""
-        ...
-
-    @property
-    def learned(self) -> Any:
-        """The estimated hyperparameters (`Learned`), or None."""
-
-    @cached_property
-    def flagged(self) -> Sequence[Any]:
-        """Outliers, each with a ``label``."""
-        ...
-
-    @cached_property
-    def spread(self) -> Any:
-        """The equations and the penalty of the fit (`Spread`); InputError for a fit without covariance."""
+Result = Any
+"""A `Calibration`, which is defined above this folder."""
 
 
 def posterior(result: Result, inflate: float, without: Sequence[str], noise: float | None) -> Statement:

@@ -199,6 +199,24 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
+        straight, promised = self._promise(state)
+        choice, length = state.choice, state.relative(float(np.linalg.norm(straight - state.z)))
+        accuracy, best = self._accuracy(state)
+        nothing = promised <= accuracy
+        over = nothing or length <= self.options.tolerance
+        if state.damping > 0 and over:
+            return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
+        state = replace(state, idle=state.idle + 1 if nothing else 0)
+        at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.stalled(accuracy, np.isfinite(best))
+        if choice.settled and at_rest:
+            return replace(state, outcome="rest")
+        waiting = choice.settled and not choice.final and not choice.answers
+        if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
+            return self.answered(replace(state, idle=0))
+        return self._stepped(state, straight, promised, over, nothing)
+
+    def _promise(self, state: State) -> tuple[Array, float]:
+        """Return the minimum (n,) of the convex program, and by how much the objective falls there if that holds."""
         # the first linearization is good for a rough minimum, unless that promises too little to judge by
         rough = 0.0 if state.history or state.refused or self.options.solver else FIRST_ACCURACY
         straight = self._solved(state.program, state, rough)
@@ -206,19 +224,10 @@ class Loop:
         if rough and promised <= 10 * rough * abs(state.merit):
             straight = self._solved(state.program, state)
             promised = state.merit - state.program.objective(straight, state.choice.weight)
-        length = state.relative(float(np.linalg.norm(straight - state.z)))
-        short = length <= self.options.tolerance
-        accuracy, best = self._accuracy(state)
-        nothing = promised <= accuracy
-        if state.damping > 0 and (short or nothing):
-            return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
-        state = replace(state, idle=state.idle + 1 if nothing else 0)
-        at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.stalled(accuracy, np.isfinite(best))
-        if state.choice.settled and at_rest:
-            return replace(state, outcome="rest")
-        waiting = state.choice.settled and not state.choice.final and not state.choice.answers
-        if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
-            return self.answered(replace(state, idle=0))
+        return straight, promised
+
+    def _stepped(self, state: State, straight: Array, promised: float, over: bool, nothing: bool) -> State:
+        """Step to a minimum if the nonlinear objective falls, else damp; ``over``: a short step, or no fall."""
         z = self._curved(state, straight)
         candidate = state.program.on(self.linearized(z, state.z))
         after = candidate.objective(z, state.choice.weight)
@@ -231,10 +240,11 @@ class Loop:
         damping = damped(state.damping, gain, promised, effect)
         state = replace(state, damping=damping, evaluations=state.evaluations + 1)
         if after <= state.merit + rounding:
+            short = state.relative(float(np.linalg.norm(straight - state.z))) <= self.options.tolerance
             return self._accepted(state, candidate, z, after, short)
         state = replace(state, refused=state.refused + 1)
         hopeless = state.refused > MANY_REFUSED and promised <= DECREASE * max(abs(state.merit), 1.0)
-        if short or nothing or hopeless:  # none was promised: the loop is at rest
+        if over or hopeless:  # none was promised: the loop is at rest
             if state.choice.settled:
                 return replace(state, outcome="rest")
             return replace(state, choice=state.choice.after(0.0))

@@ -201,47 +201,51 @@ class _Reader:
         while relation := self._next("=", "<=", ">="):
             relations.append(relation)
             sides.append(self._side())
-        tolerance = None
-        if self._next("+-"):
-            tolerance = self._constant(self._sum())
+        tolerance = self._constant(self._sum()) if self._next("+-") else None
         self._require_end()
+        if not relations and tolerance is not None:  # 'd5 +- 0.1 mm'
+            relations, sides = ["="], [*sides, ("", (Sum(nominal=1),))]
         if not relations:
-            if tolerance is None:
-                raise self._wrong("no =, <= or >=")
-            relations = ["="]
-            sides.append(("", (Sum(nominal=1),)))  # 'd5 +- 0.1 mm'
+            raise self._wrong("no =, <= or >=")
         if tolerance is not None and relations != ["="]:
             raise self._wrong("a tolerance without =", "'= 850.00 +- 0.05 mm'")
         if relations[0] == ">=":
             sides = sides[::-1]
-        limit = 0.0
-        kind: Kind = "most"
-        if any(opening for opening, _ in sides):  # an absolute value or norm is at most a number
-            if len(relations) > 1:
-                raise self._wrong(" and ".join(relations), "one relation after an absolute value or norm")
-            (opening, sums), (other, large) = sides
-            if relations[0] == "=" or not opening or other:
-                raise self._wrong("a constraint that is not convex", "an absolute value or norm <= a number")
-            limit = self._constant(large[0])
-            if not limit > 0:
-                raise self._wrong(f"a limit of {limit:g}", "a positive limit; '=' for equality")
-            kind = "within" if opening == "|" and len(sums) == 1 else "norm"
+        if any(opening for opening, _ in sides):
+            found = self._bounded(sides, relations)
         else:
-            if len(set(relations)) > 1 or len(relations) > (1 if "=" in relations else 2):
-                accepted = "one relation, or a chain like '89.9 deg <= alpha2 <= 90.1 deg'"
-                raise self._wrong(" and ".join(relations), accepted)
-            pairs = list(pairwise(each for _, (each,) in sides))
-            if any(left.nominal and right.nominal for left, right in pairs):
-                raise self._wrong("nominal on both sides", "on one of them")
-            sums = tuple(left.plus(right, -1) for left, right in pairs)
-            if "=" in relations:
-                limit = tolerance or 0.0
-                kind = "within" if limit else "equal"
-            if limit < 0:
-                raise self._wrong("a negative tolerance", "a positive tolerance")
-        for each in sums:
+            found = self._chain([each for _, (each,) in sides], relations, tolerance or 0.0)
+        for each in found.sums:
             self._checked(each)
-        return Sentence(kind, sums, limit, self.unit)
+        return found
+
+    def _bounded(self, sides: list[tuple[str, tuple[Sum, ...]]], relations: list[str]) -> Sentence:
+        """Return that an absolute value or norm is at most a number."""
+        if len(relations) > 1:
+            raise self._wrong(" and ".join(relations), "one relation after an absolute value or norm")
+        (opening, sums), (other, large) = sides
+        if relations[0] == "=" or not opening or other:
+            raise self._wrong("a constraint that is not convex", "an absolute value or norm <= a number")
+        limit = self._constant(large[0])
+        if not limit > 0:
+            raise self._wrong(f"a limit of {limit:g}", "a positive limit; '=' for equality")
+        return Sentence("within" if opening == "|" and len(sums) == 1 else "norm", sums, limit, self.unit)
+
+    def _chain(self, sides: list[Sum], relations: list[str], tolerance: float) -> Sentence:
+        """Return that sums are equal, to a tolerance, or each at most the next."""
+        equal = "=" in relations
+        if len(set(relations)) > 1 or len(relations) > (1 if equal else 2):
+            accepted = "one relation, or a chain like '89.9 deg <= alpha2 <= 90.1 deg'"
+            raise self._wrong(" and ".join(relations), accepted)
+        pairs = list(pairwise(sides))
+        if any(left.nominal and right.nominal for left, right in pairs):
+            raise self._wrong("nominal on both sides", "on one of them")
+        if tolerance < 0:
+            raise self._wrong("a negative tolerance", "a positive tolerance")
+        kind: Kind = "most"
+        if equal:
+            kind = "within" if tolerance else "equal"
+        return Sentence(kind, tuple(left.plus(right, -1) for left, right in pairs), tolerance, self.unit)
 
     def _side(self) -> tuple[str, tuple[Sum, ...]]:
         """Return a sum, or with the sign of what they stand in, sums between bars or in ``norm(...)``."""

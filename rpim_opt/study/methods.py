@@ -211,12 +211,8 @@ def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
 # --- methods ---------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Answer:
-    """Result of a method: errors (N,) of data by dimension [m or rad], and its calibration, if any."""
-
-    errors: Callable[[Dataset, str], Array]
-    result: Calibration | None = None
+Answer = tuple[Callable[[Dataset, str], Array], Calibration | None]
+"""Errors (N,) of data by dimension [m or rad] that a method leaves, and its calibration, if any."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,16 +237,16 @@ def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
     n = len(problem.parameters.free)
     accepted = f"{n} finite deviations [SI], or a function from joint values (N, dof) to positions (N, 3) [m]"
     if isinstance(returned, Calibration):
-        return Answer(returned.errors, returned)
+        return returned.errors, returned
     if callable(returned):
-        return Answer(partial(_predicted, returned))
+        return partial(_predicted, returned), None
     try:
         x = np.asarray(getattr(returned, "x", returned), dtype=float)
     except (TypeError, ValueError):
         raise InputError(where, f"a {type(returned).__name__}", accepted) from None
     if x.shape != (n,) or not np.isfinite(x).all():
         raise InputError(where, f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}", accepted)
-    return Answer(lambda data, dimension: problem.on(data).errors(x, dimension))
+    return lambda data, dimension: problem.on(data).errors(x, dimension), None
 
 
 def _predicted(predict: Callable[[Array], Any], data: Dataset, dimension: str) -> Array:
@@ -352,8 +348,8 @@ def _selector(label: str, each: Any) -> tuple[str, Any]:
 class Fitted:
     """Argument of metrics: the result of a method, and the held-out data.
 
-    The ``problem`` was fitted and the rows ``held_out`` were not; ``answer`` has the method's errors of data, and the
-    ``result`` of a calibration; ``seconds`` is its time.
+    The ``problem`` was fitted and the rows ``held_out`` were not; ``errors_of`` gives the method's errors of data,
+    ``result`` is a calibration's; ``seconds`` is its time.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -366,16 +362,17 @@ class Fitted:
 
     problem: CalibrationProblem
     held_out: Dataset
-    answer: Answer
+    errors_of: Callable[[Dataset, str], Array]
+    result: Calibration | None
     seconds: float
 
     def errors(self, dimension: str = "length") -> Array:
         """Return the errors (N,) of the rows that were held out, in m, or in rad for ``"angle"``; NaN without any."""
-        return self.answer.errors(self.held_out, dimension)
+        return self.errors_of(self.held_out, dimension)
 
     def fit_errors(self) -> Array:
         """Return the errors (N,) [m] of the identification rows."""
-        return self.answer.errors(self.problem.data, "length")
+        return self.errors_of(self.problem.data, "length")
 
 
 def _p95(fitted: Fitted) -> float | None:
@@ -385,8 +382,7 @@ def _p95(fitted: Fitted) -> float | None:
 
 
 def _coverage(fitted: Fitted) -> float | None:
-    result = fitted.answer.result
-    share = None if result is None else validate(result, fitted.held_out).coverage
+    share = None if fitted.result is None else validate(fitted.result, fitted.held_out).coverage
     return None if share is None else 100 * share
 
 
@@ -415,7 +411,7 @@ def measure(instance: Instance, answer: Answer, seconds: float, metrics: Mapping
     """Return the metrics of a result; None for a metric that is not finite."""
     if instance.validation is None:
         raise InputError("splits", "nothing held out", "validation data")
-    fitted = Fitted(instance.problem, instance.validation, answer, seconds)
+    fitted = Fitted(instance.problem, instance.validation, *answer, seconds)
     values = {name: metric(fitted) for name, metric in metrics.items()}
     return {name: float(v) if v is not None and np.isfinite(v) else None for name, v in values.items()}
 
@@ -438,10 +434,11 @@ def replicate(
         values = measure(instance, answer, seconds, metrics)
         row["configurations"] = len(np.unique(instance.problem.data.configuration))
         row["parameters"] = len(instance.problem.parameters.free)
-        if answer.result is not None:
-            row["weight"] = float(answer.result.weight)
-            if not answer.result.converged:
-                row |= {"status": UNCONVERGED, "reason": answer.result.message}
+        result = answer[1]
+        if result is not None:
+            row["weight"] = float(result.weight)
+            if not result.converged:
+                row |= {"status": UNCONVERGED, "reason": result.message}
         return {**row, **values}
     except InputError as error:
         row |= {"status": IMPOSSIBLE, "reason": str(error)}

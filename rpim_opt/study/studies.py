@@ -7,7 +7,7 @@ import importlib.util
 import io
 import os
 import sys
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import lru_cache, partial
@@ -130,20 +130,19 @@ def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
 def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     """Return digests of the files that a study depends on, by their names in its folder.
 
-    That is whatever lies in its folder. Where the study says ``DEPENDS = ["data/*.csv"]``, it is that and Python files;
-    hidden files never count, results of studies where they are named.
+    That is whatever lies in its folder but hidden files and results of studies. Where the study says ``DEPENDS =
+    ["data/*.csv"]``, it is that and Python files.
     """
     folder = path.parent
     stated = getattr(study, "DEPENDS", None)
-    files = set(_beside(folder))
-    if stated is not None:
-        files = {file for file in files if file.suffix == ".py"}
-        for pattern in stated:
-            matches = [Path(match) for match in glob.glob(str(folder / pattern), recursive=True)]
-            if not matches and not glob.has_magic(str(pattern)):
-                raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
-            for match in matches:
-                files.update(_beside(match, results=True) if match.is_dir() else [match])
+    files = _matching(folder, "**" if stated is None else "**/*.py")
+    results = {file.parent for file in files if file.name.startswith(f"{REPLICATES}.")}
+    files = {file for file in files if not results.intersection(file.parents)}
+    for pattern in map(str, stated or ()):
+        named = _matching(folder, pattern) | _matching(folder, f"{pattern}/**")
+        if not named and not glob.has_magic(pattern):
+            raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
+        files |= named
     digests = {}
     for file in sorted(files):
         name = os.path.relpath(file, folder)
@@ -153,20 +152,15 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     return digests
 
 
-def _beside(folder: Path, results: bool = False) -> Iterator[Path]:
-    """Yield the files in a folder and below it, with or without results of studies."""
-    count = 0
-    for place, folders, names in os.walk(folder):
-        folders[:] = [name for name in folders if not name.startswith((".", "__pycache__"))]
-        if not results and any(name.startswith(f"{REPLICATES}.") for name in names):
-            folders.clear()
-            continue
-        files = [Path(place, name) for name in names if not name.startswith(".")]
-        count += len(files)
-        if count > MOST_FILES:
-            found = f"more than {MOST_FILES} files in {folder}"
-            raise InputError("DEPENDS", found, "DEPENDS = [...] in the study: names of the files that it reads")
-        yield from filter(Path.is_file, files)
+def _matching(folder: Path, pattern: str) -> set[Path]:
+    """Return the files that match a pattern, without hidden and compiled ones."""
+    found: set[Path] = set()
+    for match in glob.iglob(str(folder / pattern), recursive=True):
+        found.add(Path(match))
+        if len(found) > MOST_FILES:
+            accepted = "DEPENDS = [...] in the study: names of the files that it reads"
+            raise InputError("DEPENDS", f"more than {MOST_FILES} files in {folder}", accepted)
+    return {file for file in found if file.is_file() and file.suffix != ".pyc"}
 
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:

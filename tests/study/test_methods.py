@@ -61,11 +61,11 @@ def test_what_is_no_answer_is_refused(returned: Any) -> None:
 
 def test_predictions_have_the_shape_of_positions() -> None:
     assert POSITION.validation is not None
-    wrong = Fitted(POSITION.problem, POSITION.validation, answer_of(lambda q: q, POSITION.problem, ""), 0.0)
+    wrong = Fitted(POSITION.problem, POSITION.validation, *answer_of(lambda q: q, POSITION.problem, ""), 0.0)
     with pytest.raises(ro.InputError, match="predicted positions"):
         wrong.errors()
     pose = ro.load("pose")
     assert pose.validation is not None
-    other = Fitted(pose.problem, pose.validation, answer_of(lambda q: q[:, :3], pose.problem, ""), 0.0)
+    other = Fitted(pose.problem, pose.validation, *answer_of(lambda q: q[:, :3], pose.problem, ""), 0.0)
     with pytest.raises(ro.InputError, match="one reflector"):
         other.errors()
