@@ -240,7 +240,9 @@ def _budget(map_: Workspace, result: Calibration) -> Table:
             cells += [f"{1e3 * np.sqrt(max(own, 0.0)):.4f}", f"{100 * max(own, 0.0) / total:.1f} %"]
         rows.append(cells)
     head = ["contributor", "u [mm], maximum U", "share of u²", "u [mm], region (RMS)", "share of u²"]
-    return Table("Uncertainty budget of the position reached (GUM, u over all three axes)", head, rows)
+    factor = map_.largest / np.sqrt(whole[-1])
+    title = f"Uncertainty budget of the position reached (GUM, u over all three axes; maximum U = {factor:.2f} u)"
+    return Table(title, head, rows)
 
 
 # --- parameters --------------------------------------------------------------------------------------------
