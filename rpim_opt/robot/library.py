@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -72,20 +71,13 @@ def read_arm(
     return Described(read_robot(file), np.zeros(6), np.zeros(6))
 
 
-class RobotSource(NamedTuple):
-    """The robot of a new problem folder: the file to copy as robot.toml, and its origin."""
-
-    file: Path
-    origin: str
-
-
-def find_source(robot: str | Path) -> RobotSource:
-    """Return the source of a robot that a command or a script names: a ready one by name, or a file."""
+def find_source(robot: str | Path) -> Path:
+    """Return the file of a robot that a command or a script names: of a ready one by name, or a file."""
     robot = str(robot)
     if not robot.endswith(ROBOT_FILES):
-        return RobotSource(find_robot(robot), f"a copy of the ready robot {robot}")
+        return find_robot(robot)
     file = Path(robot)
     if not file.exists():
         raise InputError("the robot", "no such file", f"a file {', '.join(ROBOT_FILES)}, or a ready robot", file)
     require_file(file)
-    return RobotSource(file, f"modified DH table, from {file.name}")
+    return file

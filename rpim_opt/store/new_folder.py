@@ -40,7 +40,7 @@ from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, 
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
-from rpim_opt.robot.library import RobotSource, find_source, read_arm
+from rpim_opt.robot.library import READY, find_source, read_arm
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import frame_of
 from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
@@ -113,12 +113,15 @@ def new_problem(
     """
     folder = Path(folder)
     source = find_source(robot)
-    before = _with_chains(folder, source.file, chain)
-    chain = chain or branching_tip(source.file, urdf_base, urdf_tip)
+    drawing = f"a copy of the ready robot {source.stem}"
+    if source.parent != READY:
+        drawing = f"modified DH table, from {source.name}"
+    before = _with_chains(folder, source, chain)
+    chain = chain or branching_tip(source, urdf_base, urdf_tip)
     options = options or TableOptions()
     if validation is not None and hold_out is not None:
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
-    arm = read_arm(source.file, urdf_base, urdf_tip, dh, origins=bool(chain))
+    arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
     paths = [data] if isinstance(data, str | Path) else data
     found = understand_of(arm, paths, measurement, options)
     if understood is not None:
@@ -160,7 +163,7 @@ def new_problem(
         "robot": ROBOT_OF_CHAINS if chain else "robot.toml",
         "identification": names[IDENTIFICATION],
         "target": board.stated,
-        "drawing": f"a copy of {source.file.name}" if chain else source.origin,
+        "drawing": f"a copy of {source.name}" if chain else drawing,
         "columns": how,
         "data": Path(found.file).name,
         "count": len(rows),
@@ -215,18 +218,16 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
     return read_bytes(folder / "problem.toml")
 
 
-def _write_whole(
-    folder: Path, contents: Mapping[str, bytes], arm: Described, source: RobotSource, chains: bool
-) -> None:
+def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: Described, source: Path, chains: bool) -> None:
     """Write a new folder with its robot beside its place, and move it there when it is whole."""
     with ExitStack() as stack:
         make_folder(folder.parent, stack.enter_context(undoing()))
         made = stack.enter_context(scratch_folder(folder)) / folder.name
         write_files({made / name: content for name, content in contents.items()})
         if chains:
-            write_bytes(made / ROBOT_OF_CHAINS, read_bytes(source.file))
-        elif source.file.suffix == ".toml":
-            write_text(made / "robot.toml", read_text(source.file))  # with its comments
+            write_bytes(made / ROBOT_OF_CHAINS, read_bytes(source))
+        elif source.suffix == ".toml":
+            write_text(made / "robot.toml", read_text(source))  # with its comments
         else:
             write_robot(arm.robot, made / "robot.toml")
         made.rename(folder)

@@ -148,7 +148,7 @@ def understand_tables(
     >>> found.notes
     ('joined by label: 2 rows of 2 with joints and 2 measured.',)
     """
-    arm = read_arm(find_source(robot).file, urdf_base, urdf_tip, dh)
+    arm = read_arm(find_source(robot), urdf_base, urdf_tip, dh)
     found = understand_of(arm, data, measurement, options)
     if not found.kind.by_camera:  # what it sees is another table
         rows_of(found, found.columns, arm, found.kind)

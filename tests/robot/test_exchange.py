@@ -628,7 +628,7 @@ def test_ros_kinematics_in_and_out(tmp_path: Path) -> None:
 def test_a_command_takes_the_drivers_file_as_robot(tmp_path: Path) -> None:
     path = tmp_path / "kinematics.yaml"
     path.write_text(YAML_PLAIN)
-    arm = read_arm(find_source(str(path)).file)
+    arm = read_arm(find_source(str(path)))
     assert np.array_equal(arm.robot.mdh, ro.robot.read_ur_kinematics(path).robot.mdh)
 
 
