@@ -20,7 +20,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import WRONG, better_reading, coupling, misfit, placed, signs
+from rpim_opt.problem.misreadings import WRONG, better_reading, coupling, fit_points, misfit, signs
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
@@ -455,7 +455,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None:
         return
-    found = placed(problem.robot, points)
+    found = fit_points(problem.robot, points)
     label = [problem.data.label[i] for i in points.row]
     far = np.flatnonzero(found.error > FAR * np.median(found.error))
     pairs = []
@@ -591,7 +591,7 @@ def _values_that_fit(robot: Robot, points: Points, joint: int) -> Array:
     steps = np.linspace(-1, 1, GRID)
     around: Any = 0.0
     for _ in range(MOST_ROUNDS):
-        fit = placed(robot, replace(points, q=q))
+        fit = fit_points(robot, replace(points, q=q))
         tries = np.repeat(q[:, None], GRID, axis=1)
         tries[..., joint] = around + width * steps
         frames = fit.base @ forward_kinematics(robot, tries.reshape(-1, robot.dof))
@@ -627,7 +627,7 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
             for k in _places(len(rows))}  # fmt: skip
     place = min(left, key=left.__getitem__)
     if left[place] < FITS * whole:
-        first, second = (placed(problem.robot, points.take(part)) for part in (rows[:place], rows[place:]))
+        first, second = (fit_points(problem.robot, points.take(part)) for part in (rows[:place], rows[place:]))
         if points.lengths:
             far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
             other, what = "anchor", "the anchor or the robot's base moved"
@@ -656,7 +656,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
         return
     flange = forward_kinematics(robot, points.q)
     for count in (2, 3):
-        named, marker, fit = points, points.marker, placed(robot, points)
+        named, marker, fit = points, points.marker, fit_points(robot, points)
         for _ in range(MOST_ROUNDS):
             frames = fit.base @ flange
             seen = np.einsum("nij,ni->nj", frames[:, :3, :3], points.y - frames[:, :3, 3])
@@ -668,7 +668,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
             if named is not points and (marker == before).all():
                 break
             named = replace(points, marker=marker, tools=tools)
-            fit = placed(robot, named)
+            fit = fit_points(robot, named)
         sizes = np.bincount(marker, minlength=count)
         if sizes.min() >= FEWEST // 2 and misfit(robot, named) < FITS * whole:
             far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()
@@ -690,7 +690,7 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     fitting = [k for k in _places(len(rows)) if misfit(problem.robot, points.take(rows[:k])) < FITS * whole]
     if not fitting:
         return
-    error = placed(problem.robot, points.take(rows[: max(fitting)])).error
+    error = fit_points(problem.robot, points.take(rows[: max(fitting)])).error
     start = int(np.flatnonzero(error <= FAR * np.median(error)).max()) + 1
     better = better_reading(problem.on(problem.data.take(points.row[start:])))
     if better is not None:

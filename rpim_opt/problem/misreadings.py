@@ -29,7 +29,7 @@ STEPS, FIRST_STEPS, MANY = 20, 8, 40
 """Steps of a fit of base and reflectors, joint zeros too if they are free."""
 
 
-def placed(robot: Robot, points: Points) -> Fit:
+def fit_points(robot: Robot, points: Points) -> Fit:
     """Return where base and reflectors fit best; of poses their positions."""
     fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
     every = 1 if points.turns is None else 4
@@ -125,7 +125,7 @@ DEGREES_PER_MM = np.radians(1) / 1e-3
 """Radians that a metre stands for where millimetres were degrees."""
 
 
-class Reading(NamedTuple):
+class Misreading(NamedTuple):
     """Another interpretation: the mistake, the remedy, the resulting points, and equally good interpretations.
 
     ``robot`` is another nominal robot, on which joint zeros are not fitted.
@@ -135,7 +135,7 @@ class Reading(NamedTuple):
     remedy: str
     change: Callable[[Any], Any] = lambda points: points
     robot: Robot | None = None
-    others: tuple[Reading, ...] = ()
+    others: tuple[Misreading, ...] = ()
 
 
 class Better(NamedTuple):
@@ -165,12 +165,12 @@ class Better(NamedTuple):
 # What a table may be mistaken for
 
 
-def _readings(robot: Robot, points: Points) -> list[Reading]:
+def _readings(robot: Robot, points: Points) -> list[Misreading]:
     """Return all single mistakes that are looked for."""
     readings = [*_of_joints(robot), *_of_rows(len(points.row), robot.dof)]
     if points.seen:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
-        return [*readings, Reading("the camera and the board exchanged", remedy, _inverted)]
+        return [*readings, Misreading("the camera and the board exchanged", remedy, _inverted)]
     if points.lengths:
         for factor, (unit, _) in LENGTHS.items():
             remedy = f"multiply column distance by {factor:g} or name its unit"
@@ -182,16 +182,16 @@ def _readings(robot: Robot, points: Points) -> list[Reading]:
     return readings
 
 
-def _of_joints(robot: Robot) -> Iterator[Reading]:
+def _of_joints(robot: Robot) -> Iterator[Misreading]:
     """Yield readings with other joint values: units, signs, orders, couplings; zeros are fitted."""
 
-    def of(what: str, remedy: str, M: Array) -> Reading:
-        return Reading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
+    def of(what: str, remedy: str, M: Array) -> Misreading:
+        return Misreading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
 
     turning = np.array(robot.joint_dimensions) == "angle"
     eye = np.eye(robot.dof)
     remedy = "sum them up from row to row"
-    yield Reading(
+    yield Misreading(
         "joint values read as absolute, not as increments", remedy, lambda of: replace(of, q=np.cumsum(of.q, axis=0))
     )
     for factor, (unit, remedy) in ANGLES.items():
@@ -234,7 +234,7 @@ def coupling(joint_map: Array) -> str:
     return f"write coupling = [{rows}] in robot.toml"
 
 
-def _of_positions() -> Iterator[Reading]:
+def _of_positions() -> Iterator[Misreading]:
     """Yield readings with other measured positions: units of all columns or one, handedness."""
     for factor, (unit, remedy) in LENGTHS.items():
         yield _scaled(f"measured lengths {unit}", remedy, factor)
@@ -254,25 +254,25 @@ def _of_positions() -> Iterator[Reading]:
         return replace(points, y=np.column_stack([radius * np.cos(angle), radius * np.sin(angle), height]))
 
     what = "columns x, y, z that are radius, angle and height (cylindrical coordinates)"
-    yield Reading(what, "convert them to x, y, z", from_cylinder)
+    yield Misreading(what, "convert them to x, y, z", from_cylinder)
     remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
-    yield Reading("columns x, y, z that are azimuth, elevation and distance", remedy, from_angles)
+    yield Misreading("columns x, y, z that are azimuth, elevation and distance", remedy, from_angles)
     remedy = "change the sign of one coordinate, or exchange two"
-    yield Reading("the measured frame mirrored (left-handed)", remedy, mirrored)
+    yield Misreading("the measured frame mirrored (left-handed)", remedy, mirrored)
 
 
-def _scaled(what: str, remedy: str, factors: Array | float) -> Reading:
-    return Reading(what, remedy, lambda points: replace(points, y=points.y * factors))
+def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
+    return Misreading(what, remedy, lambda points: replace(points, y=points.y * factors))
 
 
-def _of_poses() -> Iterator[Reading]:
+def _of_poses() -> Iterator[Misreading]:
     """Yield readings with other orientations."""
 
-    def turned(what: str, remedy: str, change: Callable[[Array], Array]) -> Reading:
+    def turned(what: str, remedy: str, change: Callable[[Array], Array]) -> Misreading:
         def changed(points: Points) -> Points:
             return points if points.turns is None else replace(points, turns=change(points.turns))
 
-        return Reading(what, remedy, changed)
+        return Misreading(what, remedy, changed)
 
     def euler(axes: str, factor: float = 1.0) -> Callable[[Array], Array]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
@@ -289,7 +289,9 @@ def _of_poses() -> Iterator[Reading]:
         "invert the rotations, or the order of the quaternion is the other one (wxyz, xyzw)",
         lambda turns: np.swapaxes(turns, 1, 2),
     )
-    yield Reading("transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted)
+    yield Misreading(
+        "transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted
+    )
     for order in map("".join, permutations("xyz")):
         for kind, axes in (("fixed", order), ("moving", order.upper())):
             if axes not in ("xyz", "ZYX"):  # one and the same: roll, pitch, yaw
@@ -306,11 +308,11 @@ def _inverted(points: Points) -> Points:
     return replace(points, y=-np.einsum("nij,nj->ni", back, points.y), turns=back)
 
 
-def _of_rows(count: int, dof: int) -> Iterator[Reading]:
+def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
     """Yield readings with joint values of other rows: shifted, one column or all, reversed, in the order of texts."""
 
-    def of(what: str, remedy: str, joints: np.ndarray, values: np.ndarray) -> Reading:
-        return Reading(what, remedy, lambda points: replace(points.take(values), q=points.q[joints]))
+    def of(what: str, remedy: str, joints: np.ndarray, values: np.ndarray) -> Misreading:
+        return Misreading(what, remedy, lambda points: replace(points.take(values), q=points.q[joints]))
 
     rows = np.arange(count)
     for k in range(1, min(3, count - 6) + 1):
@@ -326,7 +328,7 @@ def _of_rows(count: int, dof: int) -> Iterator[Reading]:
             return replace(points, q=q).take(rows[:-1] if by > 0 else rows[1:])
 
         what = f"column q{i + 1} one row too {low} in the table"
-        yield Reading(what, f"move column q{i + 1} one row {back}", slipped)
+        yield Misreading(what, f"move column q{i + 1} one row {back}", slipped)
     yield of("the rows of joint values in the reverse order", "reverse the order of one of the two", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
@@ -334,7 +336,7 @@ def _of_rows(count: int, dof: int) -> Iterator[Reading]:
     yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
 
 
-def _factors(robot: Robot, points: Points) -> Iterator[Reading]:
+def _factors(robot: Robot, points: Points) -> Iterator[Misreading]:
     """Yield readings with a column, all angles or all lengths times a factor that fits: other units, counts, gears."""
     eye = np.eye(robot.dof)
     turning = np.array(robot.joint_dimensions) == "angle"
@@ -359,10 +361,10 @@ def _factors(robot: Robot, points: Points) -> Iterator[Reading]:
             factor = near[int(np.argmin(misfits(robot, [times(what, each, few) for each in near])))]
             ratio **= 0.25
         remedy = f"multiply {what} by {factor:.5g}, or name the unit"
-        yield Reading(f"{what} in another unit or scale", remedy, partial(times, what, factor))
+        yield Misreading(f"{what} in another unit or scale", remedy, partial(times, what, factor))
 
 
-def _orders(robot: Robot, points: Points) -> Iterator[Reading]:
+def _orders(robot: Robot, points: Points) -> Iterator[Misreading]:
     """Yield all orders of up to six turning joints."""
     del points
     if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
@@ -373,10 +375,10 @@ def _orders(robot: Robot, points: Points) -> Iterator[Reading]:
         def change(points: Points, columns: tuple[int, ...] = columns) -> Points:
             return replace(points, q=points.q[..., columns])
 
-        yield Reading(f"joints in the order {names}", f"name the columns {names}", change)
+        yield Misreading(f"joints in the order {names}", f"name the columns {names}", change)
 
 
-def _other_robots(robot: Robot, points: Points) -> Iterator[Reading]:
+def _other_robots(robot: Robot, points: Points) -> Iterator[Misreading]:
     """Yield the table in the other Denavit-Hartenberg convention, and the ready robots with such joints."""
     del points
     for which, shift, end, remedy in (
@@ -387,11 +389,11 @@ def _other_robots(robot: Robot, points: Points) -> Iterator[Reading]:
         mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
         mdh[end, :2] = 0.0
         what = f"a table in the {which} Denavit-Hartenberg convention"
-        yield Reading(what, remedy, robot=replace(robot, mdh=mdh))
+        yield Misreading(what, remedy, robot=replace(robot, mdh=mdh))
     for name in robots():
         ready = read_robot(READY / f"{name}.toml")
         if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
-            yield Reading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', robot=ready)
+            yield Misreading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', robot=ready)
 
 
 # Which of these fits
@@ -443,7 +445,7 @@ def _sibling(robot: Robot, points: Points) -> Better | None:
     return None
 
 
-def _told(robot: Robot, points: Points, chain: Sequence[Reading], stated: float, left: float) -> Better:
+def _told(robot: Robot, points: Points, chain: Sequence[Misreading], stated: float, left: float) -> Better:
     """Return a chain of mistakes in words, each with what fits as well in its place: some differ by base and tool."""
     same = []
     for i, each in enumerate(chain):
@@ -465,9 +467,9 @@ def _told(robot: Robot, points: Points, chain: Sequence[Reading], stated: float,
     return Better(what, remedy, stated * points.extent, left * points.extent)
 
 
-def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading], float]:
+def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Misreading], float]:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
-    chain: list[Reading] = []
+    chain: list[Misreading] = []
     best = stated
     changed = points
     while len(chain) < MISTAKES[points.seen] and best >= min(BETTER * stated, WRONG):
@@ -491,7 +493,7 @@ def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Reading
     return chain, best
 
 
-def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[list[Reading], float]:
+def _best(robot: Robot, points: Points, readings: list[Misreading]) -> tuple[list[Misreading], float]:
     """Return the reading that fits best, if any does, and how badly; few rows choose whom more rows compare."""
     size = _tried(robot, points, readings, FEW)
     least = float(size.min(initial=np.inf))
@@ -504,7 +506,7 @@ def _best(robot: Robot, points: Points, readings: list[Reading]) -> tuple[list[R
     return [near[k]._replace(others=tuple(each for each in same if each is not near[k])[:3])], float(whole[k])
 
 
-def _tried(robot: Robot, points: Points, readings: Sequence[Reading], most: int = FEW) -> Array:
+def _tried(robot: Robot, points: Points, readings: Sequence[Misreading], most: int = FEW) -> Array:
     """Return how badly readings fit, from so many rows."""
     tries = [each.change(points).evenly(most) for each in readings]
     found = np.full(len(readings), np.inf)

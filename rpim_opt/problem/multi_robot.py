@@ -133,11 +133,10 @@ def _concatenated(tables: Sequence[Parameters]) -> Parameters:
     def listed(what: str) -> list[Any]:
         return list(chain.from_iterable(getattr(table, what) for table in tables))
 
-    return Parameters(
-        names=tuple(listed("names")), dimensions=tuple(listed("dimensions")),
-        **{what: tuple(dict.fromkeys(listed(what))) for what in ("own_frames", "terms", "unstated_tools")},
-        **{what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")},
-    )  # fmt: skip
+    fields: dict[str, Any] = {what: tuple(listed(what)) for what in ("names", "dimensions")}
+    fields |= {what: tuple(dict.fromkeys(listed(what))) for what in ("own_frames", "terms", "unstated_tools")}
+    fields |= {what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")}
+    return Parameters(**fields)
 
 
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:

@@ -262,7 +262,7 @@ def require_columns(columns: Mapping[str, str], where: str) -> None:
             raise InputError(f"{where}, column {name}", repr(dimension), f"'' (no unit), {', '.join(DISPLAY)}")
 
 
-def moved(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
+def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.SX | None:
     """Return the motion of a term, (1, 1) or (6, 1); None if its parameters are all zero."""
     sizes = [value(name) for name in term.names(joint.number)]
     # an effect may take a whole chain to write down: not for a parameter that is not there
@@ -419,7 +419,7 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    more = moved(term, Joint(i, configuration), ca.SX.sym)
+                    more = term_motion(term, Joint(i, configuration), ca.SX.sym)
                     if more is not None:
                         moves = ca.vertcat(moves, more)
         return Dependencies(
@@ -480,6 +480,6 @@ def displacement(
 ) -> ca.SX | None:
     """Return the sum of the motions of all terms of joint or link i; None without any."""
     own = [term for term in terms if term.at == at and i in term.places(joint_types)]
-    parts = [moved(term, Joint(i, configuration), value) for term in own]
+    parts = [term_motion(term, Joint(i, configuration), value) for term in own]
     parts = [part for part in parts if part is not None]
     return sum(parts[1:], parts[0]) if parts else None

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import misfit, placed
+from rpim_opt.problem.misreadings import fit_points, misfit
 from rpim_opt.problem.registration.points import FEWEST_ROWS, Points, points_of
 from tests.simulate import ARM
 
@@ -34,7 +34,7 @@ def measured(count: int = 24, moved: float = 0.0, seed: int = 0) -> Points:
 @pytest.mark.parametrize("moved", [0.0, 0.003])
 def test_base_and_reflectors_come_back(moved: float) -> None:
     points = measured(moved=moved)
-    found = placed(ARM, points)
+    found = fit_points(ARM, points)
     assert found.error.max() < 1e-4 * (moved > 0) + 1e-7
     assert found.base == pytest.approx(BASE, abs=1e-4 * (moved > 0) + 1e-7)
     assert found.tools == pytest.approx(TOOLS, abs=1e-4 * (moved > 0) + 1e-7)
@@ -45,7 +45,7 @@ def test_blunders_stand_out_and_move_nothing() -> None:
     points = measured(40)
     y = points.y.copy()
     y[[4, 17, 30]] += [0.3, -0.4, 0.2]
-    found = placed(ARM, replace(points, y=y))
+    found = fit_points(ARM, replace(points, y=y))
     far = np.linalg.norm([0.3, -0.4, 0.2])
     assert found.error[[4, 17, 30]] == pytest.approx(far, abs=1e-3)
     assert np.delete(found.error, [4, 17, 30]).max() < 1e-3
@@ -55,7 +55,7 @@ def test_blunders_stand_out_and_move_nothing() -> None:
 def test_the_misfit_is_of_the_best_three_quarters_over_the_extent() -> None:
     points = measured(30)
     noisy = replace(points, y=points.y + 1e-3 * np.random.default_rng(2).normal(size=(30, 3)))
-    error = np.sort(placed(ARM, noisy).error)[: int(np.ceil(0.75 * 30))]
+    error = np.sort(fit_points(ARM, noisy).error)[: int(np.ceil(0.75 * 30))]
     extent = np.linalg.norm(np.std(noisy.y, axis=0))
     assert misfit(ARM, noisy) == pytest.approx(np.sqrt(np.mean(error**2)) / extent, rel=1e-9)
 

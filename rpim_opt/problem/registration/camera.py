@@ -125,7 +125,7 @@ def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
     return pose_at(found.x), float(2 * found.cost)
 
 
-def views(data: Dataset, block: Block) -> Iterator[np.ndarray]:
+def rows_by_view(data: Dataset, block: Block) -> Iterator[np.ndarray]:
     """Yield the entries of a camera's block that were seen in one configuration."""
     configuration = data.configuration[block.row]
     for number in np.unique(configuration):
@@ -143,7 +143,7 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     points = targets(block)
     middle, axes, planar = _plane(points)
     unit = _scaled(block.y)
-    for view in views(data, block):
+    for view in rows_by_view(data, block):
         if planar and len(view) >= FEWEST[True]:
             seen = np.hstack([block.y[view], np.ones((len(view), 1))]) @ unit.T
             H = _linear((points[view] - middle) @ axes[:2].T, seen[:, :2])
@@ -191,7 +191,7 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
             _, _, planar = _plane(points)
             covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
             found = []  # the first entry of each view, and its pose
-            for view in views(data, block):
+            for view in rows_by_view(data, block):
                 if len(view) >= FEWEST[planar]:
                     with suppress(InputError):  # points on a line
                         found.append((int(view[0]), view_pose(points[view], xy[view])))
