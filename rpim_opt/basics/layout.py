@@ -11,8 +11,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.tables import Columns, Grid, is_numeral, list_of_numbers, matlab_columns, read_columns, read_grid
+from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6
@@ -29,6 +31,8 @@ SUMMARIES = frozenset({
     "spannweite", "moyenne", "écarttype", "media", "promedio", "平均", "最大", "最小", "标准差", "標準偏差",
 })  # fmt: skip
 """What a row begins with that is no measurement, letters alone."""
+MOST_SUMMARIES, FEWEST_ROWS, SAME = 6, 6, 1e-3
+"""Such rows at most, rows above them at least, and the part of a column's spread by which its mean may be rounded."""
 COMMENT = ("//", "#", "%", "!", "*")
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """How tables say that there is no value."""
@@ -191,8 +195,8 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     try:
         if columns is None and path.suffix.lower() == ".parquet":
             columns = read_columns(path)
-        elif columns is None and path.suffix.lower() == ".mat":
-            columns = matlab_columns(path)
+        elif columns is None and path.suffix.lower() in (".mat", ".npz"):
+            columns = array_columns(path)
         if columns is not None:
             found = [Column(name, Head(name), cells) for name, cells in columns.items()]
         else:
@@ -223,6 +227,8 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
     heads, above = _heads(grid, numeric, options)
     full = [i for i in numeric if _letters(next(filter(None, grid.rows[i]))) not in SUMMARIES]
     columns, mark = _columns([grid.rows[i] for i in full], heads, options)
+    full = full[: len(full) - _summaries(columns)]
+    columns = [each._replace(cells=each.cells[: len(full)]) for each in columns]
     left = sorted(set(range(numeric[0], len(grid.rows))) - set(full))
     notes = [*grid.notes, *_notes(grid, above, left, options)]
     if mark == ",":
@@ -236,6 +242,18 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
             units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
             notes.append(f"units above the header: {stated[1]}.")
     return columns, notes, units
+
+
+def _summaries(columns: Sequence[Column]) -> int:
+    """Return how many rows at the end are means, extremes or spreads of all rows above, whatever they are called."""
+    table = np.array([[numeral(cell) for cell in each.cells] for each in columns if _is_numeric(each.cells)]).T
+    for count in range(min(MOST_SUMMARIES, len(table) - FEWEST_ROWS), 0, -1):
+        above, row = table[:-count], table[-count]
+        spread, there = above.std(axis=0), np.isfinite(row)
+        for each in (above.mean(axis=0), spread, above.min(axis=0), above.max(axis=0)):
+            if there.sum() > 2 and (np.abs(row - each) <= SAME * spread)[there].all():
+                return count
+    return 0
 
 
 def _letters(cell: str) -> str:

@@ -18,8 +18,9 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
 from itertools import islice
 from pathlib import Path
+from string import ascii_letters
 from typing import Any, NamedTuple
-from zipfile import ZipFile
+from zipfile import BadZipFile, ZipFile
 
 import numpy as np
 import scipy
@@ -44,9 +45,18 @@ SAMPLE_CHARACTERS = 2**16
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
-THOUSANDS = re.compile(r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|±(?=\s*\d)")
-"""Signs between thousands that are no decimal marks, and that before an uncertainty."""
-LIST_OPENS = re.compile(r"[\[({][\s\d.+\-\[({]")
+NO_NUMBER = re.compile(
+    r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|±(?=\s*\d)|(?<=\d)[ \t]+#[^\n,;|\t]*$", re.MULTILINE
+)
+"""Signs between thousands that are no decimal marks, that before an uncertainty, and a comment behind a row."""
+FORTRAN = re.compile(r"(?<=\d)[dD](?=[+-]\d)")
+"""The sign of an exponent of double precision, 0.15D+01."""
+SEXAGESIMAL = re.compile(r"(\d+)°\s*(\d+)['\u2032]\s*(\d+(?:[.,]\d+)?)(?:\"|\u2033|'')")
+"""Degrees, minutes and seconds."""
+FOREIGN = re.compile(rb"[\x80-\xff]{4,}")
+"""So many letters beyond ASCII follow each other in no Western European word."""
+LIST_OPENS = re.compile(r"[a-zA-Z]*[\[({][\s\d.+\-\[({]")
+ENCODINGS = "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chinese), cp1251 (Russian), utf-16, ..."
 ZEROS = bytes(8)
 """No text has so many zeros in a row, in whatever encoding."""
 ROW_OF_NUMBERS = 1 / 3
@@ -170,16 +180,24 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
 # --- files as people have them -------------------------------------------------------------------------------------
 
 
-def matlab_columns(path: Path) -> Columns:
-    """Return the arrays of numbers of a MATLAB file, those of the most common length, as ``q_1, q_2, ...``."""
+def array_columns(path: Path) -> Columns:
+    """Return the arrays of numbers of a MATLAB or NumPy file, of the most common length, as ``q_1, q_2, ...``."""
     require_file(path, LARGEST_DATA)
-    accepted = "a file that MATLAB saved with -v7 and variables of numbers, a row a configuration"
+    accepted = "a file that MATLAB saved with -v7, or NumPy's savez, with variables of numbers, a row a configuration"
     try:
-        sizes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind in ("double", "single")}
-        if sum(map(math.prod, sizes.values())) > MOST_CELLS:
-            raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
-        arrays = scipy.io.loadmat(path, variable_names=list(sizes)) if sizes else {}
-    except (OSError, ValueError, TypeError, NotImplementedError, MemoryError) as error:
+        if path.suffix.lower() == ".npz":
+            with ZipFile(path) as archive:
+                if sum(entry.file_size for entry in archive.infolist()) > 8 * MOST_CELLS:
+                    raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
+            with np.load(path, allow_pickle=False) as file:
+                arrays = {name: np.atleast_2d(file[name].T).T for name in file.files if file[name].dtype.kind == "f"}
+            sizes = {name: array.shape for name, array in arrays.items()}
+        else:
+            sizes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind in ("double", "single")}
+            if sum(map(math.prod, sizes.values())) > MOST_CELLS:
+                raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
+            arrays = scipy.io.loadmat(path, variable_names=list(sizes)) if sizes else {}
+    except (OSError, ValueError, TypeError, NotImplementedError, MemoryError, BadZipFile) as error:
         raise InputError("the file", _first_line(error), accepted) from None
     rows = Counter(shape[0] for shape in sizes.values() if len(shape) == 2 and shape[0] > 1)
     columns: dict[str, Sequence[Any]] = {}
@@ -201,7 +219,8 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
     whole, said = decoded(path, encoding)
-    text = THOUSANDS.sub("", whole)
+    whole = SEXAGESIMAL.sub(_decimal, whole)
+    text = FORTRAN.sub("e", NO_NUMBER.sub("", whole))
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
@@ -212,6 +231,11 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
             f"cells are separated by {spelled}: {'as requested' if separator else 'it separates most numbers'}."
         )
     return Grid(*_split(text, mark), tuple(notes), mark == " ")
+
+
+def _decimal(angle: re.Match[str]) -> str:
+    degrees, minutes, seconds = (float(part.replace(",", ".")) for part in angle.groups())
+    return f"{degrees + minutes / 60 + seconds / 3600:.9f}"
 
 
 def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
@@ -226,11 +250,7 @@ def decoded(path: Path, encoding: str = "") -> tuple[str, tuple[str, ...]]:
     try:
         text = data.decode(name)
     except (ValueError, LookupError) as error:  # of the text, or of the encoding's name
-        raise InputError(
-            "the text",
-            str(error),
-            "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chinese), utf-16, ...",
-        ) from None
+        raise InputError("the text", str(error), ENCODINGS) from None
     if "\x00" in text:
         raise binary
     text = text.replace("\u2212", "-").replace("\r\n", "\n").replace("\r", "\n")
@@ -249,6 +269,9 @@ def _encoding(data: bytes) -> tuple[str, str]:
     try:
         data.decode("utf-8")
     except UnicodeDecodeError:
+        if any(len(set(run)) > 2 for run in FOREIGN.findall(sample)):
+            found = "letters that are neither UTF-8 nor Western European"
+            raise InputError("the text", found, ENCODINGS) from None
         return "cp1252", "not UTF-8"
     return "utf-8", "valid UTF-8"
 
@@ -288,6 +311,7 @@ def list_of_numbers(cell: str) -> list[str]:
     """
     if not LIST_OPENS.match(cell) or cell[-1] not in "])}":
         return []
+    cell = cell.lstrip(ascii_letters)  # array([1, 2, 3]), posj(1, 2, 3)
     parts = re.split(r"[\s\[\](){};]+" if ";" in cell else r"[\s\[\](){},]+", cell)  # else commas are decimal marks
     numbers = [part for part in parts if part]
     return numbers if len(numbers) > 1 and all(map(is_numeral, numbers)) else []

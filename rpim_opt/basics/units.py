@@ -180,7 +180,7 @@ IN_A_NAME = (
     re.compile(r"(.+?)[\s_]*[\[(]\s*(\S+?)\s*[\])]"),
     re.compile(r"(.+?)\s*/\s*(\S+)"),
     re.compile(r"(.+?)\s+in\s+(\S+)"),
-    re.compile(r"(.+)[\s_]+([^\s_]+)"),
+    re.compile(r"(.+?),?[\s_]+([^\s_,]+)"),
     re.compile(r"(.*[\dxyzXYZ])(mm|deg|rad)"),
 )
 

@@ -25,6 +25,7 @@ from rpim_opt.problem.diagnosis import (
     part_way,
     rounded,
     rows_without_values,
+    scattering_joint,
     shared_rows,
     shown_by_residuals,
     unrelated_rows,
@@ -129,12 +130,14 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return [*rows_without_values(problem), *found]
     found = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
     if not found:
-        alone, x = problem, result.x
+        error, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
+        rows = own | (error <= np.nanmax(error[own]))  # held-out rows that are gross errors were not looked for
+        alone, x = ordered.on(ordered.data.take(np.flatnonzero(rows))), result.x
         if result.learned is not None and result.learned.added:  # curves take up ratios and scales of all kinds
             p = problem.parameters
-            alone = problem.identifying(p.identified & ~np.isin(p.names, result.learned.added))
+            alone = alone.identifying(p.identified & ~np.isin(p.names, result.learned.added))
             x = settled(alone)
-        found = list(shown_by_residuals(alone, x))
+        found = list(shown_by_residuals(alone, x)) or list(scattering_joint(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     found = found or list(rounded(problem, error))
     if found or error < LARGEST["length"]:  # which a robot's own effects may be

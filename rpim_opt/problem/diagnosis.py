@@ -67,6 +67,8 @@ NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
 SEVERAL = 0.85
 """Several joint zeros moved, if that leaves less than this part of what one move leaves."""
+LOOSE = 1e-3
+"""A joint's random error [rad, m] that no gear in order has: a tenth of that is usual."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
 MOST_ROUNDS = 20
@@ -769,7 +771,17 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
 def _moves(
     problem: CalibrationProblem, x: Array, model: LinearModel, *, several: bool = False
 ) -> Iterator[tuple[Array, Say]]:
-    """Yield the columns (m, c) of a base, fixture, reflector or joint zero that moved, or of ``several`` zeros."""
+    """Yield the columns (m, c) of a base, fixture, reflector, joint zero or payload that changed, or ``several`` zeros.
+
+    It did so at a row, between two rows, or, base and fixture, steadily.
+    """
+    p = problem.parameters
+    bends = np.char.startswith(p.names, "compliance") & ~p.identified
+    if bends.any() and not several:
+        problem, own = problem.identifying(p.identified | bends), x
+        x = np.zeros(len(problem.parameters.free))
+        x[p.identified[p.identified | bends]] = own
+        model = problem.linearize(x)
     free, data = problem.parameters.free, problem.data
     markers = {marker for block in data.blocks for marker in block.markers}
     parts = {"base": {f"base_{c}" for c in FRAME}, "reflector": {tool_prefix(m) + c for m in markers for c in FRAME}}
@@ -783,6 +795,8 @@ def _moves(
     placed_by = [what for what in causes if what != "reflector"]
     zeros = _zeros(problem.robot)
     parts |= {f"zero of joint {i}": {name} for i, name in enumerate(zeros, start=1)}
+    parts["payload"] = {name for name in free.names if name.startswith("compliance")}
+    causes["payload"] = "did the load at the flange change"
     if several:
         parts = {"set of joint zeros": set(zeros)}
     causes["set of joint zeros"] = "did several joints slip, or were they remastered"
@@ -791,24 +805,58 @@ def _moves(
         return
     equations = Equations.of(data)
 
-    def say(what: str, start: int, end: int, coefficients: Array) -> tuple[str, str]:
+    def say(what: str, when: str, share: Array, coefficients: Array) -> tuple[str, str]:
         some = of[what]
-        rows = equations.length & (equations.row >= start) & (equations.row < end)
-        change = problem.jacobian(x)[np.ix_(rows, np.asarray(some))] @ (free.scale[some] * coefficients)
+        rows = equations.length & (share > 0)
+        change = problem.jacobian(x)[np.ix_(rows, np.asarray(some))] @ (free.scale[some] * coefficients) * share[rows]
         far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[rows]))))
-        until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
         cause = causes.get(what, "did the joint slip, or was it remastered")
         return (
-            f"from row {data.label[start]} {until} the points are {three_digits(far)} mm from where the others put "
-            f"them, and fit a {what} that moved"
+            f"{when} the points are {three_digits(far)} mm from where the others put them, and fit a {what} that moved"
         ), f"{cause}? Calibrate the two parts separately"
 
     spans = [(k, len(data)) for k in _places(len(data))] + list(combinations(_places(len(data), SPANS), 2))
     for (start, end), (what, some) in product(spans, of.items()):
-        inside = (problem.owners >= start) & (problem.owners < end)
+        inside = ((problem.owners >= start) & (problem.owners < end)).astype(float)
+        until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
         # zeros of all joints fit two gross errors, whatever these are
         if some and (not several or inside.sum() >= 3 * len(some)):
-            yield model.A[:, some] * inside[:, None], partial(say, what, start, end)
+            yield (
+                model.A[:, some] * inside[:, None],
+                partial(say, what, f"from row {data.label[start]} {until}", inside),
+            )
+    steadily = problem.owners / max(len(data) - 1, 1)
+    for what in placed_by:
+        if of.get(what):
+            yield (
+                model.A[:, of[what]] * steadily[:, None],
+                partial(say, what, "more and more from row to row", steadily),
+            )
+
+
+def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Report a joint that explains residuals at x (n,) if it is elsewhere in every row, by more than a gear lets it."""
+    alone = problem.with_repeatability(None)
+    model, free, rows = alone.linearize(x), problem.parameters.free, alone.owners
+    r = model.b - model.A @ (x / free.scale)
+    N, whole = len(problem.data), float(r @ r)
+    best = (0.0, 0.0, "")
+    for i, name in enumerate(_zeros(problem.robot), start=1):
+        if name in free.names:
+            k = free.names.index(name)
+            along, size = (np.bincount(rows, model.A[:, k] * each, N) for each in (r, model.A[:, k]))
+            step = along / np.maximum(size, 1e-12)
+            off = float(np.sqrt(np.mean(step**2)) * free.scale[k])
+            unit = "mrad" if free.dimensions[k] == "angle" else "mm"
+            what = f"joint {i} is {three_digits(1e3 * off)} {unit} (RMS) from its reading, otherwise in every row"
+            best = max(best, (float(step @ along), off, what))
+    gain, off, what = best
+    spare = len(r) - N
+    if off < LOOSE or whole - gain >= FITS * whole or spare < N:
+        return
+    if float(fdtrc(N, spare, gain / N / (max(whole - gain, 1e-300) / spare))) < RARE:
+        left = f"that leaves {100 * np.sqrt(1 - gain / whole):.0f} % of the residuals"
+        yield f"{what} ({left}): backlash, a loose encoder, or values read while it moved; check it."
 
 
 def _zeros(robot: Robot) -> list[str]:

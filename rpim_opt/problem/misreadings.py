@@ -17,7 +17,7 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
-from rpim_opt.problem.registration.closed_forms import transforms
+from rpim_opt.problem.registration.closed_forms import proper, transforms
 from rpim_opt.problem.registration.global_start import described, explained, rms, search
 from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, lengths_of, mirrored, points_of
 from rpim_opt.robot.formats.tables import read_robot
@@ -121,6 +121,8 @@ ANGLES = {
 """The same of joint angles."""
 MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
 """Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
+SLIPPED = ((1, "low", "up"), (-1, "high", "down"))
+"""By how many rows a column may have slipped, where it is then, and which way back."""
 DEGREES_PER_MM = np.radians(1) / 1e-3
 """Radians that a metre stands for where millimetres were degrees."""
 
@@ -175,10 +177,10 @@ def _readings(robot: Robot, points: Points) -> list[Misreading]:
         for factor, (unit, _) in LENGTHS.items():
             remedy = f"multiply column distance by {factor:g} or name its unit"
             readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
-        return readings
+        return [*readings, _scaled("measured lengths that count down", "change the sign of column distance", -1.0)]
     readings += _of_positions()
     if points.turns is not None:
-        readings += _of_poses()
+        readings += _of_poses(robot)
     return readings
 
 
@@ -203,6 +205,12 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         sign = -int(signs(robot.joint_map)[i])
         yield of(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
+        remedy = f"check its brake and column q{i + 1}"
+        yield of(f"joint {i + 1} standing still in all rows", remedy, eye - np.outer(eye[i], eye[i]))
+    for i in range(1, robot.dof - 1):
+        remedy = f"put it on the last link, or describe the robot up to joint {i}"
+        before = np.diag(np.arange(robot.dof) < i).astype(float)
+        yield of(f"the reflector on the link of joint {i} (later joints do not move it)", remedy, before)
     for i, j in combinations(range(robot.dof), 2):
         exchanged = eye.copy()
         exchanged[[i, j]] = eye[[j, i]]
@@ -265,7 +273,7 @@ def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
     return Misreading(what, remedy, lambda points: replace(points, y=points.y * factors))
 
 
-def _of_poses() -> Iterator[Misreading]:
+def _of_poses(robot: Robot) -> Iterator[Misreading]:
     """Yield readings with other orientations."""
 
     def turned(what: str, remedy: str, change: Callable[[Array], Array]) -> Misreading:
@@ -274,13 +282,11 @@ def _of_poses() -> Iterator[Misreading]:
 
         return Misreading(what, remedy, changed)
 
-    def euler(axes: str, factor: float = 1.0) -> Callable[[Array], Array]:
+    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: float = 1.0) -> Callable[[Array], Array]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
-        columns = ["xyz".index(axis) for axis in axes.lower()]
-
         def change(turns: Array) -> Array:
             angles = factor * Rotation.from_matrix(turns).as_euler("xyz")
-            return np.asarray(Rotation.from_euler(axes, angles[:, columns]).as_matrix())
+            return np.asarray(Rotation.from_euler(axes, angles[:, list(columns)]).as_matrix())
 
         return change
 
@@ -292,13 +298,31 @@ def _of_poses() -> Iterator[Misreading]:
     yield Misreading(
         "transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted
     )
+    remedy = "express both in one frame: multiply the rotations by that between the two"
+    yield Misreading("orientations in another frame than the positions", remedy, partial(_in_one_frame, robot))
     for order in map("".join, permutations("xyz")):
         for kind, axes in (("fixed", order), ("moving", order.upper())):
+            what = f"Euler angles about {kind} axes in the order {', '.join(order)}"
+            remedy = "convert them to roll, pitch, yaw, or to quaternions"
             if axes not in ("xyz", "ZYX"):  # one and the same: roll, pitch, yaw
-                what = f"Euler angles about {kind} axes in the order {', '.join(order)}"
-                yield turned(what, "convert them to roll, pitch, yaw, or to quaternions", euler(axes))
+                yield turned(what, remedy, euler(axes, ["xyz".index(axis) for axis in order]))
+            if order != "xyz":  # KUKA's A, B, C for instance
+                yield turned(f"{what}, columns in this order", remedy, euler(axes))
     for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):
-        yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor))
+        yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor=factor))
+
+
+def _in_one_frame(robot: Robot, points: Points) -> Points:
+    """Return poses whose orientations are turned into the frame of the positions, by their turns from row to row."""
+    if points.turns is None:
+        return points
+    flange = fit_points(robot, replace(points, turns=None)).base @ forward_kinematics(robot, points.q)
+
+    def turns(R: Array) -> Array:
+        return Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec()
+
+    Q = proper(np.einsum("ni,nj->ij", turns(flange[:, :3, :3]), turns(points.turns)))
+    return replace(points, turns=Q @ points.turns)
 
 
 def _inverted(points: Points) -> Points:
@@ -320,7 +344,7 @@ def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
         remedy = f"move the measured values {by} {{}}, against the joint values"
         yield of(f"measured values {by} too low in the table", remedy.format("up"), rows[:-k], rows[k:])
         yield of(f"measured values {by} too high in the table", remedy.format("down"), rows[k:], rows[:-k])
-    for i, (by, low, back) in product(range(dof), ((1, "low", "up"), (-1, "high", "down"))):
+    for i, (by, low, back) in product(range(dof), SLIPPED):
 
         def slipped(points: Points, i: int = i, by: int = by) -> Points:
             q = points.q.copy()
@@ -390,6 +414,11 @@ def _other_robots(robot: Robot, points: Points) -> Iterator[Misreading]:
         mdh[end, :2] = 0.0
         what = f"a table in the {which} Denavit-Hartenberg convention"
         yield Misreading(what, remedy, robot=replace(robot, mdh=mdh))
+    for (k, column), (by, low, back) in product(((0, "alpha"), (1, "a"), (3, "d")), SLIPPED):
+        mdh = robot.mdh.copy()
+        mdh[:, k] = np.roll(mdh[:, k], -by)
+        remedy = f"move column {column} one row {back} in the DH table"
+        yield Misreading(f"column {column} one row too {low} in the DH table", remedy, robot=replace(robot, mdh=mdh))
     for name in robots():
         ready = read_robot(READY / f"{name}.toml")
         if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
@@ -427,8 +456,14 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     chain, left = _mistakes(robot, points, stated)
     if stated > WRONG and not points.seen:
         for readings in (_factors, _orders, _other_robots):
-            if not left < BETTER * stated:
-                chain, left = _best(robot, points, list(readings(robot, points)))
+            if left < BETTER * stated:
+                break
+            chain, left = _best(robot, points, list(readings(robot, points)))
+            if chain and BETTER * stated <= left < FURTHER * stated:  # a second mistake behind it
+                behind, changed = chain[0].robot or robot, chain[0].change(points)
+                second, size = _best(behind, changed, _readings(behind, changed))
+                if size < BETTER * stated:
+                    chain, left = [*chain, *second], size
     if left < BETTER * stated and (left <= LEFT or points.seen):
         return _told(robot, points, chain, stated, left)
     return None if points.seen else _sibling(robot, points)

@@ -158,6 +158,29 @@ def both(*changes: Change) -> Change:
     return changed
 
 
+def moved_otherwise(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Measure the arm with other joint values than those of the table."""
+
+    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        other = joints(change)(problem)
+        (block,), truth = problem.data.blocks, np.random.default_rng(5).normal(size=len(problem.parameters.free))
+        y = other.modelled(truth * problem.parameters.free.scale)[0]
+        return problem.on(replace(problem.data, blocks=(replace(block, y=y),)))
+
+    return changed
+
+
+def column_d_slipped(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Write column d of the DH table a row too low."""
+    mdh = problem.robot.mdh.copy()
+    mdh[:, 3] = np.roll(mdh[:, 3], 1)
+    names, nominal = problem.parameters.names, problem.parameters.nominal.copy()
+    nominal[[names.index(f"d{i + 1}") for i in range(len(mdh))]] = mdh[:, 3]
+    return replace(
+        problem, robots=replace(problem.robot, mdh=mdh), parameters=replace(problem.parameters, nominal=nominal)
+    )
+
+
 MAPPED = "Joint mapping estimated from the data"
 """What is said where signs and zeros of joints were found: the calibration is right then."""
 BY_TEXT = sorted(range(COUNT), key=lambda i: str(i + 1))
@@ -250,6 +273,23 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
             )
         ),
         "cylindrical",
+    ),
+    "joint 5 stood still": (
+        moved_otherwise(lambda q: q * (1, 1, 1, 1, 0, *[1] * (q.shape[-1] - 5))),
+        "joint 5 standing",
+    ),
+    "the reflector on link 4": (
+        moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < 4)),
+        "the reflector on the link of joint 4",
+    ),
+    "column d a row too low": (column_d_slipped, "column d one row too low in the DH table"),
+    "the instrument sinks": (
+        values(lambda y: y + np.array([0, 0, 2e-3]) * np.linspace(0, 1, COUNT)[:, None] ** 2),
+        "more and more from row to row",
+    ),
+    "joint 3 with backlash": (
+        of_joint(2, lambda q: q + 3.5e-3 * np.random.default_rng(4).choice([-1, 1], COUNT)),
+        "from its reading, otherwise in every row",
     ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),

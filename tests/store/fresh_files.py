@@ -3,19 +3,23 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
+import numpy as np
 from scipy.io import savemat
 
 from tests.store.instrument_files import Shape, many
 from tests.store.raw_files import (
     COUNT,
+    HEAD,
     JOINTS,
     LABELS,
     METRES,
     NAMED,
     POINTS,
     RADIANS,
+    ROWS,
     WXYZ,
     P,
     Q,
@@ -117,7 +121,47 @@ def japanese(folder: Path) -> Path:
     return folder / "raw.csv"
 
 
+def encoded(head: list[str], encoding: str, comma: bool = False) -> Shape:
+    def write(folder: Path) -> Path:
+        whole = text([head], ROWS, ";" if comma else ",", comma=comma)
+        (folder / "raw.csv").write_bytes(whole.encode(encoding))
+        return folder / "raw.csv"
+
+    return write, {"encoding": encoding} | ({"decimal": "comma"} if comma else {}), "position"
+
+
+def arrays(folder: Path) -> Path:
+    np.savez(folder / "raw.npz", q=np.radians(Q), p=P / 1e3)
+    return folder / "raw.npz"
+
+
+def sexagesimal(angle: str) -> str:
+    tenths = round(abs(float(angle)) * 36000)
+    return f"{'-' * (float(angle) < 0)}{tenths // 36000}°{tenths // 600 % 60:02d}'{tenths % 600 / 10:04.1f}\""
+
+
+MEANS = ["Média", *(f"{v:.3f}" for v in [*Q.mean(axis=0), *P.mean(axis=0)])]
+ARRAYS = {
+    "cell": 4,
+    "names": LABELS,
+    "joint_angles_deg": np.asarray(JOINTS, float).tolist(),
+    "measured_mm": np.asarray(POINTS, float).tolist(),
+}
+COMMENTED = [line + " # reflector cleaned" * (i == 5) for i, line in enumerate(text([HEAD], ROWS).splitlines())]
+FORTRAN = [[f"{float(v) / 1e3:.9f}D+03" for v in row[1:]] for row in ROWS]
+
+
 FRESH: dict[str, Shape] = {
+    "Chinese in GB18030": encoded(["点号", *joint_names("关节{}(°)"), "实测X(mm)", "实测Y(mm)", "实测Z(mm)"], "gb18030"),
+    "Russian in Windows-1251": encoded(["Точка", *joint_names("Ось {}, град"), "X, мм", "Y, мм", "Z, мм"], "cp1251", comma=True),
+    "a mean in another language below": one(text([["Ponto", *HEAD[1:]]], [*ROWS, MEANS])),
+    "Doosan, posj in a cell": one(text([["no", "command", "X [mm]", "Y [mm]", "Z [mm]"]], [[label, f"posj({', '.join(q)})", *p] for label, q, p in zip(LABELS, JOINTS, POINTS, strict=True)]), units="deg"),
+    "Fortran, exponents of double precision": one(text([HEAD[1:]], FORTRAN, " "), "raw.dat"),
+    "NumPy, .npz": (arrays, IN_SI, "position"),
+    "JSON, an object of arrays": one(json.dumps(ARRAYS), "raw.json"),
+    "comments behind rows": one("\n".join(COMMENTED)),
+    "degrees, minutes and seconds": one(text([HEAD], beside(NAMED, [list(map(sexagesimal, q)) for q in JOINTS], POINTS), "\t"), "raw.tsv"),
+
     "SpatialAnalyzer, collection::group::point": many(("points.txt", spatial_analyzer()), ("joints.csv", AXES), **BOTH),
     "CALYPSO, a row a characteristic": many(("chr.txt", calypso()), ("joints.csv", AXES), **BOTH),
     "PlotJuggler, topics": one(plotjuggler(), kind="pose"),

@@ -324,6 +324,11 @@ INSTRUMENTS: dict[str, Shape] = {
         text([["Point ID", *HEAD[1:7], "Hz [gon]", "V [gon]", "SD [m]"]],
              beside(NAMED, JOINTS, cells(np.column_stack([-AZIMUTH / 0.9, (90 - ELEVATION) / 0.9, LENGTH / 1e3]))), ";")
     ),
+    "DMIS output": program(
+        "calib.dmo",
+        "UNITS/MM,ANGDEC\n" + "".join(f"FA({label})=FEAT/POINT,CART,{','.join(p)},0,0,1\n" for label, p in zip(LABELS, POINTS, strict=True)),
+        key="row",
+    ),
     "MELFA joint variables": program(
         "calib.prg", "".join(f"{label}=({','.join(f'{float(v):+.3f}' for v in q)},+0.00,+0.00)\n" for label, q in zip([f'J{i}' for i in range(1, COUNT + 1)], JOINTS, strict=True)),
         key="row",

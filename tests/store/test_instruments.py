@@ -17,7 +17,7 @@ from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY,
 from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, book, cells, text
 from tests.test_cli import run
 
-NOT_READ = {"MELFA joint variables"}
+NOT_READ = {"DMIS output"}
 """Formats without a reader."""
 FILES = {
     **REFUSED_THOUGH_RIGHT,

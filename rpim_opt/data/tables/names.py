@@ -111,7 +111,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     """
     path = [part for part in re.split(r"[/.]", stem.strip().strip("%")) if part]
     plain = unicodedata.normalize("NFKC", re.sub(r"\(95\s*%?\)", "95", stem.strip().lower()))
-    plain = re.sub(r"[\s.\-/:\[\]()$]+", "_", plain).strip("_% ")
+    plain = re.sub(r"[\s.,\-/:\[\]()$]+|(?<=[\u4e00-\u9fff])(?=[xyz]$)", "_", plain).strip("_% ")
     words = plain.split("_")
     kind = next((name for name, signs in KINDS.items() if len(words) > 1 and signs & set(words)), "")
     rest = "_".join([word for word in words if not any(word in signs for signs in KINDS.values())] or words)

@@ -39,14 +39,16 @@ def read_yaml(text: str) -> Rows:
 
 def _rows(found: Any) -> Rows:
     """Return the rows of a document."""
-    if isinstance(found, dict) and all(isinstance(cells, list) for cells in found.values()):
-        if len(set(map(len, found.values()))) != 1:
+    if isinstance(found, dict):
+        lists = {name: cells for name, cells in found.items() if isinstance(cells, list)}
+        inner = [cells for cells in lists.values() if cells and all(isinstance(row, dict) for row in cells)]
+        columns = len(lists) == len(found) or any(isinstance(cell, list) for cells in lists.values() for cell in cells)
+        if columns and len(set(map(len, lists.values()))) != 1:
             raise InputError("the text", "lists of several lengths", "an array of rows, or columns of one length")
-        found = [dict(zip(found, row, strict=True)) for row in zip(*found.values(), strict=True)]
-    elif isinstance(found, dict):
-        lists = [value for value in found.values() if isinstance(value, list) and value]
-        inner = [value for value in lists if all(isinstance(row, dict) for row in value)]
-        found = inner[0] if len(inner) == 1 else [found]
+        if columns:
+            found = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+        else:
+            found = inner[0] if len(inner) == 1 else [found]
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
         raise InputError("the text", "an array of other things", "an array of objects, one a row")
     return [dict(_flat("", row)) for row in found]
@@ -61,10 +63,11 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
     stem, unit = split(prefix)
     joints = value.get("name")
     for name, part in value.items():
-        if isinstance(joints, list) and isinstance(part, list) and part is not joints:
+        if isinstance(joints, list) and isinstance(part, list):
             # ROS: lists of values beside one of names, in whatever order
             topic = f"/{prefix}" if prefix else ""
-            yield from ((f"{topic}/{joint}/{name}", cell) for joint, cell in zip(joints, part, strict=False))
+            if part is not joints:
+                yield from ((f"{topic}/{joint}/{name}", cell) for joint, cell in zip(joints, part, strict=False))
             continue
         whole = f"{stem}.{name} [{unit}]" if unit else f"{prefix}.{name}"
         yield from _flat(whole if prefix else name, part)

@@ -3,7 +3,7 @@
 FANUC ``P[1:"name"]{ UF : 0, UT : 1, J1= 10.000 deg, ... };``; KUKA ``DECL E6AXIS XP1={A1 10.0,A2 -90.0,...}``; ABB
 ``CONST jointtarget P1:=[[10,-90,...],[9E9,...]];``; Universal Robots ``movej([0.1, -1.57, ...])`` and ``P1_q = [...]``
 in rad, ``p[...]`` in m and rad; Yaskawa ``C00000=10.0,-90.0,...`` below ``///POSTYPE ANGLE``; Kawasaki
-``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Staubli
+``#p1 10.0 -90.0 ...`` below ``.JOINTS``; Mitsubishi ``J1=(+10.00,-90.00,...)``; Staubli
 ``<Value key="0" j1="10" j2="-90" ... />``. External axes are left out.
 """
 
@@ -26,6 +26,7 @@ ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
 KAWASAKI = re.compile(r"^\.JOINTS[^\n]*\n(.*?)^\.END", re.MULTILINE | re.DOTALL | re.IGNORECASE)
+MITSUBISHI = re.compile(r"^[ \t]*(J\w*)[ \t]*=[ \t]*\(([-+\d.][-+\d., \t]*)\)", re.MULTILINE | re.IGNORECASE)
 STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
 KUKA_NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **dict(zip("XYZ", PLACE, strict=True)),
@@ -153,5 +154,11 @@ FORMATS = (
     ),
     TableFormat("Yaskawa job", (".jbi",), lambda text: YASKAWA.search(text) is not None, read_yaskawa),
     TableFormat("Kawasaki AS program", (".as", ".pg"), lambda text: KAWASAKI.search(text) is not None, read_kawasaki),
+    TableFormat(
+        "MELFA program",
+        (".prg", ".mb4", ".mb5", ".mb6"),
+        lambda text: MITSUBISHI.search(text) is not None,
+        lambda text: _rows([(name, _joints(cells)) for name, cells in MITSUBISHI.findall(text)]),
+    ),
     TableFormat("VAL3 data", (".dtx",), lambda text: "<Value" in text, read_staubli),
 )

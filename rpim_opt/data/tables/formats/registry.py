@@ -18,9 +18,7 @@ Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
 
-BINARY = frozenset(
-    {".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npz", ".npy", ".pkl"}
-)
+BINARY = frozenset({".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl"})
 """Endings of files that are no text; any other unknown ending may be one of an instrument's table."""
 
 
@@ -48,7 +46,7 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     ending = path.suffix.lower()
     every = formats()
     fitting = [each for each in every if ending in each.endings]
-    plain = {*TEXTS, *EXCEL, ".parquet", ".mat"}
+    plain = {*TEXTS, *EXCEL, ".parquet", ".mat", ".npz"}
     if not fitting and ending in BINARY:
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
