@@ -287,19 +287,19 @@ def test_a_thousand_random_cases_are_right_where_certified() -> None:
 def test_a_base_is_certified_where_problems_start() -> None:
     problem = ro.load("pose").problem
     tools = {"": np.zeros(6)}
-    place = locate(problem.robot, problem.data, tools)
-    assert place.how.startswith("certified: globally optimal")
+    base, _, how = locate(problem.robot, problem.data, tools)
+    assert how.startswith("certified: globally optimal")
     p = problem.parameters
     stated = [p.nominal[p.names.index(f"base_{c}")] for c in "xyz"]
-    assert np.abs(place.base[:3] - stated).max() < 0.02  # of a robot whose parameters are off by millimetres
+    assert np.abs(base[:3] - stated).max() < 0.02  # of a robot whose parameters are off by millimetres
 
 
 def test_positions_are_fitted_where_nothing_is_determined() -> None:
     problem = ro.load("position").problem
     few = problem.on(problem.data.take([0, 1, 2]))
-    place = locate(few.robot, few.data, {"": np.zeros(6)})
-    assert place.how.startswith(("by registration of positions: ", "not certified: "))
-    assert np.isfinite(place.base).all()
+    base, _, how = locate(few.robot, few.data, {"": np.zeros(6)})
+    assert how.startswith(("by registration of positions: ", "not certified: "))
+    assert np.isfinite(base).all()
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason="the real measurements are not here")

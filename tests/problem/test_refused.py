@@ -137,7 +137,7 @@ def test_poses_about_one_axis_are_located_by_their_places() -> None:
     tool = (0.05, 0.0, 0.1, 0.0, 0.0, 0.0)
     turns = Rotation.from_matrix(flange[:, :3, :3]).as_quat()[:, [3, 0, 1, 2]]
     y = np.hstack([flange[:, :3, :3] @ tool[:3] + flange[:, :3, 3], turns])
-    found = locate(ARM, ro.Dataset.of(q, y, 1e-3**2 * np.eye(6), measurement=pose), {"": tool})
-    assert "registration of positions" in found.how
-    assert found.base == pytest.approx(np.zeros(6), abs=1e-9)
-    assert found.tools[""] == pytest.approx(tool, abs=1e-9)
+    base, tools, how = locate(ARM, ro.Dataset.of(q, y, 1e-3**2 * np.eye(6), measurement=pose), {"": tool})
+    assert "registration of positions" in how
+    assert base == pytest.approx(np.zeros(6), abs=1e-9)
+    assert tools[""] == pytest.approx(tool, abs=1e-9)

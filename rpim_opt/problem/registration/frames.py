@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
-from rpim_opt.problem.registration.certified import certified_hand_eye
+from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import (
     NOMINAL_ERROR,
     TOOL_ERROR,
@@ -38,24 +38,14 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, model_parameters, tool_prefix
 
 ENOUGH = 2000  # rows of a measurement that register frames, where there are more
-FREE = 0.1
-"""Standard deviation of a rotation [rad] from which closed forms are tried: they refuse what is not determined."""
 
 
-class Located(NamedTuple):
-    """Located base (6,) and reflectors (6,) by marker [m, rad], and a sentence on the method."""
+def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Array, dict[str, Array], str]:
+    """Return the base (6,), the reflectors (6,) by marker [m, rad], and a sentence on the method.
 
-    base: Array
-    tools: dict[str, Array]
-    how: str
-
-
-def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
-    """Return the base and the reflectors by marker, from positions and poses on the nominal robot.
-
-    By `certified_hand_eye`; of several reflectors by that with the most poses, or positions, from which the others
-    follow. Where it does not determine the rotations, all positions are fitted with reflectors near where they are
-    stated.
+    They are those of positions and poses on the nominal robot, by `certified_hand_eye`; of several reflectors by that
+    with the most poses, or positions, from which the others follow. Where it does not determine the rotations, all
+    positions are fitted with reflectors near where they are stated.
     """
     parts = []
     for block in data.blocks:
@@ -87,7 +77,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
         start = certified_hand_eye(
             flange[own], measured[own], sigma=deviations, expected=places[first], spread=TOOL_ERROR
         )
-        if start.uncertainty > FREE or (len(count) > 1 and not start.certified):
+        if start.uncertainty > UNKNOWN or (len(count) > 1 and not start.certified):
             raise InputError("the data", start.reason, "rotations about two axes")
     except InputError as error:
         how = f"by registration of positions: {error.found}"
@@ -117,7 +107,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> Located:
         own = turned & (marker == name)
         turn = (base @ flange[own])[:, :3, :3].transpose(0, 2, 1) @ measured[own, :3, :3]
         places[name] = frame_numbers(rigid(proper(turn.sum(axis=0)), places[name][:3]))
-    return Located(frame_numbers(base), places, how)
+    return frame_numbers(base), places, how
 
 
 APART = 0.1
@@ -360,10 +350,10 @@ def relocated(problem: Source) -> Source | None:
         try:
             data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
             at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
-            found = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
+            there, located, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
         except InputError:
             return None
-        for marker, k, place in [(None, base, found.base), *((m, k, found.tools[m]) for m, k in at.items())]:
+        for marker, k, place in [(None, base, there), *((m, k, located[m]) for m, k in at.items())]:
             if _misplaced(p, k, place):
                 free = p.identified[k]
                 nominal[k[free]] = place[free]
