@@ -57,8 +57,6 @@ ROUNDS, LEAST_SHARE = 20, 1 / 8
 """Rounds at most; the least share of the way to its solution from which the next round linearizes."""
 ROUGH_TOLERANCE = 1e-3
 """Tolerance of fits between two estimates of hyperparameters: the last fit is exact."""
-ROUNDS_FARTHEST = 6
-"""Rounds that choose anew where in a region the robot moves farthest: after that these stay, or they might circle."""
 
 
 @dataclass(frozen=True)
@@ -143,7 +141,7 @@ class Loop:
     formulation: Formulation
     reweigh: Squares | None = None
     options: Options = field(default_factory=Options)
-    about: tuple[Array | None, Array | None] = (None, None)
+    about: Array | None = None
 
     @property
     def scale(self) -> Array:
@@ -155,7 +153,7 @@ class Loop:
         reweigh = self.reweigh
         if reweigh is not None and before is not None:
             reweigh = reweigh.after(before)
-        return around(self.source.linearize(self.scale * z, reweigh), *self.about)
+        return around(self.source.linearize(self.scale * z, reweigh), self.about)
 
     # --- the weight ------------------------------------------------------------------------------------------
 
@@ -193,7 +191,7 @@ class Loop:
             return state.program.on_squares(state.program.inlier_model(state.z))
         x = self.scale * state.z
         inliers = inliers_of(self.formulation, *self.source.configuration_errors(x))
-        return state.program.on(around(self.source.linearize(x, inliers), *self.about))
+        return state.program.on(around(self.source.linearize(x, inliers), self.about))
 
     # --- one step --------------------------------------------------------------------------------------------
 
@@ -343,14 +341,14 @@ def minimize(
     Positions that constraints bound are linear about a point: then it runs again about its solution until they are
     those of the solution. Where solutions jump to and fro, the next round linearizes between them.
     """
-    ended = _certified(problem, formulation, weight, start, options, (start, None))
+    ended = _certified(problem, formulation, weight, start, options, start)
     if not ended.state.program.structure.predicts:
         return ended
     history = ended.state.history
-    about = farthest = ended.x
+    about = ended.x
     share, last = 1.0, np.inf
     for rounds in range(2, ROUNDS + 1):
-        ended = _certified(problem, formulation, weight, ended.x, options, (about, farthest))
+        ended = _certified(problem, formulation, weight, ended.x, options, about)
         history = (*history, *ended.state.history)
         ended = replace(ended, rounds=rounds, state=replace(ended.state, history=history))
         step = ended.x - about
@@ -361,8 +359,6 @@ def minimize(
             share = max(share / 2, LEAST_SHARE)
         about = about + share * step
         last = length
-        if rounds <= ROUNDS_FARTHEST:
-            farthest = about
     return replace(ended, settled=False)
 
 
@@ -378,7 +374,7 @@ def _certified(
     weight: float | str | Selector,
     start: Array | None,
     options: Options,
-    about: tuple[Array | None, Array | None],
+    about: Array | None,
 ) -> Ended:
     """Run the loop once; certify its end by the formulation's functions and the measurements' model, asked anew."""
     loop, state = _rested(problem, formulation, weight, start, options, about)
@@ -387,7 +383,7 @@ def _certified(
         formulation, _ = in_blocks(formulation, lambda: state.program.model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
         anew = in_parts(problem.frozen())
-        model = around(anew.linearize(loop.scale * state.z), *about)
+        model = around(anew.linearize(loop.scale * state.z), about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)
     found = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
@@ -400,7 +396,7 @@ def _rested(
     weight: float | str | Selector,
     start: Array | None,
     options: Options,
-    about: tuple[Array | None, Array | None] = (None, None),
+    about: Array | None = None,
 ) -> tuple[Loop, State]:
     source = in_parts(problem.frozen())
     solved, reweigh = formulation, None

@@ -592,20 +592,18 @@ class CalibrationProblem(RobotModel):
 class Identified(Parameters):
     """The n identified parameters of a linear model, with the problem that positions are predicted from.
 
-    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
-    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
+    These are linear about the deviations ``at`` (n,) [SI], or about nominal.
     """
 
     problem: CalibrationProblem | None = None
     at: Array | None = None
-    farthest: Array | None = None
 
 
-def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
-    """Return a model that predicts positions linearly about x (n,) [SI], regions at ``farthest``, by default x, too."""
+def around(model: LinearModel, x: Array | None) -> LinearModel:
+    """Return a model that predicts positions linearly about x (n,) [SI]."""
     if x is None or not isinstance(model.parameters, Identified):
         return model
-    return replace(model, parameters=replace(model.parameters, at=x, farthest=x if farthest is None else farthest))
+    return replace(model, parameters=replace(model.parameters, at=x))
 
 
 def error_dimensions(block: Block) -> list[str]:
