@@ -31,7 +31,7 @@ def linear_rule(
     """
     if program.penalty_form is None:
         found = f"formulation '{program.formulation.name}'"
-        accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve or k_fold serve any"
+        accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
         raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
         program.inlier_model(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
