@@ -14,7 +14,8 @@ from rpim_opt.basics.units import fits
 from rpim_opt.bayes import prior_terms as terms
 from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
 from rpim_opt.convex.given import places
-from rpim_opt.robot.mdh import MDH, MDH_DIMENSION
+from rpim_opt.robot.chain import ORIGIN
+from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, overlay, own_name
 
 OFFSETS = "joint offsets"
@@ -27,7 +28,7 @@ BASE = "base"
 Tools and other frames are stated by hand or unknown: their scale is not estimated.
 """
 _KIND = re.compile(r"(ecc2|ecc|[a-z]+)")
-_GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+")
+_GEOMETRY = re.compile(rf"({'|'.join(MDH)})\d+|{ORIGIN}\w+_r?[xyz]")
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,8 @@ class Prior:
     freedom of the Student's t of the robot's geometry; infinity: a normal distribution.
 
     ``groups`` of parameters of the robot share an estimated scale of their own, as patterns: ``(("a?", "d?"),
-    ("alpha?",))``. Of the others, lengths, angles and joint offsets share one each, and so does every model extension
-    (compliance, eccentricity, ...); session offsets have one for shifts and one for turns.
+    ("alpha?",))``. Of the others, lengths and angles, a URDF's origins included, joint offsets and every model
+    extension share one each; session offsets have one for shifts and one for turns.
 
     ``statements`` are of linear combinations (`known`, `from_result`). With ``optional`` (`from_population`) centre and
     scale are left out where the marginal likelihood is against them. InputError for tails, factors or patterns that
@@ -201,7 +202,7 @@ class Prior:
         free = parameters.free
         keys = []
         for name, dimension in zip(free.names, free.dimensions, strict=True):
-            own, found = own_name(name), _GEOMETRY.fullmatch(own_name(name))
+            own = own_name(name)
             stated = [group for group in self.groups if any(fits(name, pattern) for pattern in group)]
             if own.startswith(f"{BASE}_"):
                 keys.append(BASE)
@@ -212,7 +213,7 @@ class Prior:
             elif is_joint_offset(name):
                 keys.append(OFFSETS)
             else:
-                keys.append(f"{MDH_DIMENSION[found[1]]}s" if found else kind_of(name))
+                keys.append(f"{dimension}s" if _GEOMETRY.fullmatch(own) else kind_of(name))
         of_base = np.array([own_name(name).startswith(f"{BASE}_") for name in parameters.names])
         fixed = (parameters.placed & (known | ~of_base))[parameters.identified]
         names = tuple(dict.fromkeys(key for key, alone in zip(keys, fixed, strict=True) if not alone))

@@ -373,6 +373,35 @@ def test_multipliers_of_joints_that_follow_are_identified(
     assert multipliers == [pytest.approx(-0.49, abs=1e-3), -0.5]
 
 
+def test_one_joint_off_its_zero_leaves_the_others_where_they_are(tmp_path: Path) -> None:
+    """Origins have tails and scales by kind: with a joint a degree off, positions elsewhere are as good as without."""
+    (tmp_path / "arms.urdf").write_text(two_arms())
+    rng = np.random.default_rng(3)
+    parts, new = {}, {}
+    for side in ("left", "right"):
+        arm = ro.read_urdf(tmp_path / "arms.urdf", "base", f"{side}_6", origins=True)
+        q = rng.uniform(-1.5, 1.5, (315, arm.robot.dof))
+        data = ro.Dataset.of(q[:15], np.zeros((15, 3)), SIGMA)
+        parts[side] = ro.problem_from(arm, data, identify=["origin_*"], base=arm.base)
+        new[side] = ro.Dataset.of(q[15:], np.zeros((300, 3)), SIGMA)
+    problem = ro.together(**parts, shared=["origin_*"])
+    elsewhere = problem.on(ro.Dataset.of_robots(new))
+    free = problem.parameters.free
+    small = 2e-4 * rng.normal(size=len(free))
+    noise = [SIGMA * rng.normal(size=y.shape) for y in problem.modelled(small)]
+    errors = []
+    for turn in (0.0, np.radians(1)):
+        x = small + turn * (np.array(free.names) == "right.origin_right_joint_3_rz")
+        measured = [y + e for y, e in zip(problem.modelled(x), noise, strict=True)]
+        data = {side: ro.Dataset.of(parts[side].data.q, y, SIGMA) for side, y in zip(parts, measured, strict=True)}
+        result = ro.calibrate(problem.on(ro.Dataset.of_robots(data)))
+        assert result.learned is not None
+        assert {"lengths", "angles"} <= set(result.learned.sizes)
+        missed = np.concatenate(elsewhere.modelled(x)) - np.concatenate(elsewhere.modelled(result.x))
+        errors.append(np.sqrt(np.mean(missed**2)))
+    assert errors[1] < 1.1 * errors[0]
+
+
 def test_what_a_urdf_does_not_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder(monkeypatch, tmp_path, 'identify = ["origin_*", "ratio1"]')
     result = ro.calibrate(ro.load(".").problem, ro.tikhonov, weight=1.0)
