@@ -18,7 +18,7 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.study import Metric, Report, distributions
 
 NOISES = (1e-1, 1e-2, 1e-3, 1e-4)
-SELECTORS = (ro.l_curve, ro.gcv, ro.reml, ro.discrepancy, ro.quasi_optimality, ro.leave_one_out)
+SELECTORS = (ro.l_curve, ro.corner, ro.gcv, ro.reml, ro.discrepancy, ro.quasi_optimality, ro.leave_one_out)
 
 
 def midpoints(n: int, low: float, high: float) -> tuple[np.ndarray, float]:

@@ -22,7 +22,7 @@ from rpim_opt.basics.text import markdown
 from rpim_opt.study import Metric, Report, distributions
 
 QUESTION = "Which selector comes nearest to the best weight on a robot?"
-RULES = (ro.reml, ro.l_curve, ro.gcv, ro.leave_one_out, ro.two_step, ro.discrepancy, ro.quasi_optimality)
+RULES = (ro.reml, ro.l_curve, ro.corner, ro.gcv, ro.leave_one_out, ro.two_step, ro.discrepancy, ro.quasi_optimality)
 SITUATIONS = {  # configurations, scales over the true spread, true noise over the declared
     "as declared": (30, 1.0, 1.0),
     "9 configurations": (9, 1.0, 1.0),
