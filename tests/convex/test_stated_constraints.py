@@ -171,6 +171,18 @@ def test_what_does_not_fit_the_problem_is_refused(text: str, found: str) -> None
     assert text in error.value.where or found == "'a9'"
 
 
+def test_a_bound_on_positions_holds_of_the_identified_robot() -> None:
+    """By its forward kinematics and not to first order: the loop runs again about its solution."""
+    problem = ro.load("position").problem
+    q = np.random.default_rng(5).uniform(-1, 1, (4, 6))
+    highest = ro.calibrate(problem, ro.tikhonov, 1.0).forward(q)[:, 2, 3].max() - 2e-4
+    below = replace(ro.tikhonov, constraints=(lambda _, p: p.positions(q)[:, 2] <= highest,))
+    result = ro.calibrate(problem, below, 1.0)
+    assert result.converged, result.message
+    assert "rounds" in result.message
+    assert result.forward(q)[:, 2, 3].max() == pytest.approx(highest, abs=1e-8)
+
+
 def test_a_file_keeps_statements_and_their_prices(tmp_path: Path) -> None:
     result = calibrated("a3 + d4 = 572.00 +- 0.05 mm", "|a3 - nominal| <= 0.2 mm")
     ro.store.save_result(result, tmp_path / "result.json")
