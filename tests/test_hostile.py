@@ -128,6 +128,8 @@ def test_limits_that_mean_none_in_a_urdf(tmp_path: Path) -> None:
         lambda problem: ro.calibrate(problem, ro.tikhonov, float("nan")),
         lambda problem: ro.calibrate(problem, ro.tikhonov, 1e308),
         lambda problem: ro.calibrate(problem, ro.tikhonov, 1e-320),
+        lambda problem: ro.constraints.signed(+2),
+        lambda problem: ro.constraints.signed(0, "a?"),
         lambda problem: ro.huber(float("nan")),
         lambda problem: problem.parameters.scaled({"length_mm": True}),
         lambda problem: problem.parameters.toleranced({"length_mm": 10**400}),

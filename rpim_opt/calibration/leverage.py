@@ -19,7 +19,7 @@ from rpim_opt.data.record import CONFIDENCE
 from rpim_opt.problem.blocks import in_parts
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.workspace import moved, predicted, within
+from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameters import of_joint, own_name
 
@@ -194,8 +194,6 @@ def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, 
 
 # --- improvement of the flange ----------------------------------------------------------------------------------------
 
-WITHIN = 256
-"""Configurations of the joint ranges at which positions are compared."""
 WORTH = 0.9
 """A calibration whose predicted error is above this share of the nominal robot's improves nothing."""
 
@@ -282,7 +280,7 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     nominal = np.where(tools, 0.0, of_robot.nominal)
     at = np.where(tools[of_robot.identified], 0.0, result.x[columns])
     there = CalibrationProblem(problem.arms[robot], replace(of_robot, nominal=nominal), problem.alone(robot).data)
-    q = within(there)[:WITHIN]
+    q = bounding(there, None, None)
     p = predicted(there, q, None, at=at).position
     J = np.zeros((len(p), 3, len(result.x)))
     J[:, :, columns] = moved(there, q, None, at=at).slope

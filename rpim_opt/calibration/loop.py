@@ -57,6 +57,8 @@ ROUNDS, LEAST_SHARE = 20, 1 / 8
 """Rounds at most; the least share of the way to its solution from which the next round linearizes."""
 ROUGH_TOLERANCE = 1e-3
 """Tolerance of fits between two estimates of hyperparameters: the last fit is exact."""
+ROUNDS_FARTHEST = 6
+"""Rounds that choose anew where in a region the robot moves farthest: after that these stay, or they might circle."""
 
 
 @dataclass(frozen=True)
@@ -141,7 +143,7 @@ class Loop:
     formulation: Formulation
     reweigh: Squares | None = None
     options: Options = field(default_factory=Options)
-    about: Array | None = None
+    about: tuple[Array | None, Array | None] = (None, None)
 
     @property
     def scale(self) -> Array:
@@ -153,7 +155,7 @@ class Loop:
         reweigh = self.reweigh
         if reweigh is not None and before is not None:
             reweigh = reweigh.after(before)
-        return around(self.source.linearize(self.scale * z, reweigh), self.about)
+        return around(self.source.linearize(self.scale * z, reweigh), *self.about)
 
     # --- the weight ------------------------------------------------------------------------------------------
 
@@ -191,7 +193,7 @@ class Loop:
             return state.program.on_squares(state.program.inlier_model(state.z))
         x = self.scale * state.z
         inliers = inliers_of(self.formulation, *self.source.configuration_errors(x))
-        return state.program.on(around(self.source.linearize(x, inliers), self.about))
+        return state.program.on(around(self.source.linearize(x, inliers), *self.about))
 
     # --- one step --------------------------------------------------------------------------------------------
 
@@ -341,14 +343,14 @@ def minimize(
     Positions that constraints bound are linear about a point: then it runs again about its solution until they are
     those of the solution. Where solutions jump to and fro, the next round linearizes between them.
     """
-    ended = _certified(problem, formulation, weight, start, options, start)
+    ended = _certified(problem, formulation, weight, start, options, (start, None))
     if not ended.state.program.structure.predicts:
         return ended
     history = ended.state.history
-    about = ended.x
+    about = farthest = ended.x
     share, last = 1.0, np.inf
     for rounds in range(2, ROUNDS + 1):
-        ended = _certified(problem, formulation, weight, ended.x, options, about)
+        ended = _certified(problem, formulation, weight, ended.x, options, (about, farthest))
         history = (*history, *ended.state.history)
         ended = replace(ended, rounds=rounds, state=replace(ended.state, history=history))
         step = ended.x - about
@@ -359,6 +361,8 @@ def minimize(
             share = max(share / 2, LEAST_SHARE)
         about = about + share * step
         last = length
+        if rounds <= ROUNDS_FARTHEST:
+            farthest = about
     return replace(ended, settled=False)
 
 
@@ -374,7 +378,7 @@ def _certified(
     weight: float | str | Selector,
     start: Array | None,
     options: Options,
-    about: Array | None,
+    about: tuple[Array | None, Array | None],
 ) -> Ended:
     """Run the loop once; certify its end by the formulation's functions and the measurements' model, asked anew."""
     loop, state = _rested(problem, formulation, weight, start, options, about)
@@ -383,7 +387,7 @@ def _certified(
         formulation, _ = in_blocks(formulation, lambda: state.program.model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
         anew = in_parts(problem.frozen())
-        model = around(anew.linearize(loop.scale * state.z), about)
+        model = around(anew.linearize(loop.scale * state.z), *about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)
     found = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
@@ -396,7 +400,7 @@ def _rested(
     weight: float | str | Selector,
     start: Array | None,
     options: Options,
-    about: Array | None = None,
+    about: tuple[Array | None, Array | None] = (None, None),
 ) -> tuple[Loop, State]:
     source = in_parts(problem.frozen())
     solved, reweigh = formulation, None

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display
 from rpim_opt.convex.expressions import cp
-from rpim_opt.convex.given import Given, given, places, whole
+from rpim_opt.convex.given import Given, every_movement, given, places, problem_of, whole
+from rpim_opt.problem.workspace import bounding
 from rpim_opt.robot.parameters import Parameters
 
 if TYPE_CHECKING:
@@ -26,14 +27,18 @@ __all__ = [
     "by_kind",
     "by_link",
     "differences",
+    "equal",
     "in_ball",
     "parse",
+    "signed",
     "within_tolerance",
 ]
 
 Constraint = Callable[[Any, Parameters], Any]
 """From z and the identified parameters to a CVXPY constraint, or several."""
 
+WORKSPACE, BOX = "workspace", ("x", "y", "z")
+"""The place that every robot has, all its joint ranges; and what a box is given by."""
 FAR = 100.0
 """Prior scales by which the nominal robot may miss a statement: beyond, its unit or its meaning is wrong."""
 
@@ -170,6 +175,58 @@ def _at_nominal(parameters: Parameters, *patterns: str) -> tuple[Array, Array]:
     return np.where(chosen, 0.0, -np.inf), np.where(chosen, 0.0, np.inf)
 
 
+def signed(sign: int, *patterns: str) -> Box:
+    """Keep the deviations that match one of the patterns on one side: sign z_i >= 0, with sign +1 or -1.
+
+    >>> import cvxpy as cp
+    >>> import rpim_opt as ro
+    >>> positive = ro.constraints.signed(+1, "a?")
+    >>> longer = ro.Formulation("no link is shorter", penalty=cp.sum_squares, constraints=(positive,))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, longer, weight=1e-3)
+    >>> bool((result.robot.mdh[:, 1] >= result.problem.robot.mdh[:, 1]).all())
+    True
+    """
+    if sign not in (1, -1):
+        raise InputError("signed", f"sign {sign}", "+1 or -1")
+    return Box("signed", Ready("signed", _signed, (sign, *patterns)))
+
+
+def _signed(parameters: Parameters, sign: int, *patterns: str) -> tuple[Array, Array]:
+    chosen = matching(parameters, patterns, "signed")
+    return np.where(chosen & (sign > 0), 0.0, -np.inf), np.where(chosen & (sign < 0), 0.0, np.inf)
+
+
+def equal(*names: str) -> Constraint:
+    """Constrain parameters to equal values (nominal plus deviation): equal link lengths, parallel axes.
+
+    InputError for names that are not identified, fewer than two, or of different dimensions.
+
+    >>> import cvxpy as cp
+    >>> import rpim_opt as ro
+    >>> parallel = ro.constraints.equal("alpha3", "alpha4")
+    >>> stated = ro.Formulation("axes 2 to 4", penalty=cp.sum_squares, constraints=(parallel,))
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1e-3)
+    >>> (1e3 * result.robot.mdh[2:4, 0]).round(3)  # [mrad]
+    array([-0.124, -0.124])
+    """
+    return Ready("equal", _equal, names)
+
+
+def _equal(z: Any, parameters: Parameters, *names: str) -> Any:
+    k = [parameters.names.index(n) for n in names if n in parameters.names]
+    if len(k) < len(names) or len(k) < 2:
+        missing = next((n for n in names if n not in parameters.names), names[0] if names else "")
+        accepted = "identified parameters, two or more: " + choices(missing, parameters.names)
+        raise InputError("equal", f"'{missing}'", accepted)
+    if len({parameters.dimensions[i] for i in k}) > 1:
+        found = ", ".join(f"{parameters.names[i]} ({parameters.dimensions[i]})" for i in k)
+        raise InputError("equal", found, "parameters of one dimension")
+    scale, nominal = parameters.scale[k], parameters.nominal[k]
+    unit = scale.max()
+    value = cp.multiply(scale / unit, z[k]) + nominal / unit
+    return value[1:] == value[0]
+
+
 def in_ball(radius: float, *patterns: str) -> Constraint:
     """Keep the deviations that match one of the patterns in a ball: |z| <= radius, in units of the scales.
 
@@ -260,12 +317,21 @@ def _differences(parameters: Parameters, *patterns: str) -> list[Array]:
 # --- statements in words ---------------------------------------------------------------------------------------
 
 
+class Place(NamedTuple):
+    """Named joint values (N, dof) [rad or m], or a box (3, 2) [m] in the robot's base frame."""
+
+    name: str
+    is_box: bool
+    numbers: tuple[tuple[float, ...], ...]
+
+
 @dataclass(frozen=True)
 class Parsed:
-    """A constraint parsed from a text by `parse`."""
+    """A constraint parsed from a text by `parse`, with its named places."""
 
     text: str
     demanded: Sentence
+    where: tuple[Place, ...] = ()
 
     @property
     def name(self) -> str:
@@ -275,7 +341,13 @@ class Parsed:
     @property
     def stated(self) -> list[Any]:
         """The maker's name and its arguments, as a file holds them."""
-        return ["parse", self.text]
+        if not self.where:
+            return ["parse", self.text]
+        where: dict[str, Any] = {}
+        for name, is_box, numbers in self.where:
+            rows = [list(row) for row in numbers]
+            where[name] = dict(zip(BOX, rows, strict=True)) if is_box else rows
+        return ["parse", self.text, where]
 
     @property
     def unit(self) -> tuple[str, float]:
@@ -306,7 +378,7 @@ class Parsed:
         limit = self.demanded.limit / size
         if by is not None:
             limit = limit + by / size
-        if kind == "norm":
+        if kind in ("norm", "move"):
             return [cp.norm(cp.reshape(value, (count, together), order="C"), 2, axis=1) <= limit]
         if kind == "most":
             return [value <= limit]
@@ -347,6 +419,22 @@ class Parsed:
 
     def _sums(self, p: Given) -> tuple[Array, Array, Array]:
         """Return sums E z + f [SI], (K, k, n) and (K, k), of which k together are to be small, and sizes (K,) of E."""
+        if self.demanded.kind == "move":
+            known = {place.name: place for place in self.where}
+            q: list[Array] = []  # joint values (N, dof) at which movements are bounded
+            for name in self.demanded.places:
+                if name not in (*known, WORKSPACE):
+                    raise self._wrong(f"place '{name}'", choices(name, [*known, WORKSPACE]))
+                numbers = np.array(known[name].numbers) if name in known else None
+                if numbers is None or known[name].is_box:
+                    numbers = bounding(problem_of(p), numbers, p.farthest)
+                q.append(numbers)
+            found = every_movement(p, np.concatenate(q))
+            size = np.linalg.norm(found.slope, axis=(1, 2))
+            moving = size > 0
+            if not moving.any():
+                raise self._wrong("no identified parameter that moves the tool", "parameters of the robot")
+            return found.slope[moving], found.position[moving], size[moving]
         rows = [row for each in self.demanded.sums for row in self._rows(each, p)]
         E, f = np.array([[row] for row, _ in rows]), np.array([[constant] for _, constant in rows])
         size = np.linalg.norm(E[:, 0], axis=1)
@@ -392,8 +480,8 @@ class Parsed:
             yield row, constant
 
 
-def parse(text: str) -> Parsed:
-    """Parse a constraint from text: values of parameters with units.
+def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
+    """Parse a constraint from text: values of parameters with units, or a limit on the robot's movement.
 
     ::
 
@@ -402,21 +490,50 @@ def parse(text: str) -> Parsed:
         alpha2 >= 89.9 deg                89.9 deg <= alpha2 <= 90.1 deg
         d5 = nominal +- 0.1 mm            of the deviation
         norm(tool_x - 10 mm, tool_y) <= 0.05 mm
+        move at most 5 mm: workspace      |p(q; x) - p(q; 0)| at every q of a place
 
-    Parameters that are not identified are nominal. InputError for anything else, units that do not fit, demands that
-    are not convex; when it is posed, for names that the problem has not. The text is parsed, and never evaluated.
+    Parameters that are not identified are nominal. A movement is that of the robot's own parameters, not of frames,
+    at 64 configurations of a box or of all joint ranges (``workspace``); to first order about the solution.
+
+    ``where`` has places by name: joint values (dof,) or (N, dof) [rad or m], or a box ``{"x": (low, high), "y": ...,
+    "z": ...}`` [m] in the robot's base frame. InputError for anything else, units that do not fit, demands that are not
+    convex; when it is posed, for names that the problem has not. The text is parsed, and never evaluated.
 
     >>> import cvxpy as cp
+    >>> import numpy as np
     >>> import rpim_opt as ro
-    >>> statements = ("a3 + a4 = 824.0 +- 0.5 mm", "|theta4| <= 1 mrad")
-    >>> demands = [ro.constraints.parse(text) for text in statements]
+    >>> statements = ("a3 + a4 = 824.0 +- 0.5 mm", "|theta4| <= 1 mrad", "move at most 2 mm: home")
+    >>> demands = [ro.constraints.parse(text, {"home": np.zeros(6)}) for text in statements]
     >>> stated = ro.Formulation("as stated", penalty=cp.sum_squares, constraints=demands)
     >>> result = ro.calibrate(ro.load("paper_arm").problem, stated, weight=1.0)
     >>> for price in result.shadow_prices:
     ...     print(f"{price.text}: {price.multiplier:.2f} a {price.unit}")
-    a3 + a4 = 824.0 +- 0.5 mm: 26.40 a mm
-    |theta4| <= 1 mrad: 0.00 a mrad
+    a3 + a4 = 824.0 +- 0.5 mm: 68.85 a mm
+    |theta4| <= 1 mrad: 2.88 a mrad
+    move at most 2 mm: home: 131.04 a mm
     """
     from rpim_opt.convex.tolerances import sentence  # texts are parsed where there are any
 
-    return Parsed(text.strip(), sentence(text))
+    if where is not None and not isinstance(where, Mapping):
+        raise InputError("parse", f"places as {type(where).__name__}", "{'home': [0, ...]}, by name")
+    demanded = sentence(text)
+    named = tuple(_place(name, stated) for name, stated in (where or {}).items() if name in demanded.places)
+    return Parsed(text.strip(), demanded, named)
+
+
+def _place(name: str, stated: Any) -> Place:
+    accepted = "joint values (N, dof) [rad or m], or a box {'x': (low, high), 'y': ..., 'z': ...} [m]"
+    is_box = isinstance(stated, Mapping)
+    if is_box:
+        if set(stated) != set(BOX):
+            raise InputError(f"place '{name}'", f"a box of {', '.join(map(str, stated))}", accepted)
+        stated = [stated[axis] for axis in BOX]
+    try:
+        numbers = np.atleast_2d(np.asarray(stated, dtype=float))
+    except (TypeError, ValueError):
+        raise InputError(f"place '{name}'", repr(stated)[:60], accepted) from None
+    if numbers.ndim != 2 or not np.isfinite(numbers).all():
+        raise InputError(f"place '{name}'", "numbers that are not finite, or of another shape", accepted)
+    if is_box and (numbers.shape != (3, 2) or (numbers[:, 0] >= numbers[:, 1]).any()):
+        raise InputError(f"place '{name}'", "a box whose sides are not (low, high)", accepted)
+    return Place(name, is_box, tuple(map(tuple, numbers.tolist())))

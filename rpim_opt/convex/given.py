@@ -6,12 +6,14 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
+import numpy as np
+
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import fits
 from rpim_opt.convex.expressions import cp
 from rpim_opt.problem.problem import CalibrationProblem, Identified
-from rpim_opt.problem.workspace import predicted
+from rpim_opt.problem.workspace import Predicted, markers, moved, predicted
 from rpim_opt.robot.parameters import Parameters
 
 
@@ -107,6 +109,17 @@ def problem_of(p: Given) -> CalibrationProblem:
         raise InputError("positions", found, "those that a problem's linear model has (`CalibrationProblem`)")
     p.asked.append("positions")
     return p.problem
+
+
+def every_movement(p: Given, q: Array) -> Predicted:
+    """Return displacements (M, 3) [m] of every reflector by the robot's parameters, and their slopes (M, 3, n) by z.
+
+    Deviations of frames (base, reflector) do not count: they say where things stand, not how the robot is.
+    """
+    problem = problem_of(p)
+    found = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]
+    slope = np.concatenate([each.slope for each in found])
+    return Predicted(np.concatenate([each.position for each in found]), slope * p.scale)
 
 
 def given(z: Any, parameters: Parameters) -> Given:

@@ -13,18 +13,19 @@ from rpim_opt.basics.units import LARGEST, SMALLEST, UNITS
 
 ACCEPTED = {
     "constraint": "'d2 + d3 = 850.00 +- 0.05 mm', '|a2 - a3| <= 0.1 mm', 'alpha2 >= 89.9 deg', "
-    "'d5 = nominal +- 0.1 mm', or 'norm(tool_x - 10 mm, tool_y) <= 0.05 mm'",
+    "'d5 = nominal +- 0.1 mm', 'norm(tool_x - 10 mm, tool_y) <= 0.05 mm', or 'move at most 5 mm: workspace'",
     "prior": "'a2 + a3 = 612.3 +- 0.05 mm', 'a2 - 0.5 a3 = nominal +- 0.05 mm', or 'd5 +- 0.1 mm'",
 }
 LONGEST = 20_000
 """Characters of a statement: some thousand parameters."""
 DIMENSIONS = ("length", "angle", "ratio", "compliance")
 """Dimensions that parameters have."""
-Kind = Literal["equal", "most", "within", "norm"]
+Kind = Literal["equal", "most", "within", "norm", "move"]
 _NUMBER = r"(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"  # possessive: read in linear time
 _PARAMETER = re.compile(r"[\w.]+")
 _NAME = r"[A-Za-z_](?:[\w.*?]|\[[^\]]*\])*"
 _TOKEN = re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{_NAME})|(?P<sign>\+-|±|<=|>=|≤|≥|==|[-+*=|(),]))")
+_MOVE = re.compile(r"\s*move\b(?:\s+at\s+most\b)?([^:]*)(?::(.*))?")
 _SIGNS = {"±": "+-", "≤": "<=", "≥": ">=", "==": "="}
 
 
@@ -52,13 +53,15 @@ class Sentence:
     """A constraint in words.
 
     ``kind`` is ``equal`` (every sum is zero), ``most`` (none is above zero), ``within`` (none is larger than the
-    limit) or ``norm`` (all together are not). ``limit`` is in SI, ``unit`` as written, empty where no number had one.
+    limit), ``norm`` (all together are not) or ``move`` (no predicted movement at ``places`` is). ``limit`` is in SI,
+    ``unit`` as written, empty where no number had one.
     """
 
     kind: Kind
     sums: tuple[Sum, ...] = ()
     limit: float = 0.0
     unit: str = ""
+    places: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -84,7 +87,10 @@ def sentence(text: str) -> Sentence:
     >>> found.kind, found.limit, found.sums
     ('within', 5e-05, (Sum(names=('d2', 'd3'), factors=(1.0, 1.0), constant=-0.85, nominal=0),))
     """
-    return _Reader(text, "constraint").sentence()
+    moving = _MOVE.fullmatch(text) if isinstance(text, str) and len(text) <= LONGEST else None
+    if moving is None:
+        return _Reader(text, "constraint").sentence()
+    return _Reader(text, "constraint", moving[1]).movement(moving[2] or "")
 
 
 def combination(text: str) -> Combination:
@@ -108,14 +114,14 @@ def units() -> list[str]:
 class _Reader:
     """Tokens of a statement, and where among them it is."""
 
-    def __init__(self, text: str, what: str):
+    def __init__(self, text: str, what: str, part: str | None = None):
         self.text, self.what = str(text), what
         if not isinstance(text, str):
             where = "key stated" if what == "constraint" else what
             raise InputError(where, repr(text)[:60], f"a statement like {ACCEPTED[what]}")
         if len(text) > LONGEST:
             raise InputError(f"statement '{text[:60]}...'", f"{len(text)} characters", f"at most {LONGEST}")
-        part = text.rstrip()
+        part = (text if part is None else part).rstrip()
         self._tokens: list[tuple[str, str]] = []
         place = 0
         while place < len(part):
@@ -152,6 +158,16 @@ class _Reader:
             raise self._wrong(f"'{' '.join(word for _, word in self._tokens[self._at :])}'")
 
     # --- statements --------------------------------------------------------------------------------------------
+
+    def movement(self, where: str) -> Sentence:
+        limit = self._constant(self._sum())
+        self._require_end()
+        if UNITS[self.unit or "mm"].dimension != "length":
+            raise self._wrong(f"a movement in {self.unit}", "a length: 'move at most 5 mm'")
+        if not limit > 0:
+            raise self._wrong(f"a movement of {limit:g}", "a positive limit; at_nominal fixes parameters")
+        places = tuple(place.strip() for place in (where.strip() or "workspace").split(","))
+        return Sentence("move", limit=limit, unit=self.unit, places=places)
 
     def combination(self) -> Combination:
         known = self._sum()

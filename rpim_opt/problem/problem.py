@@ -592,18 +592,20 @@ class CalibrationProblem(RobotModel):
 class Identified(Parameters):
     """The n identified parameters of a linear model, with the problem that positions are predicted from.
 
-    These are linear about the deviations ``at`` (n,) [SI], or about nominal.
+    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
+    that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
     """
 
     problem: CalibrationProblem | None = None
     at: Array | None = None
+    farthest: Array | None = None
 
 
-def around(model: LinearModel, x: Array | None) -> LinearModel:
-    """Return a model that predicts positions linearly about x (n,) [SI]."""
+def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -> LinearModel:
+    """Return a model that predicts positions linearly about x (n,) [SI], regions at ``farthest``, by default x, too."""
     if x is None or not isinstance(model.parameters, Identified):
         return model
-    return replace(model, parameters=replace(model.parameters, at=x))
+    return replace(model, parameters=replace(model.parameters, at=x, farthest=x if farthest is None else farthest))
 
 
 def error_dimensions(block: Block) -> list[str]:

@@ -22,6 +22,8 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
+SOME = 128
+"""Configurations of a box, or of all joint ranges, that are always looked at; and those of all that move farthest."""
 ALL, DRAWN, ROUNDS = 2048, 4096, 16
 """Configurations that stand for a box, or all joint ranges; drawn at once to find those, and how often at most."""
 
@@ -68,7 +70,7 @@ def markers(problem: CalibrationProblem) -> list[str]:
     return list(dict.fromkeys(marker for block in problem.data.blocks for marker in block.markers))
 
 
-@lru_cache(maxsize=128)
+@lru_cache(maxsize=SOME)
 def _in_box(problem: CalibrationProblem, box: tuple[tuple[float, float], ...], marker: str | None) -> Array:
     """Return configurations (N, dof) with the nominal reflector in a box, which is asked for at every iteration."""
     low, high = np.array(box).T
@@ -93,6 +95,18 @@ def within(problem: CalibrationProblem, box: Array | None = None, marker: str | 
     if box is None:
         return random_candidates(problem.robot, ALL)
     return _in_box(problem, tuple(map(tuple, box.tolist())), marker)
+
+
+def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | None) -> Array:
+    """Return some of `within` and those of largest displacement, so that bounds hold in the whole region."""
+    q = within(problem, box)
+    if farthest is None or len(q) <= 2 * SOME:
+        return q[: 2 * SOME]
+    own = ~problem.parameters.free.of_frames
+    here = _there(problem, q[SOME:], None)
+    movement = here.modelled(farthest * own)[0] - here.modelled(np.zeros(len(own)))[0]
+    order = np.argsort(-np.linalg.norm(movement, axis=1), kind="stable")[:SOME]
+    return np.concatenate([q[:SOME], q[SOME:][order]])
 
 
 def in_base(problem: CalibrationProblem, q: Array, marker: str | None = None) -> Array:

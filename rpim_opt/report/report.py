@@ -90,13 +90,12 @@ def page(result: Calibration) -> str:
     if found is not None and not np.isfinite(found.expanded).all():
         found = None
     content = Content(result, accepted, found, composition)
-    top = [*_headline(content), ("notes", warnings)]
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
         f"Calibration: {heading}",
         f"Robot calibration report, {result.record.made[:10]}",
         heading,
-        top,
+        [*_headline(content), ("notes", warnings)],
         [(name, blocks) for name, blocks in sections if blocks],
     )
 

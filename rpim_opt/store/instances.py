@@ -265,7 +265,7 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
     formulation = named_formulation(stated.table.formulation, stated.path)
-    own = stated.table.constraints.all()
+    own = stated.table.constraints.all(problem.robot, problem.data)
     formulation = replace(formulation, constraints=(*formulation.constraints, *own))
     parameters = problem.identified
     for constraint in formulation.constraints:

@@ -54,8 +54,8 @@ ABSOLUTE = 1e-6
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sum_squares": SQUARES, "sum": SUM, "max": LARGEST, "norm1": NORM1, "norm2": NORM2, "huber": huber,
     "prior_penalty": prior_penalty,
-    **{name: getattr(constraints, name) for name in ("within_tolerance", "by_link", "by_kind", "at_nominal", "in_ball",
-                                                     "differences", "parse")},
+    **{name: getattr(constraints, name) for name in ("within_tolerance", "by_link", "by_kind", "at_nominal", "signed",
+                                                     "equal", "in_ball", "differences", "parse")},
 }  # fmt: skip
 """Functions of a formulation that a file names; those that make one are named in a list with their arguments."""
 

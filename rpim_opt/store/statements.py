@@ -8,8 +8,10 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from pydantic import ConfigDict, Field, create_model
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside
 from rpim_opt.basics.schema import Length, Name, Table, validate
@@ -17,14 +19,14 @@ from rpim_opt.basics.units import fits, number, quantities, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
-from rpim_opt.convex.constraints import Constraint, at_nominal, parse
+from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse, signed
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import JOINT_OFFSET, Parameters, is_joint_offset
 
-BOX = ("x", "y", "z")
+MEASURED = "measured"
 """The place that every problem has: the configurations of its identification data."""
 FIELDS = {
     "by": "Measured by",
@@ -77,12 +79,66 @@ class Constraints(Table):
     """The keys of ``[constraints]``."""
 
     at_nominal: list[Name] = Field(default_factory=list)
+    positive: list[Name] = Field(default_factory=list)
+    negative: list[Name] = Field(default_factory=list)
+    equal: list[list[Name]] = Field(default_factory=list)
     stated: list[str] = Field(default_factory=list)
+    places: dict[Name, dict[str, Any]] = Field(default_factory=dict)
 
-    def all(self) -> tuple[Constraint, ...]:
-        """Return the constraint functions."""
-        made = [at_nominal(*self.at_nominal)] if self.at_nominal else []
-        return (*made, *(parse(text) for text in self.stated))
+    def all(self, robot: Robot, data: Dataset) -> tuple[Constraint, ...]:
+        """Return the constraint functions for a problem with this robot and identification data."""
+        boxes = (
+            (self.at_nominal, at_nominal),
+            (self.positive, partial(signed, 1)),
+            (self.negative, partial(signed, -1)),
+        )
+        made = [make(*patterns) for patterns, make in boxes if patterns]
+        places: dict[str, Any] = {MEASURED: _rows(data, None)}
+        for name, table in self.places.items():
+            where = f"key constraints.places.{name}"
+            if name in (MEASURED, WORKSPACE):
+                raise InputError(where, "a predefined place", "another name")
+            places[name] = _place(table, robot, data, where)
+        return (*made, *(equal(*names) for names in self.equal), *(parse(text, places) for text in self.stated))
+
+
+def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) -> Any:
+    """Return joint values (N, dof) [rad or m], or the sides of a box [m]."""
+    if "rows" in table:
+        if len(table) > 1:
+            raise InputError(where, "rows and other keys", "rows alone")
+        return _rows(data, table["rows"], where)
+    joints = _joints(robot)
+    known = dict.fromkeys(BOX, ("length",)) | joints
+    if len(set(robot.joint_dimensions)) == 1:
+        known["q"] = (robot.joint_dimensions[0],)
+    values = {stem: value for (stem, _), value in quantities(table, known, where, _numbers).items()}
+    if set(values) == set(BOX):
+        return values
+    if set(values) not in ({"q"}, set(joints)):
+        accepted = "x_mm, y_mm and z_mm of a box, all joints' q1_deg, ..., q_deg of all joints, or rows = [labels]"
+        raise InputError(where, ", ".join(table) or "nothing", accepted)
+    stated = values["q"] if "q" in values else [values[name] for name in joints]
+    try:
+        q = np.array(stated, dtype=float)
+    except ValueError:
+        raise InputError(where, "lists of different lengths", f"{robot.dof} joint values a configuration") from None
+    q = q.reshape(-1, q.shape[-1] if q.ndim else 1)
+    if q.shape[1] != robot.dof:
+        raise InputError(where, f"{q.shape[1]} joint values", f"{robot.dof} a configuration")
+    return q
+
+
+def _rows(data: Dataset, labels: Any, where: str = "") -> Array:
+    """Return the joint values (N, dof) of measured rows."""
+    known = [data.label[row] for block in data.blocks for row in block.row]
+    points = [q for block in data.blocks for q in block.q]
+    chosen = [q for label, q in zip(known, points, strict=True) if labels is None or label in labels]
+    missing = [label for label in labels or [] if label not in known]
+    if missing or not chosen:
+        found = f"'{missing[0]}'" if missing else "no row"
+        raise InputError(f"{where}.rows", found, "labels of the identification data: " + choices(found, known))
+    return np.unique(np.concatenate(chosen), axis=0)
 
 
 # --- [prior] -------------------------------------------------------------------------------------------------------

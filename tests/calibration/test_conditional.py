@@ -36,7 +36,7 @@ def test_a_parameter_that_is_held_has_no_width_and_the_others_those_of_a_problem
 @pytest.mark.parametrize(
     "constraint",
     [
-        ro.constraints.parse("a2 = a3"),
+        ro.constraints.equal("a2", "a3"),
         lambda z, _: z[3] == 2 * z[8],  # an equation of one's own
         lambda z, _: cp.sum(z[:12]) <= -3.0,  # an inequality that holds
         ro.constraints.Box("no width", lambda p: (np.zeros(len(p)), np.where(np.arange(len(p)) == 4, 0.0, np.inf))),

@@ -128,9 +128,7 @@ def test_what_is_known_helps() -> None:
 def test_signs_and_balls() -> None:
     model = random_model(5, 1e2)
     positive = ro.Formulation(
-        "signed",
-        penalty=cp.sum_squares,
-        constraints=(ro.constraints.parse("a? >= nominal"), ro.constraints.parse("a1? <= nominal")),
+        "signed", penalty=cp.sum_squares, constraints=(ro.constraints.signed(1, "a?"), ro.constraints.signed(-1, "a1?"))
     )
     z = ro.convex.pose(positive, model).solve(1e-3).z
     assert (z[:10] >= 0).all()
@@ -138,11 +136,16 @@ def test_signs_and_balls() -> None:
     ball = ro.Formulation("ball", penalty=cp.sum_squares, constraints=(ro.in_ball(0.7, "a?"),))
     z = ro.convex.pose(ball, model).solve(1e-3).z
     assert np.linalg.norm(z[:10]) == pytest.approx(0.7, abs=1e-7)
-    for nothing in (ro.constraints.at_nominal(), ro.in_ball(1.0)):
+    problem, _ = simulated(("a[23]", "alpha2"), configurations=10)
+    with pytest.raises(ro.InputError, match=r"equal: found a2 \(length\), alpha2 \(angle\)"):
+        ro.calibrate(problem, ro.Formulation("x", constraints=(ro.constraints.equal("a2", "alpha2"),)))
+    for nothing in (ro.constraints.at_nominal(), ro.constraints.signed(1), ro.in_ball(1.0)):
         with pytest.raises(ro.InputError, match="found no pattern"):
             ro.convex.pose(ro.Formulation("x", constraints=(nothing,)), model)
     with pytest.raises(ro.InputError, match="at_nominal: found 'q'"):
         ro.convex.pose(ro.Formulation("x", constraints=(ro.constraints.at_nominal("q"),)), model)
+    with pytest.raises(ro.InputError, match="equal: found 'a99'"):
+        ro.convex.pose(ro.Formulation("x", constraints=(ro.constraints.equal("a1", "a99"),)), model)
 
 
 def test_an_infeasible_program_says_what_contradicts_what() -> None:

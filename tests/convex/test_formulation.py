@@ -157,5 +157,5 @@ def test_a_column_of_zeros_costs_no_warning() -> None:
     z = np.abs(result.x / free.scale)
     # theta6 moves no point on its axis: what is left there is rounding, 1e-16 for each of 26 unknowns and some passes
     assert z[free.names.index("theta6")] <= 1e-12 * z.max()
-    boxed = ro.Formulation("boxed", constraints=(ro.constraints.parse("a? >= nominal"),))
+    boxed = ro.Formulation("boxed", constraints=(ro.constraints.signed(1, "a?"),))
     assert np.isfinite(ro.calibrate(ro.load("paper_arm").problem, boxed).x).all()

@@ -16,7 +16,9 @@ from rpim_opt.convex.constraints import (
     by_kind,
     by_link,
     differences,
+    equal,
     matching,
+    signed,
     spoken,
 )
 from rpim_opt.convex.formulation import lost
@@ -102,6 +104,40 @@ def test_at_nominal_is_zero_for_what_matches() -> None:
     assert (lower == -upper).all()
 
 
+def test_signs() -> None:
+    above, below = signed(+1, "a?").bounds(P), signed(-1, "a?").bounds(P)
+    chosen = matching(P, ("a?",), "mine")
+    assert (above[0] == np.where(chosen, 0.0, -np.inf)).all()
+    assert np.isposinf(above[1]).all()
+    assert (below[1] == np.where(chosen, 0.0, np.inf)).all()
+    assert np.isneginf(below[0]).all()
+    for wrong in (0, 2, -2):
+        with pytest.raises(ro.InputError, match="sign"):
+            signed(wrong, "a?")
+
+
+def test_equal_values_nominal_included() -> None:
+    """a1 + 0.35 m is a2, and base_x is 1 m: the deviations make up for what the drawing says."""
+    lengths = equal("a1", "a2", "base_x")
+    z = np.zeros(8)
+    z[1], z[3], z[4] = 0.2 / SCALE[1], -0.15 / SCALE[3], -0.7 / SCALE[4]
+    assert met(lengths, z)
+    for i in (1, 3, 4):
+        off = z.copy()
+        off[i] += 1e-3 * SCALE[4] / SCALE[i]
+        assert not met(lengths, off)
+    assert lengths(cp.Variable(8), P).size == 2
+    for names, said in (
+        (("a1",), "'a1'"),
+        (("a1", "q"), "'q'"),
+        (("a1", "a2", "q"), "'q'"),
+        ((), "identified parameters, two or more"),
+        (("a1", "alpha1"), "one dimension"),
+    ):
+        with pytest.raises(ro.InputError, match=said):
+            equal(*names)(cp.Variable(8), P)
+
+
 def test_a_ball_of_what_matches() -> None:
     z = np.array([9.0, 3.0, 9.0, 4.0, 9.0, 9.0, 9.0, 9.0])
     assert met(ro.in_ball(5.0, "a?"), z)
@@ -136,6 +172,7 @@ def test_what_a_person_reads() -> None:
 
 def test_what_a_file_holds() -> None:
     assert at_nominal("a?", "d*").stated == ["at_nominal", "a?", "d*"]
+    assert signed(-1, "a?").stated == ["signed", -1, "a?"]
     assert ro.in_ball(2.0, "*").stated == ["in_ball", 2.0, "*"]  # type: ignore[attr-defined]
     assert ro.huber(1.5).stated == ["huber", 1.5]  # type: ignore[attr-defined]
     assert box(0.0, 1.0).stated is None
@@ -143,7 +180,7 @@ def test_what_a_file_holds() -> None:
 
 def test_ready_is_what_means_the_same_whenever_it_is_asked() -> None:
     ready = [ro.tikhonov, ro.robust, ro.bounded, ro.group_lasso]
-    ready.append(ro.Formulation("b", constraints=(at_nominal("a?"), ro.in_ball(1.0, "*"))))
+    ready.append(ro.Formulation("b", constraints=(at_nominal("a?"), ro.in_ball(1.0, "*"), equal("a1", "a2"))))
     ready.append(ro.Formulation("d", penalty=cp.sum, penalty_over=differences("a?")))
     assert all(each.ready for each in ready)
     own = [

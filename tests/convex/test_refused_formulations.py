@@ -41,6 +41,9 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "no deviation": (lambda: Prior.known("a2 - a3 = 0 mm"), "no standard deviation"),
     "groups of nothing": (lambda: Prior(groups=((),)), "names or patterns of parameters"),
     "two centres": (lambda: Prior(centre={"d5_mm": 1.0}) & Prior(centre={"d5_mm": 2.0}), "'d5_mm' as 1 and 2"),
+    "places in a list": (
+        lambda: ro.constraints.parse("move at most 2 mm: home", [0]), "places as list"  # type: ignore[arg-type]
+    ),
     "two relations of a size": (lambda: ro.constraints.parse("1 mm <= |a3| <= 2 mm"), "one relation after"),
     "a pattern that nothing identified fits": (
         lambda: drawn("|d? - nominal| <= 1 mm", identify=["a?"]), "found 'd?', accepted: identified parameters"

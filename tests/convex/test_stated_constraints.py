@@ -15,6 +15,9 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.calibration.diagnosis import ShadowPrice
 from rpim_opt.calibration.result import Calibration
 
+HOME = np.zeros((1, 6))
+FIXTURE = {"x": (0.2, 0.5), "y": (-0.2, 0.2), "z": (0.0, 0.5)}
+PLACES = {"home": HOME, "fixture": FIXTURE}
 TIGHT = {
     "a3 + d4 = 572.00 +- 0.05 mm": "0.05",
     "|a3 - nominal| <= 0.2 mm": "0.2",
@@ -23,12 +26,15 @@ TIGHT = {
     "norm(tool_x - 20 mm, tool_y) <= 1 mm": "1 mm",
     "-0.5 <= beta2 - nominal <= 0.5 mrad": "0.5",
     "|theta? - nominal| <= 0.3 mrad": "0.3",
+    "move at most 0.5 mm: workspace": "0.5",
+    "move at most 0.3 mm: home": "0.3",
+    "move at most 0.5 mm: fixture": "0.5",
 }
 """Statements that the arm of ``position`` would like to break, and the number by which each is loosened."""
 
 
 def calibrated(*texts: str, formulation: ro.Formulation = ro.tikhonov, problem: str = "position") -> Calibration:
-    demands = tuple(ro.constraints.parse(text) for text in texts)
+    demands = tuple(ro.constraints.parse(text, PLACES) for text in texts)
     result = ro.calibrate(ro.load(problem).problem, replace(formulation, constraints=demands), weight=1.0)
     assert result.converged, result.message
     return result
@@ -56,11 +62,21 @@ def priced(text: str, formulation: ro.Formulation = ro.tikhonov) -> ShadowPrice:
     return price
 
 
-@pytest.mark.parametrize("text", TIGHT)
+REGIONS = ("workspace", "fixture")
+
+
+@pytest.mark.parametrize("text", [text for text in TIGHT if not text.endswith(REGIONS)])
 def test_the_price_of_a_statement_is_the_slope_of_the_misfit(text: str) -> None:
+    """A round of positions may change z by 1e-4, and the multiplier with it."""
     price = priced(text)
     assert price.gain == pytest.approx(min(price.multiplier * price.step, price.misfit))
     assert price.text == text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("text", [text for text in TIGHT if text.endswith(REGIONS)])
+def test_so_is_that_of_movements_in_a_region(text: str) -> None:
+    priced(text)
 
 
 def test_so_is_that_of_another_loss() -> None:
@@ -77,7 +93,7 @@ def test_an_equality_is_priced_by_giving_it_a_tolerance() -> None:
 @pytest.mark.slow
 def test_ten_statements_together_have_their_own_prices() -> None:
     """Whether or not they hold: multipliers are zero where there is slack, and slack is zero where they are not."""
-    texts = (*list(TIGHT)[:7], "a2 - 0.5 a3 <= -134 mm", "a4 = 70 mm")
+    texts = (*list(TIGHT)[:7], "a2 - 0.5 a3 <= -134 mm", "a4 = 70 mm", "move at most 3 mm: home")
     result = calibrated(*texts)
     assert [price.text for price in result.shadow_prices] == list(texts)
     assert {price.text for price in result.shadow_prices if not price.holds} >= {"a2 - 0.5 a3 <= -134 mm"}
@@ -100,6 +116,27 @@ def test_statements_hold_of_the_identified_robot() -> None:
     assert 571.95 - 1e-6 <= 1e3 * (a[2] + d[3]) <= 572.05 + 1e-6
     assert np.degrees(result.robot.mdh[2, 0]) >= -0.05 - 1e-8
     assert d[0] + d[1] == pytest.approx(0.29, abs=1e-9)
+
+
+@pytest.mark.parametrize("where", ["home", "workspace", pytest.param("fixture", marks=pytest.mark.slow)])
+def test_no_movement_is_larger_than_stated(where: str) -> None:
+    """Of the robot alone, by its forward kinematics and not to first order."""
+    result = calibrated(f"move at most 0.3 mm: {where}")
+    q = HOME
+    if where != "home":
+        q = np.random.default_rng(5).uniform(*result.problem.robot.limits.T, (20000, 6))
+    frames = result.problem.parameters.of_frames[result.problem.parameters.identified]
+    robot_alone = replace(result, x=np.where(frames, 0.0, result.x))
+    before = replace(result, x=np.zeros_like(result.x)).forward(q)[:, :3, 3]
+    if where == "fixture":  # in the robot's base frame
+        tool = np.array([0.02, 0.0, 0.06, 1.0])
+        at = (ro.robot.forward_kinematics(result.problem.robot, q) @ tool)[:, :3]
+        low, high = np.array([FIXTURE[axis] for axis in "xyz"]).T
+        inside = ((at > low) & (at < high)).all(axis=1)
+        q, before = q[inside], before[inside]
+        assert len(q) > 100
+    moved = np.linalg.norm(robot_alone.forward(q)[:, :3, 3] - before, axis=1)
+    assert np.max(moved) == pytest.approx(3e-4, rel=1e-5 if where == "home" else 0.1)  # others than those asked
 
 
 def test_a_contradiction_is_named() -> None:
@@ -162,6 +199,7 @@ def test_a_name_that_is_none_is_refused() -> None:
         ("beta5 = 0 deg", "no identified parameter"),
         ("a? = d?", "patterns a? and d?"),
         ("base_rx = 0 deg", "an angle of a turned frame"),
+        ("move at most 1 mm: nowhere", "place 'nowhere'"),
     ],
 )
 def test_what_does_not_fit_the_problem_is_refused(text: str, found: str) -> None:
@@ -183,8 +221,30 @@ def test_a_bound_on_positions_holds_of_the_identified_robot() -> None:
     assert result.forward(q)[:, 2, 3].max() == pytest.approx(highest, abs=1e-8)
 
 
+def moving(text: str, places: dict[str, object]) -> Calibration:
+    demand = ro.constraints.parse(text, places)
+    return ro.calibrate(ro.load("position").problem, replace(ro.tikhonov, constraints=(demand,)), weight=1.0)
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        [[0, 0], [0]],
+        [np.nan] * 6,
+        "home",
+        {"x": (0, 1)},
+        {"x": (0, 1), "y": (1, 0), "z": (0, 1)},
+        {"x": (5, 6), "y": (5, 6), "z": (5, 6)},
+        [0, 0, 0],
+    ],
+)
+def test_places_that_are_none_are_refused(place: object) -> None:
+    with pytest.raises(InputError):
+        moving("move at most 1 mm: there", {"there": place})
+
+
 def test_a_file_keeps_statements_and_their_prices(tmp_path: Path) -> None:
-    result = calibrated("a3 + d4 = 572.00 +- 0.05 mm", "|a3 - nominal| <= 0.2 mm")
+    result = calibrated("a3 + d4 = 572.00 +- 0.05 mm", "move at most 0.3 mm: home")
     ro.store.save_result(result, tmp_path / "result.json")
     again = ro.load_result(tmp_path)
     assert again.formulation.solvable

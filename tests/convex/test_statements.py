@@ -35,11 +35,15 @@ from rpim_opt.convex.tolerances import Sentence, Sum, sentence
         ),
         ("norm(base_[xyz]) <= 2 mm", Sentence("norm", (Sum(("base_[xyz]",), (1.0,)),), 0.002, "mm")),
         ("|a1, a2| <= 2 mm", Sentence("norm", (Sum(("a1",), (1.0,)), Sum(("a2",), (1.0,))), 0.002, "mm")),
+        ("move at most 2 mm", Sentence("move", (), 0.002, "mm", ("workspace",))),
+        ("move at most 2 mm:", Sentence("move", (), 0.002, "mm", ("workspace",))),
+        (" move at most 2 mm : ", Sentence("move", (), 0.002, "mm", ("workspace",))),
+        ("move at most 2 mm: here, there", Sentence("move", (), 0.002, "mm", ("here", "there"))),
     ],
 )
 def test_a_statement_means_what_it_says(text: str, meaning: Sentence) -> None:
     found = sentence(text)
-    assert (found.kind, found.unit) == (meaning.kind, meaning.unit)
+    assert (found.kind, found.unit, found.places) == (meaning.kind, meaning.unit, meaning.places)
     assert found.limit == pytest.approx(meaning.limit, rel=1e-15)
     for one, other in zip(found.sums, meaning.sums, strict=True):
         assert (one.names, one.factors, one.nominal) == (other.names, other.factors, other.nominal)
@@ -77,6 +81,9 @@ def test_a_statement_means_what_it_says(text: str, meaning: Sentence) -> None:
         ("__import__('os')", "'os')'"),
         ("(a2) <= 1 mm", "'(' where"),
         ("a2 a3 <= 1 mm", "'a3 <= 1 mm'"),
+        ("move at most 3 deg", "a movement in deg"),
+        ("move at most 0 mm", "a movement of 0"),
+        ("move at most a2", "parameters where a number"),
         (3, "3"),
     ],
 )

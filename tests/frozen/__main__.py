@@ -28,9 +28,7 @@ INTENDED = {
     "constrained:everything": CONDITIONAL,
     "constrained:wrong_tolerance": CONDITIONAL,
     "paper_arm:parallel_axes": CONDITIONAL,
-    # cones: an interior point is exact to 1e-10 of the objective, not of x; no statement bounds positions any more, for
-    # which covariances are not conditional
-    "constrained:drawing": ("x", *CONDITIONAL),
+    "constrained:drawing": ("x",),  # cones: an interior point is exact to 1e-10 of the objective, not of x
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
     # x counts from where registration puts the base, which is exact to the root of rounding
     "seven_axis": ("x",),

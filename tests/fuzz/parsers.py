@@ -244,7 +244,7 @@ def options(data: bytes, folder: Path) -> None:
     with suppress(ro.InputError):
         _parameters().scaled({text: 1.0})
     with suppress(ro.InputError):
-        ro.constraints.parse(text)
+        ro.constraints.signed(1, text)
 
 
 PARSERS: dict[str, Callable[[bytes, Path], None]] = {

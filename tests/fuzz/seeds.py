@@ -23,7 +23,7 @@ PROBLEM = (
 )  # fmt: skip
 SENTENCES = (
     "a2 = 560 mm", "d2 + d3 = 850.00 +- 0.05 mm", "|theta2 - theta3| <= 0.1 deg", "norm(theta1, theta2) <= 2 mrad",
-    "d1 - 2*d2 >= -5 mm", "a2 = a3", "theta? = nominal +- 0.2 deg",
+    "d1 - 2*d2 >= -5 mm", "move at most 5 mm: home, workspace", "a2 = a3", "theta? = nominal +- 0.2 deg",
     "a2 ± 0.05 mm", "d[12] = 0.5 m", "|a2 - 3 mm| <= 1e-3 m",
 )  # fmt: skip
 KNOWN = (

@@ -128,7 +128,7 @@ def test_several_robots_have_no_positions() -> None:
     left, right = (simulated(("theta2", "tool_x"), 8, seed=seed)[0] for seed in (1, 2))
     both = ro.together(left=left, right=right, shared=("tool_x",))
     near = ro.Formulation(
-        "near", penalty=ro.tikhonov.penalty, constraints=lambda z, p: p.positions(np.zeros((1, 6)))[0, 2] <= 9
+        "near", penalty=ro.tikhonov.penalty, constraints=ro.constraints.parse("move at most 5 mm: workspace")
     )
     with pytest.raises(ro.InputError, match="2 in one problem"):
         ro.calibrate(both, near, 1.0)

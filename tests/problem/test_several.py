@@ -167,7 +167,7 @@ def test_every_way_of_calibrating_takes_it(how: str) -> None:
 def test_a_constraint_ties_parameters_of_two_robots() -> None:
     left, right, _ = two(other=ARM)
     whole = ro.together(left=left, right=right, shared=TOOL)
-    same = ro.Formulation("same a2", penalty=cp.sum_squares, constraints=(ro.constraints.parse("left.a2 = right.a2"),))
+    same = ro.Formulation("same a2", penalty=cp.sum_squares, constraints=(ro.constraints.equal("left.a2", "right.a2"),))
     values = by_name(whole, ro.calibrate(whole, same, weight=1.0).x)
     assert values["left.a2"] == pytest.approx(values["right.a2"], abs=1e-9)
 

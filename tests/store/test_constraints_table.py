@@ -1,4 +1,4 @@
-"""``stated`` in a problem file: eight constraints of a drawing, what says their cost, what is refused."""
+"""``stated`` in a problem file: ten constraints of a drawing, places, what says their cost, what is refused."""
 
 from __future__ import annotations
 
@@ -6,12 +6,14 @@ import json
 from pathlib import Path
 from shutil import copytree
 
+import numpy as np
 import pytest
 from typer.testing import CliRunner
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.cli import app
+from rpim_opt.convex.constraints import Parsed
 from tests import ROOT
 
 
@@ -30,10 +32,10 @@ def stating(folder: Path, text: str) -> Path:
 
 @pytest.mark.slow
 def test_a_drawing_makes_the_arm_better() -> None:
-    """True statements about it: the eight of the variant, against nothing besides the data."""
+    """True statements about it: the ten of the variant, against nothing besides the data."""
     plain, drawn = ro.load("constrained"), ro.load("constrained", "drawing")
     before, after = plain.calibrate(), drawn.calibrate()
-    assert len(after.shadow_prices) == 8
+    assert len(after.shadow_prices) == 10
     assert before.converged
     assert after.converged
     assert after.errors(drawn.validation).mean() < 0.85 * before.errors(plain.validation).mean()
@@ -55,6 +57,30 @@ def test_reports_say_what_statements_cost(tmp_path: Path) -> None:
     assert sentence in str(result)
 
 
+def test_places_are_joint_values_boxes_and_rows(folder: Path) -> None:
+    stating(
+        folder,
+        """
+[variant.places.constraints]
+stated = ["move at most 9 mm: one, two, three, four, measured"]
+[variant.places.constraints.places]
+one = { q_deg = [[0, 0, 90, 0, 90, 0], [0, 0, 90, 0, 80, 0]] }
+two = { q1_deg = 0, q2_rad = 0, q3_deg = 90, q4_deg = 0, q5_deg = 90, q6_deg = 0 }
+three = { rows = ["c1", "c3"] }
+four = { x_mm = [400, 500], y_m = [-0.3, 0.3], z_mm = [-200, 200] }
+""",
+    )
+    instance = ro.load(folder, "places")
+    (demand,) = instance.formulation.constraints
+    assert isinstance(demand, Parsed)
+    where = {place.name: np.array(place.numbers) for place in demand.where}
+    assert np.allclose(where["one"], np.radians([[0, 0, 90, 0, 90, 0], [0, 0, 90, 0, 80, 0]]))
+    assert np.allclose(where["two"], where["one"][:1])
+    assert where["three"].shape == (2, 6)
+    assert np.allclose(where["four"], [[0.4, 0.5], [-0.3, 0.3], [-0.2, 0.2]])
+    assert len(where["measured"]) == 14
+
+
 @pytest.mark.parametrize(
     ("table", "found"),
     [
@@ -64,6 +90,15 @@ def test_reports_say_what_statements_cost(tmp_path: Path) -> None:
         ('stated = ["a33 = 425 mm"]', "'a33'"),
         ('stated = "a3 = 425 mm"', "'a3 = 425 mm'"),
         ("stated = [3]", "3"),
+        ('stated = ["move at most 3 mm: nowhere"]', "place 'nowhere'"),
+        ("places.measured = { q_deg = [0, 0, 0, 0, 0, 0] }", "a predefined place"),
+        ("places.here = { q_deg = [0, 0, 0] }", "3 joint values"),
+        ("places.here = { q_mm = [0, 0, 0] }", "no unit of the right dimension"),
+        ("places.here = { q_deg = [[0, 0], [0]] }", "lists of different lengths"),
+        ("places.here = { x_mm = [0, 1] }", "x_mm"),
+        ("places.here = { }", "nothing"),
+        ('places.here = { rows = ["c99"] }', "'c99'"),
+        ("places.here = { rows = [], q_deg = 0 }", "rows and other keys"),
     ],
 )
 def test_a_table_that_does_not_fit_is_refused(folder: Path, table: str, found: str) -> None:

@@ -79,7 +79,7 @@ def test_the_evidence_for_the_weight_is_kept(tmp_path: Path, selector) -> None:
 
 
 AT_NOMINAL = ro.constraints.at_nominal("alpha[34]")
-SIGNS = (ro.constraints.parse("a[23] >= nominal"), ro.constraints.parse("a2 = a3"))
+SIGNS = (ro.constraints.signed(1, "a[23]"), ro.constraints.equal("a2", "a3"))
 FORMULATIONS = [
     ro.Formulation("own numbers", ro.huber(1.5), cp.sum_squares, (AT_NOMINAL, ro.in_ball(9.0, "a?"))),
     ro.Formulation("differences", penalty=cp.sum, penalty_over=ro.constraints.differences("a?")),
