@@ -291,9 +291,9 @@ def new(
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
             )  # fmt: skip
-    said = made.understood.content()
-    said["notes"] += made.notes
-    return Answer(made, {"written": [made.folder], **said})
+    document = made.understood.content()
+    document["notes"] += made.notes
+    return Answer(made, {"written": [made.folder], **document})
 
 
 @command
@@ -368,15 +368,15 @@ def calibrate(
             say("calibrating from all rows")
             result = refit_all(result)
         say("computing the summary")
-        found = summary(result, instance.published)
-    text = describe(result, found)
+        document = summary(result, instance.published)
+    text = describe(result, document)
     if drop_outliers:
         refitted = (
             f"Refitted without {', '.join(without)}." if without else "No flagged row to drop: nothing was refitted."
         )
         text = f"{refitted}\n\n{text}"
-    code = CODES[(found["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
-    return Answer(text, {**found, "refitted_without": without}, code, _saved(result, out))
+    code = CODES[(document["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
+    return Answer(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
 
 @command
@@ -420,12 +420,12 @@ def validate(
         from rpim_opt.use.validation import validate
 
         read = tables.read(loaded, data)
-        found = validate(loaded, read.data)
-    text, kept = _against(limit, "error", found.largest)
-    document = {**found.content(), "limit_mm": limit, "within_limit": kept}
-    failed = kept is False or found.mistake or found.worse
-    written = console.written_to(out, found.csv())
-    return Answer("\n".join([str(found), *text]), document, int(bool(failed)), written, read.left_out, read.notes)
+        validation = validate(loaded, read.data)
+    text, within = _against(limit, "error", validation.largest)
+    document = {**validation.content(), "limit_mm": limit, "within_limit": within}
+    failed = within is False or validation.mistake or validation.worse
+    written = console.written_to(out, validation.csv())
+    return Answer("\n".join([str(validation), *text]), document, int(bool(failed)), written, read.left_out, read.notes)
 
 
 @command
@@ -445,9 +445,9 @@ def accept(
 
         read = tables.read(loaded, data) if data else None
         say("searching for the maximum uncertainty")
-        found = accept(loaded, console.required(limit, box, loaded.record.requirement), read and read.data)
+        acceptance = accept(loaded, console.required(limit, box, loaded.record.requirement), read and read.data)
     left_out, notes = (read.left_out, read.notes) if read else ((), ())
-    return Answer(found, found.content(), CODES[found.verdict], left_out=left_out, notes=notes)
+    return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], left_out=left_out, notes=notes)
 
 
 @command
@@ -463,16 +463,16 @@ def iso9283(
 
     console.require_positive("--limit", limit)
     console.require_positive("--repeatability", repeatability)
-    found = read_approaches(table, units)
-    if limit is not None and found.accuracy is None:
+    performance = read_approaches(table, units)
+    if limit is not None and performance.accuracy is None:
         raise InputError("--limit", "a table without commands", "command_x_mm, command_y_mm, command_z_mm in it")
-    accuracy, kept = _against(limit, "AP_p", found.accuracy or 0.0)
-    repeated, also_kept = _against(repeatability, "RP_l", found.repeatability)
-    checked = [each for each in (kept, also_kept) if each is not None]
+    accuracy, within = _against(limit, "AP_p", performance.accuracy or 0.0)
+    repeated, also_kept = _against(repeatability, "RP_l", performance.repeatability)
+    checked = [each for each in (within, also_kept) if each is not None]
     limits = {"limit_mm": limit, "repeatability_limit_mm": repeatability}
-    document = {**found.content(), **limits, "within_limits": all(checked) if checked else None}
-    written = console.written_to(out, found.csv())
-    return Answer("\n".join([str(found), *accuracy, *repeated]), document, int(not all(checked)), written)
+    document = {**performance.content(), **limits, "within_limits": all(checked) if checked else None}
+    written = console.written_to(out, performance.csv())
+    return Answer("\n".join([str(performance), *accuracy, *repeated]), document, int(not all(checked)), written)
 
 
 @command
@@ -494,11 +494,11 @@ def update(
 
         read = tables.read(loaded, data)
         patterns = reset.replace(",", " ").split()
-        found = update(loaded, read.data, prior_inflation=prior_inflation, reset=patterns, progress=say)
-        updated = found.result
+        recalibration = update(loaded, read.data, prior_inflation=prior_inflation, reset=patterns, progress=say)
+        updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
-    failed = not (found.explained and updated.verdict.delivered)
-    return Answer(found, found.content(), int(failed), _saved(updated, out), read.left_out, read.notes)
+    failed = not (recalibration.explained and updated.verdict.delivered)
+    return Answer(recalibration, recalibration.content(), int(failed), _saved(updated, out), read.left_out, read.notes)
 
 
 @command
@@ -517,9 +517,9 @@ def monitor(
         from rpim_opt.use.monitoring import monitor
 
         read = tables.read(loaded, checks)
-        found = monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
-        written = written_checks(found, out, loaded.record.title)
-    return Answer(found, found.content(), int(found.drifts), written, read.left_out, read.notes)
+        monitoring = monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
+        written = written_checks(monitoring, out, loaded.record.title)
+    return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read.left_out, read.notes)
 
 
 @command
@@ -589,14 +589,16 @@ def compensate(
 
         read, left_out = read_commands(loaded, targets, console.table_options(units))
         say("compensating")
-        found = compensate(
+        compensation = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
             limit=float("inf") if limit is None else 1e-3 * limit,
         )  # fmt: skip
-    document = {**found.content(), "limit_mm": limit}
-    return _with_table(found, found.csv(), out, document)._replace(code=int(bool(found.missed)), left_out=left_out)
+    document = {**compensation.content(), "limit_mm": limit}
+    return _with_table(compensation, compensation.csv(), out, document)._replace(
+        code=int(bool(compensation.missed)), left_out=left_out
+    )
 
 
 @command
@@ -650,14 +652,14 @@ def design(
                 limits = measured_ranges(posed)[posed.data.blocks[0].robot].T
                 where = "\nCandidates are within the measured joint ranges (use --table for others)."
             q = random_candidates(replace(posed.robot, limits=limits), candidates, seed)
-        found = choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
-    columns = joint_cells(posed.robot, q[found.chosen], found.chosen)
+        chosen = choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
+    columns = joint_cells(posed.robot, q[chosen.chosen], chosen.chosen)
     if table is not None:
         label = read_columns(table).get("label")
         if label is not None:
-            columns["label"] = [str(label[k]) for k in found.chosen]
-    document = {"criterion": criterion, "value": found.value, "bound": found.bound, "gap": found.gap}
-    return _with_table(f"{found}{where}", columns_csv(columns), out, {**document, "configurations": columns})
+            columns["label"] = [str(label[k]) for k in chosen.chosen]
+    document = {"criterion": criterion, "value": chosen.value, "bound": chosen.bound, "gap": chosen.gap}
+    return _with_table(f"{chosen}{where}", columns_csv(columns), out, {**document, "configurations": columns})
 
 
 @command
@@ -717,18 +719,18 @@ def compare(
 
     journal = None if out is None else out / "replicates.sqlite"
     words, numbers = console.listed_words, console.listed_numbers
-    found = compare(
+    comparison = compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
         counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
         workers=workers, journal=journal, resume=resume, progress=not as_json,
     )  # fmt: skip
-    summary = found.summary(against=against)
+    summary = comparison.summary(against=against)
     written: list[Path] = []
     if out is not None and journal is not None:
-        written = [found.report(out, against=against)]
+        written = [comparison.report(out, against=against)]
         journal.unlink()
-    document = {"replicates": found.rows, "made": found.made, "notes": summary.notes}
-    return Answer(f"{found!r}\n\n{summary}", document, written=written)
+    document = {"replicates": comparison.rows, "made": comparison.made, "notes": summary.notes}
+    return Answer(f"{comparison!r}\n\n{summary}", document, written=written)
 
 
 @command
@@ -809,8 +811,8 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
     """Return a sentence on a figure [m] and its limit [mm], and whether it is kept; nothing where there is none."""
     if limit is None:
         return [], None
-    kept = 1e3 * value <= limit
-    return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if kept else 'above'} {limit:g} mm."], kept
+    within = 1e3 * value <= limit
+    return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if within else 'above'} {limit:g} mm."], within
 
 
 def main() -> None:

@@ -36,7 +36,7 @@ ENDING = ".part"
 def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> None:
     """Refuse anything but a regular file of at most ``largest`` bytes; a pipe or device may never end."""
     try:
-        found = path.stat()
+        status = path.stat()
     except FileNotFoundError:
         near: list[str] = []
         with suppress(OSError):
@@ -46,11 +46,11 @@ def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str]
         ) from None
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         raise InputError("the file", str(error), "a readable file", path) from None
-    if not stat.S_ISREG(found.st_mode):
-        kind = "a folder" if stat.S_ISDIR(found.st_mode) else "a pipe, a socket or a device"
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder" if stat.S_ISDIR(status.st_mode) else "a pipe, a socket or a device"
         raise InputError("the file", kind, "a regular file", path)
-    if found.st_size > largest:
-        raise InputError("the file", f"{found.st_size} bytes", f"a file of at most {largest} bytes", path)
+    if status.st_size > largest:
+        raise InputError("the file", f"{status.st_size} bytes", f"a file of at most {largest} bytes", path)
 
 
 def read_bytes(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> bytes:
@@ -131,11 +131,11 @@ def parse_json(text: str) -> Any:
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    found = dict(pairs)
-    if len(found) < len(pairs):
+    members = dict(pairs)
+    if len(members) < len(pairs):
         ((twice, _),) = Counter(name for name, _ in pairs).most_common(1)
         raise ValueError(f"the key '{twice}' twice in one object")
-    return found
+    return members
 
 
 def sha256_of(path: Path) -> str:

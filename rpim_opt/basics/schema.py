@@ -51,12 +51,12 @@ class Table(BaseModel):
         except InputError as error:
             key = error.where.removeprefix("key ") if error.where.startswith("key ") else ""
             raise Misfit(key, error.found, error.accepted) from None
-        found = {key: value for key, value in table.items() if key not in others}
+        converted = {key: value for key, value in table.items() if key not in others}
         for (stem, _), value in values.items():
-            if stem in found:
+            if stem in converted:
                 raise Misfit(stem, "the same quantity twice", "one of them")
-            found[stem] = value
-        return found
+            converted[stem] = value
+        return converted
 
 
 def _scaled(value: Any, where: str, si: float) -> Any:

@@ -72,11 +72,11 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
             reason = f"-2 ln L falls by {fall:.1f} with it, where {ASKED:g} are required."
             notes = (f"The population prior was left out: {reason}",)
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
-    stated = p.free.names
+    requested = p.free.names
     curved = None
     gain = 0.0
     if model == "auto" and possible(fit.problem):
-        curved = admitted(estimator, fit, stated, trials)
+        curved = admitted(estimator, fit, requested, trials)
     if curved is not None:
         fit, trials, gain = curved
         problem = problem.with_transmission(fit.problem.robot.model.curves)
@@ -85,14 +85,14 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         outliers = beyond_noise(laid, fit.x)
     if outliers:
         laid = laid.without(outliers)
-    found = learned(
+    hyperparameters = learned(
         fit,
         gain,
         trials=trials,
         left_out=tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1])),
-        added=tuple(name for name in fit.problem.parameters.free.names if name not in stated),
+        added=tuple(name for name in fit.problem.parameters.free.names if name not in requested),
     )
-    return Estimated(laid, replace(found, notes=(*notes, *found.notes)), fit.inside, fit.x)
+    return Estimated(laid, replace(hyperparameters, notes=(*notes, *hyperparameters.notes)), fit.inside, fit.x)
 
 
 def _without_outliers(

@@ -165,7 +165,7 @@ class Whitened(NamedTuple):
 
 def whitened(data: Linearized, repeatability: Repeatability, noise: Mapping[str, float]) -> list[Whitened]:
     """Return whitened equations, with derivatives of the noise by the logarithms of its variance components."""
-    found = []
+    models = []
     for stack in data.stacks:
         N, k = stack.index.shape
         L = np.linalg.cholesky(stack.covariance(repeatability))
@@ -184,8 +184,8 @@ def whitened(data: Linearized, repeatability: Repeatability, noise: Mapping[str,
         by_noise = inverse @ np.reshape(slopes, (-1, N, k, k)) @ inverse.transpose(0, 2, 1)
         y = (inverse @ data.y[stack.index][:, :, None])[:, :, 0]
         logdet = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
-        found.append(Whitened(inverse @ data.X[stack.index], y, by_noise, logdet))
-    return found
+        models.append(Whitened(inverse @ data.X[stack.index], y, by_noise, logdet))
+    return models
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,11 +211,11 @@ class Point:
 
     def falls(self, M: Array) -> Array:
         """Return the decreases (s,) of tr(M C^-1) for a symmetric M (p, p)."""
-        found = M.diagonal() @ self.own
+        derivative = M.diagonal() @ self.own
         for part in self.parts:
             blocks = part.X @ M @ part.X.transpose(0, 2, 1)
-            found[len(found) - len(part.noise) :] += np.einsum("anij,nij->a", part.noise, blocks)
-        return np.asarray(found, dtype=float)
+            derivative[len(derivative) - len(part.noise) :] += np.einsum("anij,nij->a", part.noise, blocks)
+        return np.asarray(derivative, dtype=float)
 
 
 @dataclass(frozen=True, eq=False)
@@ -366,7 +366,7 @@ class Evidence:
             if not len(start):
                 known.append(self.at(start, last))
                 continue
-            found = scipy.optimize.minimize(
+            optimum = scipy.optimize.minimize(
                 lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
                 start,
                 method="trust-exact",
@@ -375,8 +375,8 @@ class Evidence:
                 callback=explored,
                 options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
             )
-            if not is_known(found):
-                known.append(self.at(found.x, last))
+            if not is_known(optimum):
+                known.append(self.at(optimum.x, last))
         return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
@@ -386,8 +386,8 @@ class Evidence:
         """
         noisy = 3.0 * np.isin(self.names, self.noise)
         geometry = 2.0 * np.isin(np.arange(len(self.centre)), self.prior.geometry)
-        found = [self.centre + noisy, self.centre, self.centre + geometry]
-        return found[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
+        starts = [self.centre + noisy, self.centre, self.centre + geometry]
+        return starts[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
 
     def restricted(self, keep: np.ndarray) -> Evidence:
         """Return the marginal likelihood of a model with a subset of the columns (p,)."""
@@ -462,13 +462,13 @@ class Evidence:
     def _log_variances(self, of_size: Array, direct: Array, follows: Array, size2: Array, v: Array) -> Array:
         """Return the derivatives (p, s) of ln v, an implicit equation for Student-t deviations."""
         heavy, tails = self._heavy, self.prior.tails
-        found = of_size.copy()
-        found[heavy] = 0.0
+        logs = of_size.copy()
+        logs[heavy] = 0.0
         if len(heavy):
-            wanted = tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ found
+            wanted = tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ logs
             system = np.diag((tails + 1) * v[heavy]) - follows[heavy][:, heavy]
-            found[heavy] = np.linalg.solve(system, wanted)
-        return found
+            logs[heavy] = np.linalg.solve(system, wanted)
+        return logs
 
 
 def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -> tuple[Array, Array, Array, Array]:

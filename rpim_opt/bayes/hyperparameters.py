@@ -247,18 +247,18 @@ class Estimator:
     def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, iterations: int) -> Fit:
         """Estimate hyperparameters at one linearization, starting from given values (s,) and from several starts."""
         p = problem.parameters
-        stated = self.prior.stated(p)
-        evidence = self.evidence(problem, x, stated)
+        prior = self.prior.stated(p)
+        evidence = self.evidence(problem, x, prior)
         starts = [] if known is None else [known]
         if several:
             starts += sides(problem, evidence)
         point, *others = evidence.optima(starts)
         scale = p.scale.copy()
-        scale[p.identified] *= stated.scale * np.sqrt(point.v)
+        scale[p.identified] *= prior.scale * np.sqrt(point.v)
         repeatability = replace(evidence.repeatability(point.logs), at=parameter_values(problem, x))
         laid = replace(problem, parameters=replace(p, scale=scale), repeatability=repeatability)
-        mean = p.free.scale * (stated.centre + stated.scale * point.z)
-        fit = Fit(problem, stated, evidence, point, others, laid, mean)
+        mean = p.free.scale * (prior.centre + prior.scale * point.z)
+        fit = Fit(problem, prior, evidence, point, others, laid, mean)
         if self.refit is None or _distance(mean, x, laid) <= CLOSE:  # near enough for one linearization
             return fit
         return replace(fit, x=self.refit(laid, fit.inside.penalized(tikhonov), x, iterations))

@@ -82,7 +82,7 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
 
     Of harmonics those of joints that turned far enough.
     """
-    found: dict[str, list[str]] = {}
+    names_of: dict[str, list[str]] = {}
     known = set(problem.parameters.free.names)
     for robot, arm in problem.arms.items():
         travel = np.ptp(problem.alone(robot).joint_values, axis=0)
@@ -90,14 +90,14 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
             if extension in TURNED:
                 turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[extension]}
                 names = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
-            found.setdefault(extension, []).extend(problem.parameters.called(robot, name) for name in names)
+            names_of.setdefault(extension, []).extend(problem.parameters.called(robot, name) for name in names)
     prefixes = {session_prefix(name) for name in problem.data.sessions}
     if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions differ from configurations
-        found[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
+        names_of[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
     grows = [n for n in problem.parameters.names if own_name(n) == EXPANSION]
     if grows and np.ptp(problem.data.temperatures) > 0:
-        found[WARMTH] = grows
-    new = {extension: tuple(dict.fromkeys(n for n in names if n not in known)) for extension, names in found.items()}
+        names_of[WARMTH] = grows
+    new = {extension: tuple(dict.fromkeys(n for n in names if n not in known)) for extension, names in names_of.items()}
     return {extension: names for extension, names in new.items() if names}
 
 
@@ -166,19 +166,19 @@ class Models:
         possible = [
             tuple(extension for extension in candidate if extension in self.extensions) for candidate in CANDIDATES
         ]
-        found = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
-        best = min(found, key=lambda each: each.price)
+        candidates = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
+        best = min(candidates, key=lambda each: each.price)
         further = FURTHER if len(np.unique(self.problem.data.configuration)) >= MANY else {}
         for extension, beside in further.items():
             if extension in self.extensions:
                 more = (*best.extensions, beside, extension)
                 arm = [each for each in ARM if each in more and each in self.extensions]
-                found.append(price((*arm, *conditions)))
-                best = min(best, found[-1], key=lambda each: each.price)
+                candidates.append(price((*arm, *conditions)))
+                best = min(best, candidates[-1], key=lambda each: each.price)
         kept = tuple(extension for extension in best.extensions if extension not in conditions)
         for count in range(len(conditions)):
-            found += [price((*kept, *some)) for some in combinations(conditions, count)]
-        return found
+            candidates += [price((*kept, *some)) for some in combinations(conditions, count)]
+        return candidates
 
 
 def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]]:
@@ -196,12 +196,12 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
             known[conditions] = _hyperparameters(evidence, point)
         return Candidate(point.value + GAIN * questions(candidate), candidate, point)
 
-    found = sorted(models.compared(price), key=lambda each: each.price)
-    trials = tuple(Trial(each.extensions, each.found.value) for each in found)
-    if not found[0].extensions:
+    candidates = sorted(models.compared(price), key=lambda each: each.price)
+    trials = tuple(Trial(each.extensions, each.found.value) for each in candidates)
+    if not candidates[0].extensions:
         return fit, trials
-    whole = extended(fit.problem, models.added(found[0].extensions))
-    return estimator.fit(whole, deviations(whole, deviation), found[0].found.logs, ROUNDS), trials
+    whole = extended(fit.problem, models.added(candidates[0].extensions))
+    return estimator.fit(whole, deviations(whole, deviation), candidates[0].found.logs, ROUNDS), trials
 
 
 def questions(extensions: Sequence[str]) -> int:
@@ -287,8 +287,8 @@ class Comparison(Models):
         learned = self.result.learned
         if learned is not None and learned.trials:  # it was selected then
             return self.plain
-        found = [self._price(()), *self.compared(self._price)]
-        return min(found, key=lambda each: each.price).found
+        candidates = [self._price(()), *self.compared(self._price)]
+        return min(candidates, key=lambda each: each.price).found
 
     def _price(self, extensions: tuple[str, ...]) -> Candidate:
         model = self.plain

@@ -69,7 +69,7 @@ def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
     for block in problem.data.blocks:
         dimensions = error_dimensions(block)
         components[block.row] = [dimensions.count("length"), dimensions.count("angle")]
-    found = np.zeros(len(problem.data))
+    ratios = np.zeros(len(problem.data))
     for dimension, counts in zip(("length", "angle"), components.T, strict=True):
         if not counts.any():
             continue
@@ -78,8 +78,8 @@ def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
             rows = np.flatnonzero(counts == k)
             median = max(float(np.median(errors[rows])), 1e-12)
             as_rare = np.sqrt(chdtri(int(k), FALSE_RATE) / chdtri(int(k), 0.5)) / BEYOND
-            found[rows] = np.maximum(found[rows], errors[rows] / median / as_rare)
-    return found
+            ratios[rows] = np.maximum(ratios[rows], errors[rows] / median / as_rare)
+    return ratios
 
 
 def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
@@ -135,9 +135,9 @@ def outlier_candidates(problem: CalibrationProblem, x: Array, scale: Array, spar
 
 def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
     """Return which rows (r,) have errors like their neighbours in joint space: a model error, not outliers."""
-    found = np.zeros(len(rows), dtype=bool)
+    member = np.zeros(len(rows), dtype=bool)
     if len(rows) < NEIGHBOURS:
-        return found
+        return member
     q = problem.data.q
     unit = (q - q.mean(axis=0)) / (q.std(axis=0) + 1e-9)
     errors = np.nan_to_num(error_vectors(problem, x))
@@ -150,12 +150,12 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
         apart = np.sum((unit - unit[i]) ** 2, axis=1)
         apart[(together == together[i]) | (whose != whose[i])] = np.inf
         j = int(np.argmin(apart))
-        found[k] = j in rows and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
-    pairs = np.ceil(found.sum() / 2)  # two are each other's neighbour
+        member[k] = j in rows and errors[i] @ errors[j] > ALIKE * length[i] * length[j]
+    pairs = np.ceil(member.sum() / 2)  # two are each other's neighbour
     expected = len(rows) ** 2 / len(q) * (1 - ALIKE) / 2  # dealt out at random, in random directions
     if pairs and pdtrc(pairs - 1, expected) >= RUN:
-        found[:] = False
-    return found
+        member[:] = False
+    return member
 
 
 def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
@@ -191,18 +191,18 @@ def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
 
 def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]) -> dict[str, float]:
     """Return the excluded rows that a fit without them, x (n,) with covariance (n, n) [SI], cannot explain."""
-    kept = dict(labels)
+    reasons = dict(labels)
     residual, J = problem.slopes(x)
     parts = by_block(problem, np.column_stack([residual, J]))
     for (block, part), V in zip(parts, problem.covariances(), strict=True):
         k = len(block.measurement.components)
-        asked = np.array([problem.labels[row] in labels for row in block.row])
-        r, slopes = part[asked][:, :, :1], part[asked][:, :, 1:]
-        S = slopes @ covariance @ slopes.transpose(0, 2, 1) + np.broadcast_to(V, (len(block.row), k, k))[asked]
+        labelled = np.array([problem.labels[row] in labels for row in block.row])
+        r, slopes = part[labelled][:, :, :1], part[labelled][:, :, 1:]
+        S = slopes @ covariance @ slopes.transpose(0, 2, 1) + np.broadcast_to(V, (len(block.row), k, k))[labelled]
         squares = np.sum(r * np.linalg.solve(S, r), axis=(1, 2))
-        for row in block.row[asked][chdtrc(k, squares) > FALSE_RATE]:
-            kept.pop(problem.labels[row])
-    return kept
+        for row in block.row[labelled][chdtrc(k, squares) > FALSE_RATE]:
+            reasons.pop(problem.labels[row])
+    return reasons
 
 
 def contradicted(
@@ -228,7 +228,7 @@ def contradicted(
     if spare > 1:
         sigma2 = max(1.0, float(np.sum((rest.A @ z - rest.b) ** 2)) / spare)
     rare = RARE / len(np.unique(model.group))
-    found = []
+    outlying = []
     for number in groups:
         A = model.A[model.group == number]
         e = A @ z - model.b[model.group == number]
@@ -237,5 +237,5 @@ def contradicted(
         if sigma2 > 1:  # it was estimated: Fisher's F
             chance = fdtrc(len(A), spare, squares / len(A))
         decided = np.linalg.norm(A @ undecided) <= UNDECIDED * np.linalg.norm(A)
-        found.append(bool(decided and chance < rare))
-    return np.array(found, dtype=bool)
+        outlying.append(bool(decided and chance < rare))
+    return np.array(outlying, dtype=bool)

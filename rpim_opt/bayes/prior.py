@@ -203,11 +203,11 @@ class Prior:
         keys = []
         for name, dimension in zip(free.names, free.dimensions, strict=True):
             own = own_name(name)
-            stated = [group for group in self.groups if any(fits(name, pattern) for pattern in group)]
+            groups = [group for group in self.groups if any(fits(name, pattern) for pattern in group)]
             if own.startswith(f"{BASE}_"):
                 keys.append(BASE)
-            elif stated:
-                keys.append(" ".join(stated[0]))
+            elif groups:
+                keys.append(" ".join(groups[0]))
             elif of_session(name):
                 keys.append(SESSIONS[dimension])
             elif is_joint_offset(name):
@@ -223,5 +223,5 @@ class Prior:
 
 def kind_of(name: str) -> str:
     """Return the model extension of a non-geometric parameter: ``ecc`` for ``ecc_cos3``."""
-    found = _KIND.match(own_name(name))
-    return found[1] if found else own_name(name)
+    match = _KIND.match(own_name(name))
+    return match[1] if match else own_name(name)

@@ -68,8 +68,8 @@ class Stated:
     @property
     def plain(self) -> bool:
         """Whether it consists of the parameters' scales alone."""
-        said = self.centre.any() or len(self.rows) or self.replaced.any()
-        return not said and bool((self.scale == 1).all())
+        informative = self.centre.any() or len(self.rows) or self.replaced.any()
+        return not informative and bool((self.scale == 1).all())
 
     def inside(self, size: Array) -> Stated:
         """Return the same for parameters whose scales have been multiplied by ``size`` (n,): ``scale`` is 1 there."""
@@ -268,11 +268,11 @@ def known(text: str) -> Statement:
     """Return the statement that a combination of parameters has a known value, as of `Prior.known`."""
     from rpim_opt.convex.tolerances import combination  # texts are read where there are any
 
-    said = combination(text)
-    row = tuple(factor / said.sd for factor in said.factors)
-    reference = None if said.nominal else (0.0,) * len(row)
-    dimensions = (said.dimension,) * len(row)
-    return Statement(said.names, dimensions, (row,), (said.value / said.sd,), reference, text=text.strip())
+    combined = combination(text)
+    row = tuple(factor / combined.sd for factor in combined.factors)
+    reference = None if combined.nominal else (0.0,) * len(row)
+    dimensions = (combined.dimension,) * len(row)
+    return Statement(combined.names, dimensions, (row,), (combined.value / combined.sd,), reference, text=text.strip())
 
 
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
@@ -301,23 +301,23 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
         parts.append(np.sqrt(spread.weight / variance) * form.matrix)
     if isinstance(without, str):
         without = without.split()
-    kept = np.arange(len(free))
+    chosen = np.arange(len(free))
     if without:
-        kept = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
-    if not len(kept):
+        chosen = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
+    if not len(chosen):
         raise InputError("Prior.from_result, without", "every parameter", "patterns that keep at least one")
     R = triangle_of(np.vstack(parts))
     if spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
         moved = R @ (spread.drift / free.scale[:, None])
         R = np.linalg.solve(np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T), R)
-    rows, _ = marginal(R, np.zeros(len(free)), kept)
-    rows = triangle_of(rows) / (free.scale[kept] * inflate)
+    rows, _ = marginal(R, np.zeros(len(free)), chosen)
+    rows = triangle_of(rows) / (free.scale[chosen] * inflate)
     return Statement(
-        names=tuple(free.names[i] for i in kept),
-        dimensions=tuple(free.dimensions[i] for i in kept),
+        names=tuple(free.names[i] for i in chosen),
+        dimensions=tuple(free.dimensions[i] for i in chosen),
         rows=listed(rows),
-        values=tuple((rows @ result.x[kept]).tolist()),
-        reference=tuple(free.nominal[kept].tolist()),
+        values=tuple((rows @ result.x[chosen]).tolist()),
+        reference=tuple(free.nominal[chosen].tolist()),
         whole=True,
         text="an earlier result",
     )

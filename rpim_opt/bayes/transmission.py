@@ -53,15 +53,15 @@ def possible(problem: CalibrationProblem) -> bool:
 
 def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
     """Return the columns (m, c) of all coefficients, from joint values and derivatives by them (m, dof)."""
-    found = [np.zeros((len(q), 0))]
+    columns = [np.zeros((len(q), 0))]
     for curve in curves:
         joint, half = curve.joint - 1, curve.period / 2
         moved = q[:, joint] - curve.centre
         waves = np.outer(moved, np.arange(1, curve.waves + 1))
         repeated = np.outer(np.pi / half * np.clip(moved, -half, half), np.arange(1, curve.harmonics + 1))
         angles = np.hstack([waves, repeated])
-        found.append(slopes[:, [joint]] * np.hstack([np.cos(angles), np.sin(angles)]))
-    return np.hstack(found)
+        columns.append(slopes[:, [joint]] * np.hstack([np.cos(angles), np.sin(angles)]))
+    return np.hstack(columns)
 
 
 def admitted(
@@ -80,13 +80,13 @@ def admitted(
     models = Models(bare, estimator, deviation, skip=(SECOND,))
     used = np.isin(models.names, p.free.names)
     before = named(fit.problem, fit.point.v)
-    given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
+    columns_given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
     start = np.log([max(getattr(fit.laid.repeatability, kind), LEAST) for kind in models.columns.noise])
-    plain = given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
-    found = _most_likely(given, models, plain)
-    if found is None:
+    plain = columns_given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
+    likeliest = _most_likely(columns_given, models, plain)
+    if likeliest is None:
         return None
-    point, curves, columns = found
+    point, curves, columns = likeliest
     rest = _integrated(models.columns, columns, point)
     kept = {"gravity"}.intersection(trials[0].extensions)
 

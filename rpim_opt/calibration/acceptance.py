@@ -61,11 +61,11 @@ class Region:
         """Return whether configurations (N, dof) are in the region (N,), with a margin as a fraction of its ranges."""
         low, high = self.limits.T
         spare = slack * (high - low)
-        found = ((q >= low - spare) & (q <= high + spare)).all(axis=1)
-        if self.box is not None and found.any():
-            at = in_base(self.problem, q[found], self.marker)
-            found[found] = ((at >= self.box[:, 0]) & (at <= self.box[:, 1])).all(axis=1)
-        return found
+        inside = ((q >= low - spare) & (q <= high + spare)).all(axis=1)
+        if self.box is not None and inside.any():
+            at = in_base(self.problem, q[inside], self.marker)
+            inside[inside] = ((at >= self.box[:, 0]) & (at <= self.box[:, 1])).all(axis=1)
+        return inside
 
     def drawn(self) -> Array:
         """Return configurations (N, dof) that represent the region; InputError if none reaches the box."""
@@ -142,8 +142,8 @@ def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: 
 
 def reaching(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
     """Return predicted positions (N, 3) [m] at configurations (N, dof), and their expanded uncertainties (N,)."""
-    found = Uncertainty(result, confidence).predict(q, region.marker, of="reached")
-    return found.position, distance_quantile(found.covariance, result.freedom, confidence)
+    prediction = Uncertainty(result, confidence).predict(q, region.marker, of="reached")
+    return prediction.position, distance_quantile(prediction.covariance, result.freedom, confidence)
 
 
 def distance_quantile(covariance: Array, freedom: float, probability: float) -> Array:
@@ -160,12 +160,12 @@ def distance_quantile(covariance: Array, freedom: float, probability: float) -> 
     trace = np.trace(covariance, axis1=1, axis2=2)
     known = np.isfinite(trace)
     S = covariance[known]
-    found = np.full(len(covariance), np.inf)
+    quantile = np.full(len(covariance), np.inf)
     squares = np.einsum("nij,nji->n", S, S)
     h = trace[known] ** 2 / np.maximum(squares, np.finfo(float).tiny)
     h = np.clip(h, 1.0, covariance.shape[1])
-    found[known] = np.sqrt(trace[known] * fdtri(h, max(freedom, 1.0), probability))
-    return found
+    quantile[known] = np.sqrt(trace[known] * fdtri(h, max(freedom, 1.0), probability))
+    return quantile
 
 
 # --- the verdict ------------------------------------------------------------------------------------------------------
@@ -215,16 +215,16 @@ class Acceptance:
 
     def sentences(self) -> list[str]:
         """Return the verdict and its grounds, sentence by sentence."""
-        asked = self.requirement
-        said = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Inconclusive"}[self.verdict]
-        limit = f"limit {1e3 * asked.limit:g} mm with {percent(asked.confidence)} confidence"
-        lines = [f"{said}: {limit} at every configuration of the region.", f"Region: {asked.where}."]
-        found = self.workspace
-        if found is not None and np.isfinite(found.largest):
+        requirement = self.requirement
+        verdict = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Inconclusive"}[self.verdict]
+        limit = f"limit {1e3 * requirement.limit:g} mm with {percent(requirement.confidence)} confidence"
+        lines = [f"{verdict}: {limit} at every configuration of the region.", f"Region: {requirement.where}."]
+        workspace = self.workspace
+        if workspace is not None and np.isfinite(workspace.largest):
             lines.append(
-                f"Expanded uncertainty of the position reached (U, {percent(asked.confidence)}): at most "
-                f"{1e3 * found.largest:.3f} mm (largest of {found.count} configurations, refined by a search), median "
-                f"{1e3 * found.typical:.3f} mm."
+                f"Expanded uncertainty of the position reached (U, {percent(requirement.confidence)}): at most "
+                f"{1e3 * workspace.largest:.3f} mm (largest of {workspace.count} configurations, refined by a search), "
+                f"median {1e3 * workspace.typical:.3f} mm."
             )
             lines.append("It is the uncertainty of the reflector; `compensate --tool` states that of another point.")
         if self.held_out is not None:
@@ -237,21 +237,21 @@ class Acceptance:
 
     def content(self) -> dict[str, Any]:
         """Return the same as a document [mm]."""
-        r, found = self.requirement, self.workspace
+        r, workspace = self.requirement, self.workspace
         box = None
         if r.box is not None:
             box = {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
-        lengths = {"bound": self.bound, "typical": found and found.typical, "repeatability": self.repeatability}
+        lengths = {"bound": self.bound, "typical": workspace and workspace.typical, "repeatability": self.repeatability}
         return {
             "verdict": self.verdict,
             "limit_mm": 1e3 * r.limit,
             "confidence": r.confidence,
             "region": r.where,
             "box_mm": box,
-            "configurations": 0 if found is None else found.count,
+            "configurations": 0 if workspace is None else workspace.count,
             **{f"{k}_mm": None if v is None or not np.isfinite(v) else 1e3 * v for k, v in lengths.items()},
-            "worst": found and found.q[-1].tolist(),
-            "place_mm": found and (1e3 * found.position[-1]).tolist(),
+            "worst": workspace and workspace.q[-1].tolist(),
+            "place_mm": workspace and (1e3 * workspace.position[-1]).tolist(),
             "checked": self.held_out and {k: v for k, v in self.held_out.items() if k != "sentence"},
             "reasons": list(self.reasons),
         }
@@ -338,9 +338,9 @@ def _held_out(
     excluded: list[str] = []
     moved = ""
     if apart is not None:
-        found = judged(result, apart)
-        error, (sigmas, allowed, coverage) = result.errors(apart), found
-        moved = displaced(result, apart, found)
+        intervals = judged(result, apart)
+        error, (sigmas, allowed, coverage) = result.errors(apart), intervals
+        moved = displaced(result, apart, intervals)
     elif held is not None:
         excluded = excluded_by_fit(result)
         kept = ~np.isin(held.label, excluded)
@@ -355,9 +355,9 @@ def _held_out(
         points = [region.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
         inside[block.row] &= np.all(points, axis=0)
         lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
-        stated = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
+        covariance = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
         if lengths:
-            of_lengths = stated[:, lengths][:, :, lengths]
+            of_lengths = covariance[:, lengths][:, :, lengths]
             instrument[block.row] = distance_quantile(of_lengths, STATED, requirement.confidence)
     missing = [apart.label[i] for i in np.flatnonzero(inside & (error > requirement.limit + instrument))]
     unexplained = np.nan_to_num(sigmas) > np.nan_to_num(allowed, nan=np.inf)
@@ -420,12 +420,12 @@ def repeatability_bounds(result: Calibration, region: Region, q: Array, confiden
         learned = {} if result.learned is None else result.learned.noise
         least = {k: 0.0 if s.spread > VAGUE else s.value * float(np.exp(-2 * s.spread)) for k, s in learned.items()}
         results.append(replace(result, problem=result.problem.with_repeatability(replace(repeatability, **least))))
-    found = [0.0, 0.0]
+    bounds = [0.0, 0.0]
     for i, each in enumerate(results):
         mean, reached = (each.predict(q[None], region.marker, of=of).covariance for of in ("mean", "reached"))
         if np.isfinite(mean).all():
-            found[i] = float(distance_quantile(reached - mean, each.freedom, confidence)[0])
-    return found[0], found[1]
+            bounds[i] = float(distance_quantile(reached - mean, each.freedom, confidence)[0])
+    return bounds[0], bounds[1]
 
 
 def _unmodelled(result: Calibration, region: Region) -> list[str]:

@@ -72,7 +72,7 @@ def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
         return problem.linearize(scale * z).A
 
     jac: Any = slope
-    found = scipy.optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         residual, np.zeros_like(scale), jac=jac, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200
     )
-    return Baseline(scale * found.x, int(found.nfev), "Levenberg-Marquardt")
+    return Baseline(scale * solution.x, int(solution.nfev), "Levenberg-Marquardt")

@@ -94,10 +94,10 @@ def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: A
     directions = rng.normal(size=(DIRECTIONS, len(z)))
     for direction in directions:
         exact = model.A @ direction
-        found = slope(direction)
-        if found.shape != exact.shape or not np.isfinite(found).all():
+        difference = slope(direction)
+        if difference.shape != exact.shape or not np.isfinite(difference).all():
             return model
-        if np.linalg.norm(found - exact) > INEXACT * np.linalg.norm(exact):
+        if np.linalg.norm(difference - exact) > INEXACT * np.linalg.norm(exact):
             A = np.column_stack([slope(unit) for unit in np.eye(len(z))])
             return replace(model, A=A, b=residual(z) + A @ z)
     return model

@@ -74,10 +74,10 @@ class Spread:
     @cached_property
     def prior(self) -> Array:
         """Mean-square bias (n, n) [SI] due to the penalty, mostly in unidentifiable directions."""
-        found = self._in_si(self.form.prior(self.weight))
+        covariance = self._in_si(self.form.prior(self.weight))
         if self.drift is not None:
-            found = found + self.drift @ self.drift.T
-        return found
+            covariance = covariance + self.drift @ self.drift.T
+        return covariance
 
     @cached_property
     def covariance(self) -> Array:
@@ -93,13 +93,13 @@ class Spread:
         Variances are infinite where an undecided direction moves the position; where none does they are finite, even
         if no parameter alone is known.
         """
-        found = J @ (self.noise + self.prior) @ J.transpose(0, 2, 1)
+        covariance = J @ (self.noise + self.prior) @ J.transpose(0, 2, 1)
         slopes = J * self.linear.parameters.scale
         moved = np.linalg.norm(slopes @ self.form.undecided(self.weight), axis=2)
         size = np.linalg.norm(slopes, axis=(1, 2))
         for i, axis in zip(*np.nonzero(moved > UNDECIDED * size[:, None]), strict=True):
-            found[i, axis, axis] = np.inf
-        return found
+            covariance[i, axis, axis] = np.inf
+        return covariance
 
 
 # --- noise of readings ------------------------------------------------------------------------------------------------

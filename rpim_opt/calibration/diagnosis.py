@@ -94,13 +94,13 @@ def active_bounds(program: Program, z: Array, weight: float) -> tuple[ActiveBoun
     loss = program.value(z)[0]
     rows = program.model.equations
     near = np.minimum(z - box[0], box[1] - z) < ACTIVE * (1 + np.abs(z))
-    found: list[ActiveBound] = []
+    bounds: list[ActiveBound] = []
     for i in np.flatnonzero((multiplier > ACTIVE * loss / rows) & near & (box[0] < box[1])):
         bound = float(min((box[0][i], box[1][i]), key=lambda side: abs(z[i] - side)))
         less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
         gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
-        found.append(ActiveBound(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
-    return tuple(sorted(found, key=lambda h: -h.gain))
+        bounds.append(ActiveBound(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
+    return tuple(sorted(bounds, key=lambda h: -h.gain))
 
 
 def shadow_prices(program: Program, z: Array, weight: float) -> tuple[ShadowPrice, ...]:
@@ -111,7 +111,7 @@ def shadow_prices(program: Program, z: Array, weight: float) -> tuple[ShadowPric
     parameters = program.model.parameters
     duals = program.beginning(z).solve(weight).duals
     misfit = program.objective(z, weight)
-    found = []
+    prices = []
     for parsed, multipliers in zip(constraints, duals, strict=True):
         if not isinstance(parsed, Parsed):
             continue
@@ -123,10 +123,10 @@ def shadow_prices(program: Program, z: Array, weight: float) -> tuple[ShadowPric
         if met or multiplier * scale <= ACTIVE * max(misfit, ACTIVE):  # an interior point's multipliers are not zero
             multiplier = 0.0
         gain = min(multiplier * parsed.step, misfit)
-        found.append(
+        prices.append(
             ShadowPrice(parsed.text, unit, max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit)
         )
-    return tuple(found)
+    return tuple(prices)
 
 
 # --- extrapolation ----------------------------------------------------------------------------------------------------
@@ -160,11 +160,11 @@ def measured_ranges(problem: Source) -> dict[str, Array]:
 
 def widest(ranges: Iterable[tuple[str, Array]]) -> dict[str, Array]:
     """Return the union of ranges (2, dof), by robot."""
-    found: dict[str, Array] = {}
+    corrections: dict[str, Array] = {}
     for robot, (low, high) in ranges:
-        least, most = found.get(robot, (low, high))
-        found[robot] = np.stack([np.minimum(least, low), np.maximum(most, high)])
-    return found
+        least, most = corrections.get(robot, (low, high))
+        corrections[robot] = np.stack([np.minimum(least, low), np.maximum(most, high)])
+    return corrections
 
 
 def outside(ranges: Mapping[str, Array], data: Dataset) -> Outside:

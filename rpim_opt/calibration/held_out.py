@@ -125,16 +125,16 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     apart = result.record.validation if validation is None else validation
     if apart is None:
         raise InputError("validation", "no held-out rows", "a calibration with validation data")
-    stated = result.stated
-    if not stated.keeps_rows:
+    original = result.stated
+    if not original.keeps_rows:
         raise InputError("refit_all", "data in blocks", "measurements in memory")
-    used = len(stated.data)
-    whole = Dataset.together([stated.data, apart], ["identification", "validation"])
+    used = len(original.data)
+    whole = Dataset.together([original.data, apart], ["identification", "validation"])
     errors = result.nominal_errors(apart), result.errors(apart)
     held_out = HeldOut(whole.label[used:], used, *errors, *judged(result, apart))
     record = replace(result.record, validation=None, held_out=held_out)
-    found = result.asked(stated.on(whole))
-    if found.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
-        left_out = (*result.learned.left_out, *found.learned.left_out)
-        found = replace(found, learned=replace(found.learned, left_out=left_out))
-    return replace(found, record=record)
+    refitted = result.asked(original.on(whole))
+    if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
+        left_out = (*result.learned.left_out, *refitted.learned.left_out)
+        refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))
+    return replace(refitted, record=record)

@@ -159,7 +159,7 @@ def calibrate(
             prior = (prior or Prior()) & Prior(statements=tuple(zeros))
         elsewhere = relocated(problem)
     problem = elsewhere or problem
-    asked: Callable[[Source], Calibration] = partial(
+    again: Callable[[Source], Calibration] = partial(
         calibrate,
         formulation=formulation,
         weight=weight,
@@ -183,8 +183,8 @@ def calibrate(
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
-    said = [ending(ended, max_iterations), ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""]
-    message = " ".join(filter(None, said))
+    sentences = [ending(ended, max_iterations), ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""]
+    message = " ".join(filter(None, sentences))
     LOGGER.info(message)
     return Calibration(
         problem=problem,
@@ -197,7 +197,7 @@ def calibrate(
         history=ended.state.history,
         program=ended.state.program,
         certificate=ended.certificate,
-        asked=mapped_as(mapping, asked),
+        asked=mapped_as(mapping, again),
         learned=learned,
         mapping=mapping,
     )

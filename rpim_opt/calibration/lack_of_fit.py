@@ -297,8 +297,8 @@ def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
     squares = {"instrument": 0.0, "position": 0.0, "joint": 0.0}
     for stack in model.evidence.data.stacks:
         which = stack.of(compared.dimension)
-        stated = np.einsum("nkk->nk", stack.instrument)
-        squares["instrument"] += repeatability.instrument**2 * float(np.sum(stated[which]))
+        variance = np.einsum("nkk->nk", stack.instrument)
+        squares["instrument"] += repeatability.instrument**2 * float(np.sum(variance[which]))
         squares["joint"] += repeatability.joint**2 * float(np.sum(np.sum(stack.joint**2, axis=2)[which]))
         if compared.dimension == "pixel":
             squares["position"] += float(np.sum(np.einsum("nkk->nk", stack.covariance(only))[which]))
@@ -376,14 +376,14 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
     if not squares > 0:
         return None
     rng = np.random.default_rng(0)
-    found = 0.0
+    product = 0.0
     permuted = np.zeros(PERMUTATIONS)
     for rows in groups:
         e = errors[rows]
         near = scipy.spatial.KDTree(unit[rows]).query(unit[rows], k=2)[1]
         # of points at the same place either may come first
         nearest = np.where(near[:, 0] == np.arange(len(rows)), near[:, 1], near[:, 0])
-        found += float(np.sum(e * e[nearest]))
+        product += float(np.sum(e * e[nearest]))
         products = e @ e.T
         for k in range(PERMUTATIONS):
             order = rng.permutation(len(rows))
@@ -391,7 +391,7 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
     spread = float(permuted.std())
     if not spread > 0:
         return None
-    return Autocorrelation(found / squares, (found - float(permuted.mean())) / spread)
+    return Autocorrelation(product / squares, (product - float(permuted.mean())) / spread)
 
 
 # --- in words ---------------------------------------------------------------------------------------------------------

@@ -104,9 +104,9 @@ def influence(result: Outcome) -> Influence:
     model, first_label = _equations(result)
     numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)
     squares = (model.A @ result.z - model.b) ** 2
-    stated = result.formulation
+    formulation = result.formulation
     if not result.squared_loss:  # squares with the weights that the loss ended with
-        model, _ = Squares(stated.loss, stated.name, stated.loss_over)(model, result.z)
+        model, _ = Squares(formulation.loss, formulation.name, formulation.loss_over)(model, result.z)
     A, b = model.triangle[:, :-1], model.triangle[:, -1]
     L, c = np.zeros((0, len(free))), np.zeros(0)
     form = result.program.penalty_form
@@ -118,7 +118,7 @@ def influence(result: Outcome) -> Influence:
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
         accepted = "a loss that weighs its equations by their residuals: squares, Huber's"
-        raise InputError("influence", f"formulation '{stated.name}'", accepted)
+        raise InputError("influence", f"formulation '{formulation.name}'", accepted)
     T = _inverse_root(np.vstack([A, L]), moving)
     residual = model.A @ result.z - model.b
     weight = np.divide(residual**2, squares, out=np.ones(len(squares)), where=squares > 0)

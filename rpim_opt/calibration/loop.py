@@ -390,8 +390,8 @@ def _certified(
         model = around(anew.linearize(loop.scale * state.z), *about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)
-    found = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
-    return Ended(state, loop.scale * state.z, found)
+    certificate = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
+    return Ended(state, loop.scale * state.z, certificate)
 
 
 def _rested(

@@ -148,7 +148,7 @@ class Outcome:
     def robots(self) -> Mapping[str, Robot]:
         """The robots with their identified MDH parameters by name, ``""`` for the only one, as of `robot`."""
         free = self.problem.parameters.free
-        found = {}
+        robots = {}
         for robot, nominal in self.problem.arms.items():
             mdh = nominal.mdh.copy()
             places = {f"{c}{i + 1}": (i, j) for i in range(len(mdh)) for j, c in enumerate(MDH)}
@@ -156,8 +156,8 @@ class Outcome:
                 place = places.get(own_name(free.names[k]))
                 if place is not None:
                     mdh[place] += self.x[k]
-            found[robot] = replace(nominal, mdh=mdh)
-        return found
+            robots[robot] = replace(nominal, mdh=mdh)
+        return robots
 
     def forward(
         self,
@@ -251,7 +251,7 @@ class Outcome:
 
     def measured_positions(self, data: Dataset | None = None) -> Array:
         """Return the measured position of every row, (N, 3) [m]; the modelled one where none was measured."""
-        found = []
+        positions = []
         for part in self._at(data)[0].rows():
             points = np.empty((len(part.data), 3))
             for block in part.data.blocks:
@@ -261,8 +261,8 @@ class Outcome:
                 names = list(block.measurement.columns)
                 if {"x", "y", "z"} <= set(names):
                     points[block.row] = block.y[:, [names.index(axis) for axis in "xyz"]]
-            found.append(points)
-        return np.concatenate(found)
+            positions.append(points)
+        return np.concatenate(positions)
 
     def errors(self, data: Dataset | None = None, dimension: str = "length") -> Array:
         """Return the norm of every row's residual, (N,) [m], of the identification data by default.
@@ -425,20 +425,20 @@ class Outcome:
         >>> len(result.flagged), len(result.without_flagged().flagged)
         (5, 0)
         """
-        found = diagnosis.flagged(self.problem, self.x)
+        flags = diagnosis.flagged(self.problem, self.x)
         problem = self.problem
-        if not found or self.squared_loss or not self.linear_penalty or not isinstance(problem, CalibrationProblem):
-            return found
+        if not flags or self.squared_loss or not self.linear_penalty or not isinstance(problem, CalibrationProblem):
+            return flags
         model = self.program.model
         if len(model.b) != sum(len(part.owners) for part in problem.rows()):  # reduced to a QR factor
-            return found
+            return flags
         number = dict(zip(problem.labels, problem.data.configuration, strict=True))
-        groups = np.array([number[flag.label] for flag in found])
+        groups = np.array([number[flag.label] for flag in flags])
         p = problem.parameters
         width = (default_widths(p) / p.scale)[p.identified]
         weight = self.penalty_weight / self._squares[1]
         sure = contradicted(model, self.program.penalty_form, weight, width, groups)
-        return tuple(flag for flag, certain in zip(found, sure, strict=True) if certain)
+        return tuple(flag for flag, certain in zip(flags, sure, strict=True) if certain)
 
     @cached_property
     def clustered(self) -> tuple[str, ...]:
@@ -466,10 +466,10 @@ class Outcome:
         Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
         """
         out = [flag for flag in self.flagged if flag.label not in self.clustered]
-        kept = self.stated.without({flag.label for flag in out})
+        rest = self.stated.without({flag.label for flag in out})
         reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in out}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
-        return replace(self.asked(kept), record=record)
+        return replace(self.asked(rest), record=record)
 
     @cached_property
     def active_bounds(self) -> tuple[ActiveBound, ...]:

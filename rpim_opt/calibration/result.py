@@ -119,8 +119,8 @@ class Calibration(Outcome):
 
     def __repr__(self) -> str:
         """Return one line."""
-        said = self.message if self.verdict.delivered else f"Not delivered. {self.verdict.reasons[0]}"
-        return f"<Calibration '{self.formulation.name}', {len(self.x)} parameters, weight {self.weight:.4g}: {said}>"
+        ending = self.message if self.verdict.delivered else f"Not delivered. {self.verdict.reasons[0]}"
+        return f"<Calibration '{self.formulation.name}', {len(self.x)} parameters, weight {self.weight:.4g}: {ending}>"
 
     def _repr_html_(self) -> str:
         """Return the same as the text for a notebook."""

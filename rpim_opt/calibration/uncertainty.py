@@ -75,11 +75,11 @@ class Uncertainty(Tabled):
 
         The factor is larger for readings of an unknown session, where few sessions told how far they lie apart.
         """
-        found = self.result.predict(q, marker, **arguments)
+        prediction = self.result.predict(q, marker, **arguments)
         factor: float | Array = self.coverage_factor
-        if isinstance(found.freedom, np.ndarray):
-            factor = coverage_factor(found.freedom, self.confidence)[:, None]
-        return found._replace(coverage_factor=factor)
+        if isinstance(prediction.freedom, np.ndarray):
+            factor = coverage_factor(prediction.freedom, self.confidence)[:, None]
+        return prediction._replace(coverage_factor=factor)
 
     def _short(self) -> str:
         return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"
@@ -174,7 +174,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
     at = part.joint_values
     if result.record.earlier:  # what was measured before them counts, at the corners of its ranges
         at = np.vstack([at, *(ends @ part.robot.joint_map.T for ends in result.ranges.values())])
-    found = []
+    errors = []
     for curve in part.robot.model.curves:
         place = np.array([free.names.index(name) for name in transmission(curve).names(curve.joint)])
         q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
@@ -184,10 +184,10 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
             variance = np.sum((columns @ C[np.ix_(place, place)]) * columns, axis=1)
         effect = np.linalg.norm(J[np.ix_(length, place)] @ result.x[place]) / np.sqrt(rows)
         ends = float(at[:, curve.joint - 1].min()), float(at[:, curve.joint - 1].max())
-        found.append(
+        errors.append(
             TransmissionError(curve.joint, q, columns @ result.x[place], np.sqrt(variance), ends, float(effect))
         )
-    return found
+    return errors
 
 
 def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
@@ -213,9 +213,9 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
         squares = np.sum((fitted - program.model.b) ** 2)
         variance = squares / max(len(fitted) - len(result.z), 1)
     level = np.sqrt(variance)
-    found = []
+    solutions = []
     for _ in range(draws):
         b = fitted + level * rng.normal(size=len(fitted))
         drawn = program.on(program.model.with_values(b))
-        found.append(drawn.path([result.weight])[0].z)
-    return np.array(found) * result.problem.parameters.free.scale
+        solutions.append(drawn.path([result.weight])[0].z)
+    return np.array(solutions) * result.problem.parameters.free.scale

@@ -230,9 +230,9 @@ def _deviations(result: Outcome) -> Iterator[str]:
         if kind == "d" and types[int(joint) - 1] == "prismatic":  # the zero of that joint
             continue
         unit, largest = MACHINED[kind]
-        said = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
-        said = f"{said}: no robot is machined worse than {1e3 * largest:g} {unit}."
-        worst = max(worst, (float(abs(x)) / largest, said))
+        sentence = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
+        sentence = f"{sentence}: no robot is machined worse than {1e3 * largest:g} {unit}."
+        worst = max(worst, (float(abs(x)) / largest, sentence))
     if worst[1]:
         yield f"{worst[1]} Check the order, signs and units of the joint columns, and the DH table."
 

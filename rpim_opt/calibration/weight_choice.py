@@ -72,13 +72,13 @@ class WeightChoice:
             return self
         again = replace(self, settled=False).asked(program)
         apart = SAME  # by how much logarithms of weights differ that a rule tells apart
-        found = again.selection
+        selection = again.selection
         if self.robust and program.closed_form:
             apart = SAME_ROBUST
-        elif found is not None and found.interior:  # an answer from a grid is no closer than its neighbours
-            order = np.sort(found.weights)
-            place = int(np.searchsorted(order, found.weight))
-            if 0 < place < len(order) - 1 and order[place] == found.weight and order[place - 1] > 0:
+        elif selection is not None and selection.interior:  # an answer from a grid is no closer than its neighbours
+            order = np.sort(selection.weights)
+            place = int(np.searchsorted(order, selection.weight))
+            if 0 < place < len(order) - 1 and order[place] == selection.weight and order[place - 1] > 0:
                 apart = float(np.clip(0.5 * np.log(order[place + 1] / order[place - 1]), SAME, SAME_SEARCH))
         if self.answers and _same(again.weight, self.weight, apart):
             return replace(self, settled=True, final=True, note=again.note)

@@ -352,16 +352,16 @@ def camera_remarks(result: Outcome) -> list[str]:
         f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; in millimetres, the distance of the "
         "line of sight from the point. It measures how well views agree, not how well the robot is identified."
     ]
-    found = improvement(result)
-    if found is None:
+    lens = improvement(result)
+    if lens is None:
         remarks.append("The expected position error of the flange is not determined by this result.")
     else:
         remarks.append(
             "Expected position error of the flange over its joint ranges, base and tool fitted: "
-            f"{1e3 * found.before:.3g} mm RMS nominal, {1e3 * found.after:.3g} mm identified (95 % within "
-            f"{1e3 * found.within:.3g} mm along any axis)."
+            f"{1e3 * lens.before:.3g} mm RMS nominal, {1e3 * lens.after:.3g} mm identified (95 % within "
+            f"{1e3 * lens.within:.3g} mm along any axis)."
         )
-        if not found.improves:
+        if not lens.improves:
             remarks.append(
                 "These views do not improve this robot: use its nominal parameters. Views from farther apart, with the "
                 "board nearer or larger, or an instrument that measures positions would."
@@ -382,12 +382,12 @@ def touch_errors(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str,
 
     By its name: how many, their RMS before and after calibration, and the largest.
     """
-    found = []
+    errors = []
     for name, rows in _touched(data):
         before, after = 1e3 * nominal[rows], 1e3 * error[rows]
         lengths = {"nominal_rms_mm": rms(before), "rms_mm": rms(after), "max_mm": float(after.max())}
-        found.append({"name": name, "count": len(rows), **lengths})
-    return tuple(sorted(found, key=lambda each: -each["rms_mm"]))
+        errors.append({"name": name, "count": len(rows), **lengths})
+    return tuple(sorted(errors, key=lambda each: -each["rms_mm"]))
 
 
 def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
@@ -432,11 +432,11 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
         nearest.append("the mean of all touches of its point")
     if any(problem.touches.planar):
         nearest.append("the plane that fits all touches of it best")
-    said = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
+    definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
     tells = "how well the robot returns there"
     if len(problem.arms) > 1:
         tells = "how well the robots meet and return there"
-    remarks = [f"{said}. Their positions were not measured: the error is {tells} from all sides."]
+    remarks = [f"{definition}. Their positions were not measured: the error is {tells} from all sides."]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
         remarks.append("No distance is known: the size of the robot rests on its nominal lengths alone.")
     return remarks

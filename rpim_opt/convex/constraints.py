@@ -429,12 +429,12 @@ class Parsed:
                 if numbers is None or known[name].is_box:
                     numbers = bounding(problem_of(p), numbers, p.farthest)
                 q.append(numbers)
-            found = every_movement(p, np.concatenate(q))
-            size = np.linalg.norm(found.slope, axis=(1, 2))
+            movement = every_movement(p, np.concatenate(q))
+            size = np.linalg.norm(movement.slope, axis=(1, 2))
             moving = size > 0
             if not moving.any():
                 raise self._wrong("no identified parameter that moves the tool", "parameters of the robot")
-            return found.slope[moving], found.position[moving], size[moving]
+            return movement.slope[moving], movement.position[moving], size[moving]
         rows = [row for each in self.demanded.sums for row in self._rows(each, p)]
         E, f = np.array([[row] for row, _ in rows]), np.array([[constant] for _, constant in rows])
         size = np.linalg.norm(E[:, 0], axis=1)
@@ -517,7 +517,9 @@ def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
     if where is not None and not isinstance(where, Mapping):
         raise InputError("parse", f"places as {type(where).__name__}", "{'home': [0, ...]}, by name")
     demanded = sentence(text)
-    named = tuple(_place(name, stated) for name, stated in (where or {}).items() if name in demanded.places)
+    named = tuple(
+        _place(name, configuration) for name, configuration in (where or {}).items() if name in demanded.places
+    )
     return Parsed(text.strip(), demanded, named)
 
 

@@ -275,22 +275,22 @@ class Term:
             self.variable.save_value(value)
             if any(np.any(limit.violation() > 0) for limit in self._domain):  # 1 / x is a number there, no atom's
                 return float("inf")
-            found = self._evaluated(value)
-        if found is None or not np.isfinite(found):
+            value_of_term = self._evaluated(value)
+        if value_of_term is None or not np.isfinite(value_of_term):
             return float("inf")
-        return float(found)
+        return float(value_of_term)
 
     def slope(self, value: Array) -> Array | None:
         """Return the gradient (n,), None where CVXPY knows none, or outside the domain."""
         with self._lock:
             self.variable.save_value(value)
             with np.errstate(all="ignore"):
-                found = self.expression.grad.get(self.variable)
-        if found is None:
+                gradient = self.expression.grad.get(self.variable)
+        if gradient is None:
             return None
-        if not scipy.sparse.issparse(found):
-            return np.atleast_1d(np.asarray(found, dtype=float)).ravel()
-        return np.asarray(found.todense()).ravel()
+        if not scipy.sparse.issparse(gradient):
+            return np.atleast_1d(np.asarray(gradient, dtype=float)).ravel()
+        return np.asarray(gradient.todense()).ravel()
 
 
 def term(function: Callable[[Any], Any], size: int, where: str) -> Term:

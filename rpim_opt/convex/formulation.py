@@ -89,11 +89,11 @@ class Formulation(Brief):
         object.__setattr__(self, "penalty", named(self.penalty))
         if self.loss_over not in ("equation", "configuration"):
             raise InputError("loss_over", f"'{self.loss_over}'", "equation, configuration")
-        stated: Any = self.constraints
+        constraints: Any = self.constraints
         try:
-            object.__setattr__(self, "constraints", (stated,) if callable(stated) else tuple(stated))
+            object.__setattr__(self, "constraints", (constraints,) if callable(constraints) else tuple(constraints))
         except TypeError:
-            found = f"a {type(stated).__name__}"
+            found = f"a {type(constraints).__name__}"
             raise InputError("constraints", found, "functions of z and the parameters, in a tuple") from None
         for key in ("loss", "penalty", "penalty_over"):
             function = getattr(self, key)

@@ -19,10 +19,10 @@ from rpim_opt.robot.parameters import Parameters
 
 def places(names: Sequence[str], pattern: str, where: str, kind: str = "parameters") -> list[int]:
     """Return the indices of the names that match a pattern (``*``, ``?``, ``[...]``); at least one must."""
-    found = [i for i, name in enumerate(names) if fits(name, pattern)]
-    if not found:
+    indices = [i for i, name in enumerate(names) if fits(name, pattern)]
+    if not indices:
         raise InputError(where, f"'{pattern}'", f"{kind}: {choices(pattern, names)}")
-    return found
+    return indices
 
 
 def index_of(names: Sequence[str], key: Any, where: str) -> Any:
@@ -91,10 +91,10 @@ class Given(Identified):
         >>> print(f"{result.forward(home)[0, 2, 3]:.4f} m")
         0.1975 m
         """
-        found = predicted(problem_of(self), q, marker, torque, self.at)
-        count = len(found.position)
-        flat = (found.slope * self.scale).reshape(3 * count, -1)
-        return cp.reshape(flat @ self.z, (count, 3), order="C") + found.position
+        prediction = predicted(problem_of(self), q, marker, torque, self.at)
+        count = len(prediction.position)
+        flat = (prediction.slope * self.scale).reshape(3 * count, -1)
+        return cp.reshape(flat @ self.z, (count, 3), order="C") + prediction.position
 
 
 def whole(p: Given) -> Parameters:
@@ -117,9 +117,9 @@ def every_movement(p: Given, q: Array) -> Predicted:
     Deviations of frames (base, reflector) do not count: they say where things stand, not how the robot is.
     """
     problem = problem_of(p)
-    found = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]
-    slope = np.concatenate([each.slope for each in found])
-    return Predicted(np.concatenate([each.position for each in found]), slope * p.scale)
+    movements = [moved(problem, q, marker, at=p.at) for marker in markers(problem)]
+    slope = np.concatenate([each.slope for each in movements])
+    return Predicted(np.concatenate([each.position for each in movements]), slope * p.scale)
 
 
 def given(z: Any, parameters: Parameters) -> Given:

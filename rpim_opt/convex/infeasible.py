@@ -35,16 +35,16 @@ def conflict(structure: Structure) -> Conflict | None:
     units = _units(structure, z)
     if _possible(units):
         return None
-    kept = _irreducible(units)
-    single = _irreducible([[stated] for unit in kept for stated in unit])
-    names = tuple(stated.name for unit in single for stated in unit)
+    units_left = _irreducible(units)
+    single = _irreducible([[demand_of] for unit in units_left for demand_of in unit])
+    names = tuple(demand_of.name for unit in single for demand_of in unit)
     parameters = structure.parameters
     parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
     slacks = []
     for kind, count in (("boxes", structure.n), ("statements", len(parsed))):
         slack = cp.Variable(max(count, 1), nonneg=True)
         loosened = _units(structure, z, **{kind: slack})
-        _solved(cp.sum(slack), [demand for unit in loosened for stated in unit for demand in stated.demands])
+        _solved(cp.sum(slack), [demand for unit in loosened for demand_of in unit for demand in demand_of.demands])
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
     by_box, by_statement = slacks
     bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
@@ -73,12 +73,12 @@ def _possible(units: list[list[Stated]]) -> bool:
 
 def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
     """Leave out, one after the other, what is not needed for the contradiction."""
-    kept = list(units)
+    left = list(units)
     for unit in units:
-        others = [other for other in kept if other is not unit]
+        others = [other for other in left if other is not unit]
         if not _possible(others):
-            kept = others
-    return kept
+            left = others
+    return left
 
 
 def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[list[Stated]]:
@@ -90,32 +90,32 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
     units: list[list[Stated]] = []
     count = 0
     for k, function in enumerate(stated.constraints):
-        found: list[Stated] = []
+        demands_of: list[Stated] = []
         if isinstance(function, Box):
             more = boxes + np.zeros(structure.n)
             for sign, side in zip("><", function.bounds(parameters), strict=True):
                 for i in np.flatnonzero(np.isfinite(side)):
                     bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
                     demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
-                    found.append(Stated(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
+                    demands_of.append(Stated(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
         elif isinstance(function, Parsed):
             by = None if isinstance(statements, int) else function.scale(parameters) * statements[count]
-            found.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
+            demands_of.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
             count += 1
         else:
             demands = [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
             name = name_of(function, k)
             several = len(demands) > 1
-            found = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
-        units.append(found)
+            demands_of = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
+        units.append(demands_of)
     return units
 
 
 def name_of(function: Any, k: int) -> str:
     """Return the user's name of a constraint function."""
-    stated = getattr(function, "stated", None)
-    if stated:
-        maker, *arguments = stated
+    call = getattr(function, "stated", None)
+    if call:
+        maker, *arguments = call
         return f"{maker}({', '.join(repr(a) for a in arguments)})"
     name = getattr(function, "__name__", "<lambda>")
     return f"constraint {k + 1}" if name == "<lambda>" else name

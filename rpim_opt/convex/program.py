@@ -264,13 +264,15 @@ class Program(Brief):
         >>> round(program.violation(3 * program.solve().z), 6)
         4.0
         """
-        found = self._projected(z)
-        return np.inf if found is None else float(np.linalg.norm(found - z, 2 if self.box is None else np.inf))
+        projection = self._projected(z)
+        return (
+            np.inf if projection is None else float(np.linalg.norm(projection - z, 2 if self.box is None else np.inf))
+        )
 
     def nearest(self, z: Array) -> Array:
         """Return the projection of z (n,) on the constraints; z itself if it fails."""
-        found = self._projected(z)
-        return z if found is None or np.linalg.norm(found - z) <= TOUCHING else found
+        projection = self._projected(z)
+        return z if projection is None or np.linalg.norm(projection - z) <= TOUCHING else projection
 
     def _projected(self, z: Array) -> Array | None:
         """Return the point of the constraints of z that is nearest to z (n,); None where the solver finds none."""
@@ -396,8 +398,8 @@ class Program(Brief):
                 penalties = np.sum((form.times(Z.T).T - form.c) ** 2, axis=1) + form.constant
             rows = zip(Z, checked, losses, penalties, strict=True)
             return [Estimate(z, float(w), float(loss), float(penalty)) for z, w, loss, penalty in rows]
-        found = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
-        return [found[weight] for weight in checked.tolist()]
+        estimates = {weight: self.solve(weight) for weight in sorted(set(checked.tolist()), reverse=True)}
+        return [estimates[weight] for weight in checked.tolist()]
 
     def tangent(self, z: Array, weight: float) -> Array | None:
         """Return an orthonormal basis (n, k) of the active constraints' null space at z; None without any.
@@ -407,20 +409,20 @@ class Program(Brief):
         if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
             return None
         try:
-            found = minimum(self.structure.loss, self._rows, self._warm.begun(z), weight, self._squares)
+            optimum = minimum(self.structure.loss, self._rows, self._warm.begun(z), weight, self._squares)
         except Unsolved:
             return None
         p = self.structure.canonical
-        limit = ACTIVE * max(np.abs(found.dual).max(initial=0.0), TOUCHING)
+        limit = ACTIVE * max(np.abs(optimum.dual).max(initial=0.0), TOUCHING)
         dense = p.dense[0]
         linear = np.arange(p.linear)
-        active = (linear < p.zero) | (np.abs(found.dual[linear]) > limit)
+        active = (linear < p.zero) | (np.abs(optimum.dual[linear]) > limit)
         normals = [dense[linear[active]]]
         start = p.linear
         for count in p.cone_sizes:
             part = slice(start, start + count)
-            if np.abs(found.dual[part]).max() > limit:
-                normals.append(found.dual[part][None] @ dense[part])
+            if np.abs(optimum.dual[part]).max() > limit:
+                normals.append(optimum.dual[part][None] @ dense[part])
             start += count
         G = np.vstack(normals)
         if not len(G):
@@ -449,15 +451,15 @@ class Program(Brief):
         """Return the minimum by the structure of the loss; where that fails, CVXPY's."""
         of = self.structure.loss, self._rows, self._warm, weight, self._squares
         try:
-            found = minimum(*of, damping, accuracy)
+            optimum = minimum(*of, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
-        z = found.x[self.structure.canonical.at]
+        z = optimum.x[self.structure.canonical.at]
         if weight == 0 and damping is None and not self.structure.constrained:  # what the data do not see stays nominal
             _, s, V = self.model.svd
             z = z - V[s == 0].T @ (V[s == 0] @ z)
-        return self._at(z, weight, partial(self._duals, found), found.iterations)
+        return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""
@@ -480,14 +482,14 @@ class Program(Brief):
 
     def _by_function(self, groups: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
         """Return multipliers by constraint function: of a box (n,), as if loosened on the side that is active."""
-        found = []
+        multipliers = []
         for constraint, group in zip(self.formulation.constraints, groups, strict=True):
             values = np.concatenate([np.empty(0), *group])
             if isinstance(constraint, Box):
                 sides = _sides(*constraint.bounds(self.structure.parameters))
                 values = np.bincount(sides, np.abs(values), self.structure.n)
-            found.append(values)
-        return tuple(found)
+            multipliers.append(values)
+        return tuple(multipliers)
 
     def _by_cvxpy(
         self,
@@ -503,8 +505,8 @@ class Program(Brief):
             installed = ", ".join(cp.installed_solvers())
             raise InputError("solver", f"{solver!r}", f"an installed solver: {installed}")
         answers = self.structure.answers
-        stated = self.structure.loss_of_r, answers.penalty_of_z, answers.constraints
-        problem, z, groups = self._written((*self.rows, weight), stated, damping)
+        functions = self.structure.loss_of_r, answers.penalty_of_z, answers.constraints
+        problem, z, groups = self._written((*self.rows, weight), functions, damping)
         for variable in problem.variables():
             variable.save_value(None)
         with warnings.catch_warnings():

@@ -270,9 +270,9 @@ def robot_alone(penalty: Quadratic, frames: np.ndarray) -> Quadratic:
     cross = K[np.ix_(rest, frames)]
     K_rest = K[np.ix_(rest, rest)] - cross @ np.linalg.pinv(K[np.ix_(frames, frames)], hermitian=True) @ cross.T
     values, vectors = np.linalg.eigh(K_rest)
-    kept = values > RANK_TOLERANCE * np.max(values, initial=0.0)
-    L = np.zeros((int(kept.sum()), len(frames)))
-    L[:, rest] = (vectors[:, kept] * np.sqrt(values[kept])).T
+    positive = values > RANK_TOLERANCE * np.max(values, initial=0.0)
+    L = np.zeros((int(positive.sum()), len(frames)))
+    L[:, rest] = (vectors[:, positive] * np.sqrt(values[positive])).T
     return Quadratic(L, L @ centre)
 
 

@@ -113,8 +113,10 @@ def answers(formulation: Formulation, parameters: Parameters, equations: int, gr
             accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
             raise InputError(f"{where}, {what}", "a program that is not convex", accepted)
     constraints = [[frozen(each) for each in group] for group in live]
-    stated = live_loss, over_z(live_penalty), live
-    return Answers(z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, stated, bool(known.asked))
+    functions = live_loss, over_z(live_penalty), live
+    return Answers(
+        z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, functions, bool(known.asked)
+    )
 
 
 def declared_form(function: Any, size: int) -> Quadratic | None:
@@ -402,11 +404,11 @@ def structure(
     if not formulation.solvable:
         return Structure(formulation, model.parameters, m, model.members[0], forms)
     if model.stands_for is not None:
-        found = of_length(formulation, lambda: model.equations)
-        if found is None:
+        counted = of_length(formulation, lambda: model.equations)
+        if counted is None:
             where = f"formulation '{formulation.name}'"
             raise InputError(where, "equations in blocks, of which only the QR factor is kept", "a squared loss")
-        formulation = found
+        formulation = counted
     if formulation.loss in INVARIANT and formulation.loss_over == "equation":
         m = n + 1
     groups = model.members[0]

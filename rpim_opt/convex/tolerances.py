@@ -177,11 +177,11 @@ class _Reader:
             raise self._wrong(f"'{patterns[0]}'", "names of single parameters")
         if known.constant or known.nominal:
             raise self._wrong("a number or nominal before =", "a sum of parameters, with its value after =")
-        stated = self._sum() if self._next("=") else Sum(nominal=1)
+        right = self._sum() if self._next("=") else Sum(nominal=1)
         spread = self._next("+-")
         wide = self._item(self._next("+", "-")) if spread else Sum()
         self._require_end()
-        for name in (*stated.names, *wide.names):
+        for name in (*right.names, *wide.names):
             accepted = f"a number with a unit: {choices(name, units())}"
             raise self._wrong(f"'{name}' where a number should stand", accepted)
         if not spread:
@@ -193,7 +193,7 @@ class _Reader:
         if not sd >= SMALLEST:
             found = f"a standard deviation of {sd / unit.si:g} {self.unit}"
             raise self._wrong(found, "a positive standard deviation; [constraints] fixes parameters")
-        return Combination(known.names, known.factors, stated.constant, bool(stated.nominal), sd, unit.dimension)
+        return Combination(known.names, known.factors, right.constant, bool(right.nominal), sd, unit.dimension)
 
     def sentence(self) -> Sentence:
         sides = [self._side()]
@@ -212,12 +212,12 @@ class _Reader:
         if relations[0] == ">=":
             sides = sides[::-1]
         if any(opening for opening, _ in sides):
-            found = self._bounded(sides, relations)
+            parsed = self._bounded(sides, relations)
         else:
-            found = self._chain([each for _, (each,) in sides], relations, tolerance or 0.0)
-        for each in found.sums:
+            parsed = self._chain([each for _, (each,) in sides], relations, tolerance or 0.0)
+        for each in parsed.sums:
             self._checked(each)
-        return found
+        return parsed
 
     def _bounded(self, sides: list[tuple[str, tuple[Sum, ...]]], relations: list[str]) -> Sentence:
         """Return that an absolute value or norm is at most a number."""
@@ -254,23 +254,23 @@ class _Reader:
             return "", (self._sum(),)
         if opening == "norm" and not self._next("("):
             raise self._wrong("norm without (", "norm(tool_x - 10 mm, tool_y)")
-        found = [self._sum()]
+        sums = [self._sum()]
         while self._next(","):
-            found.append(self._sum())
+            sums.append(self._sum())
         end = "|" if opening == "|" else ")"
         if not self._next(end):
             raise self._wrong(f"no closing {end}")
-        return opening, tuple(found)
+        return opening, tuple(sums)
 
     # --- sums ------------------------------------------------------------------------------------------------
 
     def _sum(self) -> Sum:
-        found = self._item(self._next("+", "-"))
+        total = self._item(self._next("+", "-"))
         while sign := self._next("+", "-"):
-            found = found.plus(self._item(sign))
-        if found.nominal not in (0, -1 if found.names else 1):
+            total = total.plus(self._item(sign))
+        if total.nominal not in (0, -1 if total.names else 1):
             raise self._wrong("nominal without a meaning here", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
-        return found
+        return total
 
     def _item(self, sign: str) -> Sum:
         factor = -1.0 if sign == "-" else 1.0

@@ -168,10 +168,10 @@ class PartitionedProblem(RobotModel):
         known = self.on(self.first.take([0]))  # one row: what a worker must know besides its own block
         task = partial(_on_part, what, known, self.dropped)
         results = (self.compute or map)(task, list(enumerate(self.parts, start=1)))
-        found = [result for result in results if result is not None]
-        if not found:
+        answers = [result for result in results if result is not None]
+        if not answers:
             raise InputError("data", "no row", "at least one")
-        return found
+        return answers
 
 
 Source = CalibrationProblem | PartitionedProblem

@@ -86,17 +86,17 @@ class Thing:
 
     def seen(self, values: Array) -> Array:
         """Return what of values (K, 3, c) of the positions a touch shows, (K, 3, c)."""
-        found = np.zeros_like(values)
-        found[:, : len(self.shown)] = self.shown @ values
-        return found
+        components = np.zeros_like(values)
+        components[:, : len(self.shown)] = self.shown @ values
+        return components
 
     def slopes(self, values: Array) -> Array:
         """Return how what touches show, less the thing, changes (K, 3, c), where positions move by (K, 3, c)."""
         moved = self.moved(values)
-        found = self.seen(values - moved.centre)
+        slopes = self.seen(values - moved.centre)
         q = self.places[:, 1:] @ self.across[: self.places.shape[1] - 1] + np.outer(self.height, self.normal)
-        found[:, 0] += q @ moved.normal
-        return found
+        slopes[:, 0] += q @ moved.normal
+        return slopes
 
     def moved(self, values: Array) -> Moved:
         """Return how it moves where its touches move by values (K, 3, c).
@@ -162,13 +162,13 @@ class Touches:
         """Return the touches of a dataset; None where there are none."""
         at: dict[str, list[int]] = {}
         planar: dict[str, bool] = {}
-        stated: list[tuple[np.ndarray, Block, int]] = []
+        known: list[tuple[np.ndarray, Block, int]] = []
         numbers = equation_numbers(data)
         for block, equations in zip(data.blocks, numbers, strict=True):
             if block.touched is None:
                 continue
             if not block.measurement.touching:
-                stated += [(equations[i], block, i) for i in range(len(equations))]
+                known += [(equations[i], block, i) for i in range(len(equations))]
                 continue
             for equation, name in zip(equations[:, 0], block.touched[:, 0], strict=True):
                 at.setdefault(name, []).append(int(equation))
@@ -177,7 +177,7 @@ class Touches:
             return None
         number = {name: i for i, name in enumerate(at)}
         ties = []
-        for equations, block, i in stated:
+        for equations, block, i in known:
             one, other = (number.get(name) for name in np.asarray(block.touched)[i])
             if one is not None and other is not None:
                 ties.append(Tie(equations, block.measurement.name, float(block.y[i, 0]), (one, other)))
@@ -252,29 +252,29 @@ class Touches:
 
     def kept(self, where: Things) -> np.ndarray:
         """Return which of the equations' places contrasts have (m,)."""
-        found = np.ones(self.equations, dtype=bool)
+        mask = np.ones(self.equations, dtype=bool)
         for thing, index in zip(where, self.rows, strict=True):
-            found[index] = False
-            found[thing.kept(index)] = True
-        return found
+            mask[index] = False
+            mask[thing.kept(index)] = True
+        return mask
 
     def contrasts(self, values: Array, where: Things) -> Array:
         """Return what m equations' values (m, c), as of `centred`, say without points and planes, (k, c)."""
-        found = values.copy()
+        contrasts = values.copy()
         for thing, index in zip(where, self.rows, strict=True):
             shown = values[index[:, : len(thing.shown)]]
-            found[thing.kept(index)] = np.tensordot(thing.aside.T, shown, axes=1)
-        return found[self.kept(where)]
+            contrasts[thing.kept(index)] = np.tensordot(thing.aside.T, shown, axes=1)
+        return contrasts[self.kept(where)]
 
     def noise(self, where: Things) -> scipy.sparse.csr_matrix:
         """Return by which noise of the m equations that of the contrasts is made, (k, m)."""
-        found = scipy.sparse.identity(self.equations, format="lil")
+        transform = scipy.sparse.identity(self.equations, format="lil")
         for thing, index in zip(where, self.rows, strict=True):
-            found[thing.kept(index).ravel()[:, None], index.ravel()] = np.kron(thing.aside.T, thing.shown)
+            transform[thing.kept(index).ravel()[:, None], index.ravel()] = np.kron(thing.aside.T, thing.shown)
         for tie in self.ties:
             for index, G in self.through(tie, where):
-                found[tie.equations[:, None], index.ravel()] = G
-        return found.tocsr()[self.kept(where)]
+                transform[tie.equations[:, None], index.ravel()] = G
+        return transform.tocsr()[self.kept(where)]
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:
@@ -282,16 +282,16 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: n
 
     Equations of a configuration whose noise is independent of each other's come in several.
     """
-    kept = touches.kept(where)
-    place = np.cumsum(kept) - 1
+    mask = touches.kept(where)
+    place = np.cumsum(mask) - 1
     noise = touches.noise(where)
     own = np.ones(touches.equations, dtype=bool)
     for tie in touches.ties:
         own[tie.equations] = False  # its touches vary, and not what is stated
-    found: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
+    by_size: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
     for stack in stacks:
         for n, index in enumerate(stack.index):
-            rows = index[kept[index]]
+            rows = index[mask[index]]
             W = noise[place[rows]][:, index].toarray()
             instrument = W @ stack.instrument[n] @ W.T
             unit = (W * (stack.length[n] & own[index])) @ W.T
@@ -313,8 +313,8 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: n
                 e = rows[some]
                 dimensions = (each[n][np.isin(index, e)] & own[e] for each in (stack.length, stack.angle))
                 each = (place[e], instrument[both], *dimensions, joint[some], unit[both])
-                found.setdefault((len(some), joint.shape[1]), []).append(each)
-    return [Stack(*map(np.stack, zip(*same, strict=True))) for same in found.values()]
+                by_size.setdefault((len(some), joint.shape[1]), []).append(each)
+    return [Stack(*map(np.stack, zip(*same, strict=True))) for same in by_size.values()]
 
 
 def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
@@ -339,14 +339,14 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Thing
     for tie in touches.ties:
         parts = [(G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, where)]
         ties[tie.equations[0]] = sum(np.einsum("aki,kij,bkj->ab", G, V, G) for G, V in parts)
-    found = []
+    covariances = []
     for block, V, first in zip(data.blocks, each, numbers, strict=True):
         if block.measurement.touching:
-            found.append(left[first])
+            covariances.append(left[first])
             continue
         rows = np.broadcast_to(V, (len(first), *V.shape[1:])).copy()
         for i, equation in enumerate(first):
             if equation in ties:
                 rows[i] = reading * block.covariance[min(i, len(block.covariance) - 1)] + ties[equation]
-        found.append(rows)
-    return found
+        covariances.append(rows)
+    return covariances

@@ -117,8 +117,8 @@ def reduced_rows(rows: Array, R: Array | None = None) -> Array:
     stacked = np.zeros((max(len(above) + len(rows), n), n), order="F")
     stacked[: len(above)] = above
     stacked[len(above) : len(above) + len(rows)] = rows
-    found: Array = GEQRT(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
-    return np.triu(found)
+    factor: Array = GEQRT(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
+    return np.triu(factor)
 
 
 def triangle_of(A: Array, b: Array) -> Array:

@@ -159,13 +159,13 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
                     like[called.removesuffix(name) + prefix + name.rpartition("_")[2]] = called
     if not like:
         return problem
-    kept = np.flatnonzero(~np.isin(p.names, list(like)))
+    known_names = np.flatnonzero(~np.isin(p.names, list(like)))
     entries = np.array([p.names.index(name) for name in like.values()])
     more = replace(p.take(entries), names=tuple(like), nominal=np.zeros(len(like)))
     repeatability = problem.repeatability
     if repeatability is not None and repeatability.at is not None:
-        repeatability = replace(repeatability, at=np.append(repeatability.at[kept], more.nominal))
-    return replace(problem, parameters=_concatenated([p.take(kept), more]), repeatability=repeatability)
+        repeatability = replace(repeatability, at=np.append(repeatability.at[known_names], more.nominal))
+    return replace(problem, parameters=_concatenated([p.take(known_names), more]), repeatability=repeatability)
 
 
 def unknown_sessions(problem: CalibrationProblem) -> list[Array]:

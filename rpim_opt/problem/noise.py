@@ -65,25 +65,25 @@ class Stack:
         own = repeatability.orientation**2 * self.angle
         if self.unit is None:
             own = repeatability.position**2 * self.length + own
-        found = own[:, :, None] * np.eye(k)
+        covariance = own[:, :, None] * np.eye(k)
         if self.unit is not None:
-            found += repeatability.position**2 * self.unit
+            covariance += repeatability.position**2 * self.unit
         if repeatability.joint > 0:
-            found += repeatability.joint**2 * self.joint @ self.joint.transpose(0, 2, 1)
+            covariance += repeatability.joint**2 * self.joint @ self.joint.transpose(0, 2, 1)
         if reading:
-            found += repeatability.instrument**2 * self.instrument
-        return found
+            covariance += repeatability.instrument**2 * self.instrument
+        return covariance
 
 
 def equation_numbers(data: Dataset) -> list[np.ndarray]:
     """Return the numbers (N, k) of the equations of every block's rows."""
-    found = []
+    numbers = []
     start = 0
     for block in data.blocks:
         k = len(block.measurement.components)
-        found.append(start + np.arange(k * len(block.row)).reshape(-1, k))
-        start += found[-1].size
-    return found
+        numbers.append(start + np.arange(k * len(block.row)).reshape(-1, k))
+        start += numbers[-1].size
+    return numbers
 
 
 class Equations(NamedTuple):

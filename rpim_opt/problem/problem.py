@@ -217,21 +217,21 @@ class CalibrationProblem(RobotModel):
         arm = self.arms[robot]
         p = self.parameters.of_robot(robot)
         others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared among other robots
-        kept = np.flatnonzero([name not in others for name in p.names])
-        p = replace(p.take(kept), terms=tuple(name for name in p.terms if name not in others))
+        own = np.flatnonzero([name not in others for name in p.names])
+        p = replace(p.take(own), terms=tuple(name for name in p.terms if name not in others))
         repeatability = self.repeatability
         if repeatability is not None and repeatability.at is not None:
-            repeatability = replace(repeatability, at=repeatability.at[self.parameters.places_of(robot)[kept]])
+            repeatability = replace(repeatability, at=repeatability.at[self.parameters.places_of(robot)[own]])
         return CalibrationProblem(arm, p, self.data.of_robot(robot), repeatability=repeatability)
 
     @property
     def joint_values(self) -> Array:
         """Joint values of the model at every row's first point, (N, dof) [rad or m]; zero for joints that it lacks."""
-        found = np.zeros((len(self.data.label), max(len(arm.mdh) for arm in self.arms.values())))
+        values = np.zeros((len(self.data.label), max(len(arm.mdh) for arm in self.arms.values())))
         for block in self.data.blocks:
             M = self.arms[block.robot].joint_map
-            found[block.row, : len(M)] = block.q[:, 0] @ M.T
-        return found
+            values[block.row, : len(M)] = block.q[:, 0] @ M.T
+        return values
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements.
@@ -269,15 +269,15 @@ class CalibrationProblem(RobotModel):
         y = np.zeros((N, len(measurement.columns)))
         if "qw" in measurement.columns:
             y[:, list(measurement.columns).index("qw")] = 1.0
-        stated = {name: np.asarray(each, dtype=float) for name, each in columns.items()}
-        approach = np.broadcast_to(stated.pop("approach", 0.0), q.shape)
+        arrays = {name: np.asarray(each, dtype=float) for name, each in columns.items()}
+        approach = np.broadcast_to(arrays.pop("approach", 0.0), q.shape)
         if all(block.approach is None for block in self.data.blocks):
             approach = None
         data = Dataset.of(
             q, y, covariance, measurement=measurement, approach=approach,
             torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
-            columns={name: np.broadcast_to(each, N) for name, each in stated.items()},
+            columns={name: np.broadcast_to(each, N) for name, each in arrays.items()},
         )  # fmt: skip
         first = self.data.blocks[0]
         own = first.markers[:1] if marker is None else (marker,)
@@ -505,10 +505,10 @@ class CalibrationProblem(RobotModel):
 
     def _whitened(self, values: Array) -> Array:
         """Return values (m, c) of the equations in units of their noise."""
-        found = np.empty_like(values)
+        whitened = np.empty_like(values)
         for index, inverse in self._inverses:
-            found[index] = inverse @ values[index]
-        return found
+            whitened[index] = inverse @ values[index]
+        return whitened
 
     @cached_property
     def _inverses(self) -> list[tuple[np.ndarray, Array]]:
@@ -525,11 +525,11 @@ class CalibrationProblem(RobotModel):
         ``joints``: whether the slopes by the joints' angles are wanted; ``at``: (P,) values of all parameters at which
         they are taken [SI], None for nominal.
         """
-        found = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
+        stacks = self._stacked(self._equations.grouped(self.data.configuration[self._equations.row]), joints, at)
         if self.touches is None:
-            return found
+            return stacks
         stop = np.unique(self.data.q, axis=0, return_inverse=True)[1].ravel()
-        return contrasted(self.touches, found, self.touched, stop[self._equations.row])
+        return contrasted(self.touches, stacks, self.touched, stop[self._equations.row])
 
     def _stacked(self, groups: Iterable[np.ndarray], joints: bool, at: Array | None) -> list[Stack]:
         """Return groups of equations (N, k) with what divides their noise; arguments as for `stacks`."""
@@ -551,13 +551,13 @@ class CalibrationProblem(RobotModel):
         """
         repeatability = self.repeatability
         if repeatability is None:
-            found = [block.covariance * reading for block in self.data.blocks]
+            covariances = [block.covariance * reading for block in self.data.blocks]
         else:
             stacks = self._stacked(equation_numbers(self.data), repeatability.joint > 0, repeatability.at)
-            found = [stack.covariance(repeatability, reading) for stack in stacks]
+            covariances = [stack.covariance(repeatability, reading) for stack in stacks]
         if self.touches is None:
-            return found
-        return of_rows(self.touches, self.data, found, self.touched, reading)
+            return covariances
+        return of_rows(self.touches, self.data, covariances, self.touched, reading)
 
     def _slopes_by(self, columns: Mapping[str, int], width: int, at: Array | None) -> Array:
         """Return the slopes (m, width) of modelled values by parameters, summed in the columns that these have.
@@ -566,12 +566,12 @@ class CalibrationProblem(RobotModel):
         """
         p = self.parameters
         chosen = np.array([name in columns for name in p.names])
-        found = np.zeros((len(self._equations.row), width))
+        slopes = np.zeros((len(self._equations.row), width))
         if chosen.any():
             alone = replace(p, nominal=p.nominal if at is None else at, identified=chosen)
             J = self.with_parameters(alone).slopes(np.zeros(int(chosen.sum())), centred=False)[1]
-            np.add.at(found.T, [columns[name] for name in p.names if name in columns], J.T)
-        return found
+            np.add.at(slopes.T, [columns[name] for name in p.names if name in columns], J.T)
+        return slopes
 
     def joint_slopes(self, at: Array | None = None) -> Array:
         """Return the slopes (m, dof) of the modelled values by the joints' angles [SI]; zero for sliding joints.
@@ -648,13 +648,13 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     if patterns != "auto":
         return [patterns] if isinstance(patterns, str) else patterns
     kinds = [block.measurement for block in data.blocks]
-    kept = [GEOMETRY]
+    allowed = [GEOMETRY]
     if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
-        kept.append(BASE)
-    kept.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
+        allowed.append(BASE)
+    allowed.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
     if carried_by(robot.model.terms):  # in the place of the table's
-        kept[0] = re.compile(f"{ORIGIN}.*")
-    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in kept)
+        allowed[0] = re.compile(f"{ORIGIN}.*")
+    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in allowed)
     others = [block for block in data.blocks if block.measurement not in READY.values()]
     own = {of_fixture(name, block.fixture) for block in others for name in block.measurement.parameters}
     places.append([name for name in parameters.names if name in own and not PLACES.fullmatch(name)])

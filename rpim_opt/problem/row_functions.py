@@ -141,13 +141,13 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     """Return deviations, nominal values and the row; residual, modelled values, and metres of a residual of one."""
     p = _Parameters(of)
     points = len(of.markers)
-    stated = of.loads.symbols(len(of.joint_types), points)
+    symbols = of.loads.symbols(len(of.joint_types), points)
     session = ca.SX.sym("session", len(of.sessions))
     y = ca.SX.sym("y", len(measurement.columns))
     # every point's reflector in the frame that measures
     transforms = []
     for point, marker in enumerate(of.markers):
-        configuration = of.loads.configuration(of.joint_types, p.start, stated, point)
+        configuration = of.loads.configuration(of.joint_types, p.start, symbols, point)
         factors = []
         if of.several or not measurement.touching:  # touches differ by as much wherever one robot stands
             factors += p.frame("base_")
@@ -165,9 +165,9 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     for name in measurement.parameters:
         if not name.startswith(in_frames):
             own[name] = p.value(of_fixture(name, of.fixture))
-    known = of.loads.named(stated) | {"q": ca.reshape(stated["q"], -1, points)}
-    if "torque" in stated:
-        known["torque"] = ca.reshape(stated["torque"], -1, points)
+    known = of.loads.named(symbols) | {"q": ca.reshape(symbols["q"], -1, points)}
+    if "torque" in symbols:
+        known["torque"] = ca.reshape(symbols["torque"], -1, points)
     for name in measurement.sees:
         if name not in known:
             where = f"measurement {measurement.name}"
@@ -181,7 +181,7 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     metres = ca.SX(1)
     if measurement.metres is not None:
         metres = measurement.metres(*transforms, **own)
-    return [p.x, p.nominal, ca.vertcat(*stated.values(), session, y)], [residual, modelled, ca.densify(metres)]
+    return [p.x, p.nominal, ca.vertcat(*symbols.values(), session, y)], [residual, modelled, ca.densify(metres)]
 
 
 Stated = Mapping[str, ca.SX]
@@ -234,9 +234,9 @@ def needed(robot: Robot, parameters: Parameters) -> Dependencies:
     used = parameters.identified | (parameters.nominal != 0)
     names = {parameters.names[i] for i in np.flatnonzero(used)}
     of_arms = [name for name in names if of_term(name)]
-    found = dependencies(robot.model, robot.joint_types, names.__contains__)
-    return found._replace(
-        torques=found.torques or any(name.startswith("compliance") for name in of_arms),
+    needs = dependencies(robot.model, robot.joint_types, names.__contains__)
+    return needs._replace(
+        torques=needs.torques or any(name.startswith("compliance") for name in of_arms),
         moments=any(name.startswith("bend") for name in of_arms),
     )
 
@@ -269,16 +269,16 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
 
 def loads_in(robot: Robot, block: Block) -> list[Array]:
     """Return what rows state of the joints of the model, (N, c) each, in the order of `Loads.symbols`."""
-    found = [block.q @ robot.joint_map.T]
+    inputs = [block.q @ robot.joint_map.T]
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
         if robot.dof < len(robot.mdh):
             raise InputError("joint torques", "those of a robot with mimic joints", "a table without torques")
-        found.append(block.torque @ np.linalg.inv(robot.joint_map))
+        inputs.append(block.torque @ np.linalg.inv(robot.joint_map))
     if block.payload is not None:
-        found.append(block.payload)
+        inputs.append(block.payload)
     if block.approach is not None:
-        found.append(np.sign(block.approach @ robot.joint_map.T))
-    return [values.reshape(len(block.y), -1) for values in (*found, *block.columns.values())]
+        inputs.append(np.sign(block.approach @ robot.joint_map.T))
+    return [values.reshape(len(block.y), -1) for values in (*inputs, *block.columns.values())]
 
 
 def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block]) -> None:

@@ -49,9 +49,9 @@ def predicted(
 def moved(problem: CalibrationProblem, q: Array, marker: str | None, at: Array | None = None) -> Predicted:
     """Return the displacement of a reflector by the robot's parameters with frames fixed; arguments as before."""
     own = ~problem.parameters.free.of_frames
-    found = predicted(problem, q, marker, at=None if at is None else at * own)
+    prediction = predicted(problem, q, marker, at=None if at is None else at * own)
     nominal = _there(problem, q, marker).modelled(np.zeros(len(own)))[0]
-    return Predicted(found.position - nominal, found.slope * own)
+    return Predicted(prediction.position - nominal, prediction.slope * own)
 
 
 def _there(
@@ -74,17 +74,17 @@ def markers(problem: CalibrationProblem) -> list[str]:
 def _in_box(problem: CalibrationProblem, box: tuple[tuple[float, float], ...], marker: str | None) -> Array:
     """Return configurations (N, dof) with the nominal reflector in a box, which is asked for at every iteration."""
     low, high = np.array(box).T
-    found = np.zeros((0, problem.robot.dof))
+    inside = np.zeros((0, problem.robot.dof))
     for seed in range(ROUNDS):
         q = random_candidates(problem.robot, DRAWN, seed)
         at = in_base(problem, q, marker)
-        found = np.concatenate([found, q[((at >= low) & (at <= high)).all(axis=1)]])
-        if len(found) >= ALL:
+        inside = np.concatenate([inside, q[((at >= low) & (at <= high)).all(axis=1)]])
+        if len(inside) >= ALL:
             break
-    if len(found) == 0:
+    if len(inside) == 0:
         accepted = "a box within reach, in the robot's base frame (not the instrument's)"
         raise InputError("the box", "no configuration of the joint ranges that reaches into it", accepted)
-    return found[:ALL]
+    return inside[:ALL]
 
 
 def within(problem: CalibrationProblem, box: Array | None = None, marker: str | None = None) -> Array:
@@ -185,7 +185,7 @@ class Target(NamedTuple):
         """
         low, high = np.array([[-np.inf], [np.inf]]) if self.within is None else self.within.T
         least, most = (self.robot.limits if self.within is None else self.within).T
-        found = np.empty((count, self.robot.dof))
+        reached = np.empty((count, self.robot.dof))
         missing = np.ones(count, dtype=bool)
         nearest = np.full(count, np.inf)
         for draw in range(DRAWS):
@@ -201,14 +201,14 @@ class Target(NamedTuple):
                     break
             # a last step for all: rounding is then all that is left, the same on every processor
             q = q + self._step(q, rows)
-            found[rows] = q
+            reached[rows] = q
             missing[rows] = ~there | np.any((q < least) | (q > most), axis=1)
             nearest[rows] = np.minimum(nearest[rows], np.linalg.norm(self.away(q, rows), axis=1))
             if not missing.any():
-                return found, None
+                return reached, None
             if draw >= FIRST and (nearest > FAR).any():
                 break
-        return found, int(np.argmax(nearest * missing))
+        return reached, int(np.argmax(nearest * missing))
 
     def _step(self, q: Array, rows: np.ndarray) -> Array:
         """Return every row's step (M, dof), no longer than `LONGEST` ranges."""
@@ -281,7 +281,7 @@ def visible_configurations(
     normal = normal * np.copysign(1.0, normal[np.argmax(np.abs(normal))])
     size = np.array(image)
     rng = np.random.default_rng(seed)
-    found = np.zeros((0, problem.robot.dof))
+    visible = np.zeros((0, problem.robot.dof))
     for _ in range(TIMES):
         q = random_candidates(problem.robot, DRAWN, rng, share)
         T: Array = base @ forward_kinematics(problem.robot, q) @ tool
@@ -296,10 +296,10 @@ def visible_configurations(
         inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(axis=(1, 2))
         large = np.ptp(uv, axis=1).max(axis=1) > LARGE * size[0]
         upright = leaning > UPRIGHT * np.linalg.norm(sight, axis=1)
-        found = np.concatenate([found, q[before & inside & large & upright]])
-        if len(found) >= count:
-            return found[:count]
-    found_text = f"{len(found)} of {count} views in which the board is in sight"
+        visible = np.concatenate([visible, q[before & inside & large & upright]])
+        if len(visible) >= count:
+            return visible[:count]
+    found_text = f"{len(visible)} of {count} views in which the board is in sight"
     raise InputError(
         "visible_configurations", found_text, "frames, a share and an image with which it is visible more often"
     )

@@ -86,10 +86,10 @@ def page(result: Calibration) -> str:
         warnings = [" ".join(composition), *warnings]
         composition = []
     accepted = summary.acceptance(result)
-    found = summary.workspace(result) if accepted is None else accepted.workspace
-    if found is not None and not np.isfinite(found.expanded).all():
-        found = None
-    content = Content(result, accepted, found, composition)
+    workspace = summary.workspace(result) if accepted is None else accepted.workspace
+    if workspace is not None and not np.isfinite(workspace.expanded).all():
+        workspace = None
+    content = Content(result, accepted, workspace, composition)
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
         f"Calibration: {heading}",
@@ -105,14 +105,14 @@ def page(result: Calibration) -> str:
 
 def _headline(content: Content) -> Iterator[Block]:
     result = content.result
-    found = content.accepted
+    accepted = content.accepted
     yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
-    if found is not None:
-        word, _, text = found.sentences()[0].partition(": ")
-        if found.bound is not None and np.isfinite(found.bound):
-            U = f"expanded uncertainty of the position reached (U, {percent(found.requirement.confidence)})"
-            text = f"{U} at most {1e3 * found.bound:.3f} mm, {text}"
-        yield "verdict", {"kind": found.verdict, "word": word, "text": text}
+    if accepted is not None:
+        word, _, text = accepted.sentences()[0].partition(": ")
+        if accepted.bound is not None and np.isfinite(accepted.bound):
+            U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
+            text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
+        yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
     elif summary.inconclusive(result, content.map):
         word, _, text = summary.inconclusive(result, content.map).partition(": ")
         yield "verdict", {"kind": "undecided", "word": word, "text": text}
@@ -211,9 +211,9 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
         "of the configurations that reach it, at any depth. Axes of the robot's base.",
     ]
-    stated = result.record.requirement is not None
-    limit = 1e3 * map_.requirement.limit if stated else None
-    yield "text", notes if stated else [summary.workspace_sentence(map_), *notes]
+    required = result.record.requirement is not None
+    limit = 1e3 * map_.requirement.limit if required else None
+    yield "text", notes if required else [summary.workspace_sentence(map_), *notes]
     box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.problem, map_.q, map_.region.marker)
     frame = "" if box is None else " The frame is the box of the requirement."
@@ -350,32 +350,34 @@ def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
 
 def _identifiability(result: Calibration) -> Iterator[Block]:
     parameters = result.problem.parameters
-    found = observe(result.problem.identifying(parameters.identified & ~parameters.of_curves))
-    text = f"{found.configurations} configurations. {summary.identifiability(result)}"
-    redundant = [f"{combination(each)}" for each in found.redundant]
+    observability = observe(result.problem.identifying(parameters.identified & ~parameters.of_curves))
+    text = f"{observability.configurations} configurations. {summary.identifiability(result)}"
+    redundant = [f"{combination(each)}" for each in observability.redundant]
     if result.record.earlier:
         text += " The other parameters are known from the earlier calibrations that serve as prior."
         redundant = []
-    elif found.rank < len(found.names):
-        if found.unidentifiable:
-            text += f" Unidentifiable (no measurement depends on them): {', '.join(found.unidentifiable)}."
+    elif observability.rank < len(observability.names):
+        if observability.unidentifiable:
+            text += f" Unidentifiable (no measurement depends on them): {', '.join(observability.unidentifiable)}."
         text += (
             " Redundant combinations [mm, mrad], which change no measurement at the nominal parameters; the "
             "penalty determines them, and predictions do not depend on them."
         )
     yield "text", [text]
     yield "bullets", redundant
-    indices = ", ".join(f"{name} {value:.3g}" for name, value in found.indices.items())
-    condition = f"Condition number {found.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."
+    indices = ", ".join(f"{name} {value:.3g}" for name, value in observability.indices.items())
+    condition = (
+        f"Condition number {observability.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."
+    )
     yield "text", [condition]
 
 
 def _flagged(result: Calibration) -> Block:
     flagged = result.flagged
-    kept = "flagged, in the data"
-    rows = [[flag.label, f"{flag.sigmas:.1f}", mm(flag.error_mm), kept] for flag in flagged[:MOST_FLAGGED]]
+    status = "flagged, in the data"
+    rows = [[flag.label, f"{flag.sigmas:.1f}", mm(flag.error_mm), status] for flag in flagged[:MOST_FLAGGED]]
     if len(flagged) > MOST_FLAGGED:
-        rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{kept}; result.json names them"])
+        rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
     if result.learned is not None:
         rows += [
@@ -504,8 +506,8 @@ def _regularization(content: Content) -> Iterator[Block]:
 
 def _weight(result: Calibration) -> Iterator[Block]:
     """Yield the L-curve, and the choice of every rule with the resulting mean error."""
-    given = Selection(result.weight, "given", np.array([]), np.array([]), True)
-    chosen = {**compare(result.program), result.selector: result.selection or given}
+    by_user = Selection(result.weight, "given", np.array([]), np.array([]), True)
+    chosen = {**compare(result.program), result.selector: result.selection or by_user}
     chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))
     marked = {rule: choice for rule, choice in chosen.items() if choice.weight > 0}
     draw = partial(plot.l_curve, result, marked)

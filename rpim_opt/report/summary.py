@@ -128,10 +128,10 @@ def workspace(result: Calibration) -> Workspace | None:
     requirement = result.record.requirement or ANYWHERE
     try:
         region = region_of(result, requirement)
-        found = workspace(result, requirement, region, region.drawn())
+        sampled = workspace(result, requirement, region, region.drawn())
     except InputError:
         return None
-    return found if np.isfinite(found.expanded).all() else None
+    return sampled if np.isfinite(sampled.expanded).all() else None
 
 
 def workspace_sentence(found: Workspace) -> str:
@@ -210,11 +210,11 @@ def headline(result: Calibration) -> str:
             f"from all {len(result.problem.labels)}."
         )
         excluded = excluded_by_fit(result)
-        kept = held.error[~np.isin(held.label, excluded)]
-        if excluded and np.isfinite(kept).any():
+        used = held.error[~np.isin(held.label, excluded)]
+        if excluded and np.isfinite(used).any():
             sentence += (
                 f" Without {listed(excluded)}, excluded as outliers by that fit and not counted by an acceptance test, "
-                f"the mean error is {mm(1e3 * float(np.nanmean(kept)))} mm."
+                f"the mean error is {mm(1e3 * float(np.nanmean(used)))} mm."
             )
     if result.record.earlier:
         last = result.record.earlier[-1]
@@ -310,8 +310,8 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
 
 def describe(result: Calibration, document: Mapping[str, Any]) -> str:
     """Return a `summary` as text: headline, verdict, what was estimated, warnings, and the tables."""
-    stated = [f"{FIELDS[key]}: {text}" for key, text in document["details"].items()]
-    lines = [*filter(None, [document["title"], document["source"]]), *stated, "", document["headline"]]
+    details = [f"{FIELDS[key]}: {text}" for key, text in document["details"].items()]
+    lines = [*filter(None, [document["title"], document["source"]]), *details, "", document["headline"]]
     lines += document["verdict"]["reasons"]
     if document["acceptance"]:
         lines += document["acceptance"]["text"]

@@ -80,11 +80,11 @@ class Statics(Weight):
             links = list(zip(range(1, dof + 1), gravity.centres, gravity.masses, strict=True))
         else:
             links = [(min(k or dof, dof), (0.0, 0.0, 0.0), mass) for mass, k in GUESS]
-        found = []
+        masses = []
         for k, centre, mass in [*links, (dof, gravity.payload_centre, self.payload)]:
             T = self._frames[k - 1]
-            found.append((k, T[:3, 3] + T[:3, :3] @ ca.DM(centre), mass))
-        return found
+            masses.append((k, T[:3, 3] + T[:3, :3] @ ca.DM(centre), mass))
+        return masses
 
 
 @lru_cache(maxsize=64)

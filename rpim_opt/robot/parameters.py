@@ -210,9 +210,9 @@ class Parameters(Tabled):
         """Return the entries of one of several robots (``""`` for a single one), without the robot's prefix."""
         if not robot:
             return self
-        found = self.take(self.places_of(robot))
-        terms = tuple(own_name(name) for name in self.terms if name in found.names)
-        return replace(found, names=tuple(map(own_name, found.names)), terms=terms)
+        part = self.take(self.places_of(robot))
+        terms = tuple(own_name(name) for name in self.terms if name in part.names)
+        return replace(part, names=tuple(map(own_name, part.names)), terms=terms)
 
     def called(self, robot: str, own: str) -> str:
         """Return the table's name of a robot's parameter: ``left.a2``, or ``a2`` if shared."""
@@ -358,8 +358,8 @@ def overlay(
     accepted = {stem: tuple(sorted(set(dimensions[index].tolist()))) for stem, index in members.items()}
     result = values.copy()
     try:
-        stated = quantities(table, accepted, where)
-        for (stem, dimension), value in sorted(stated.items(), key=lambda item: order.index(item[0][0])):
+        sizes = quantities(table, accepted, where)
+        for (stem, dimension), value in sorted(sizes.items(), key=lambda item: order.index(item[0][0])):
             if not (value >= SMALLEST or signed):
                 found = f"a number greater than zero, from {SMALLEST:g} on"
                 raise InputError(f"{where}, key {stem}", f"{value:g}", found)

@@ -104,9 +104,9 @@ class Instance(Tabled):
 
         ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``.
         """
-        asked = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
-        asked |= {"model": self.model, "noise": self.noise}
-        return replace(identify.calibrate(self.problem, **{**asked, **changes}), record=self.record)
+        settings = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
+        settings |= {"model": self.model, "noise": self.noise}
+        return replace(identify.calibrate(self.problem, **{**settings, **changes}), record=self.record)
 
 
 def load(
@@ -144,24 +144,26 @@ def load(
     >>> len(instance.problem.data), len(instance.validation), instance.formulation.name
     (16, 9, 'Tikhonov')
     """
-    stated = read_problem(name, variant, measurements, model, chain)
-    if len(stated.chains) > 1 and chain is None:
-        return _of_chains(stated, {each: load(name, variant, measurements, model, each) for each in stated.chains})
-    table = stated.table
-    path = stated.path
-    data, files = _read_tables(stated)
-    tools = stated.tools
+    definition = read_problem(name, variant, measurements, model, chain)
+    if len(definition.chains) > 1 and chain is None:
+        return _of_chains(
+            definition, {each: load(name, variant, measurements, model, each) for each in definition.chains}
+        )
+    table = definition.table
+    path = definition.path
+    data, files = _read_tables(definition)
+    tools = definition.tools
     validation = data.get("validation")
     with in_file(path):
         rows = data["identification"]
         temperature = None if table.celsius is None else table.celsius + UNITS["degC"].zero
-        fixtures = place_fixtures(stated.placed, rows)
-        parameters = starting_parameters(stated.robot, rows, stated.base, tools, fixtures, temperature)
-        problem = CalibrationProblem(stated.robot, stated.chosen(parameters, rows), rows)
+        fixtures = place_fixtures(definition.placed, rows)
+        parameters = starting_parameters(definition.robot, rows, definition.base, tools, fixtures, temperature)
+        problem = CalibrationProblem(definition.robot, definition.chosen(parameters, rows), rows)
         problem = problem.with_repeatability(stated_repeatability(table, path))
         if validation is not None:
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
-        formulation = _formulation(stated, problem)
+        formulation = _formulation(definition, problem)
         prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         details = stated_details(table.record)
         TableOptions.stated(table.reading)
@@ -244,9 +246,9 @@ def _also_of_folders(
             problem = load(problem)
         if not isinstance(problem, Instance):
             return function(problem, *arguments, **options)
-        stated = signature(function).bind(problem.problem, *arguments, **options).arguments
-        del stated["problem"]
-        return problem.calibrate(**stated)
+        bound = signature(function).bind(problem.problem, *arguments, **options).arguments
+        del bound["problem"]
+        return problem.calibrate(**bound)
 
     return calibrate
 

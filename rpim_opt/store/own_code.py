@@ -56,7 +56,7 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
         spec.loader.exec_module(content)
     except (Exception, SystemExit) as error:  # code of somebody else may raise anything
         raise InputError(where, f"{type(error).__name__}: {error}", "code that runs without errors", source) from error
-    found = getattr(content, attribute, None)
-    if not isinstance(found, kind):
-        raise InputError(where, f"{attribute} = {found!r}"[:80], f"a {kind.__name__} of that name", source)
-    return found
+    named = getattr(content, attribute, None)
+    if not isinstance(named, kind):
+        raise InputError(where, f"{attribute} = {named!r}"[:80], f"a {kind.__name__} of that name", source)
+    return named

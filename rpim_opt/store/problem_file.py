@@ -394,8 +394,8 @@ def stated_repeatability(table: ProblemTable, path: Path) -> Repeatability | Non
             accepted = choices(table.repeatability, LEARNED_NOISE) + ", or a table"
             raise InputError("key repeatability", f"'{table.repeatability}'", accepted, path)
         return None
-    found = part(RepeatabilityTable, table.repeatability, "key repeatability", path)
-    return Repeatability(found.position, found.orientation, found.joint)
+    numbers = part(RepeatabilityTable, table.repeatability, "key repeatability", path)
+    return Repeatability(numbers.position, numbers.orientation, numbers.joint)
 
 
 def _frame(table: Any, where: str, path: Path, kind: type[F]) -> F:

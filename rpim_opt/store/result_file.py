@@ -258,12 +258,12 @@ def content(result: Calibration) -> dict[str, Any]:
     from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
 
     result = replace(result, record=result.record.dated(), known_causes=result.causes)
-    stated = definition(result.formulation)
-    solvable = formulation_of("", stated).solvable
+    functions = definition(result.formulation)
+    solvable = formulation_of("", functions).solvable
     stored = Stored(
         **{name: getattr(result, name) for name in SHARED},
         formulation=result.formulation.name,
-        definition=stated,
+        definition=functions,
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
         x=result.x,
         inliers=None if solvable else _inliers(result),
@@ -404,10 +404,10 @@ def _name(function: Callable[..., Any] | None) -> str | list[Any] | None:
     if function is None:
         return "none"
     known = next((name for name, ready in FUNCTIONS.items() if ready == function), None)
-    stated = getattr(function, "stated", None)
-    if known or stated is None:
+    call = getattr(function, "stated", None)
+    if known or call is None:
         return known
-    maker, *arguments = stated
+    maker, *arguments = call
     return [maker, *(_name(each) if callable(each) else each for each in arguments)]
 
 
@@ -459,21 +459,21 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
 
 def _robot(name: str, file: Stored, models: Models) -> Robot:
     """Return a robot of the file with the terms that somebody gives again: by name, or one model for all."""
-    stated = file.terms.get(name, [])
+    terms = file.terms.get(name, [])
     if not isinstance(models, Model):
         if not name:
             raise InputError("model", "models by name", "a Model, for the one robot of the file")
         model = models.get(name, Model())
-    elif name and not stated:
+    elif name and not terms:
         model = Model()
     else:
         model = models
     robot = file.robots[name]
-    given = _terms(model, robot)
-    if stated != given:
-        wanted = "; ".join(map(str, stated)) or "none"
+    own_terms = _terms(model, robot)
+    if terms != own_terms:
+        wanted = "; ".join(map(str, terms)) or "none"
         accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
-        raise InputError("key terms", "; ".join(map(str, given)) or "no term given", accepted)
+        raise InputError("key terms", "; ".join(map(str, own_terms)) or "no term given", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
     origins = [displaced(carried) for carried in file.origins.get(name, ())]
     return replace(robot, model=Model((*origins, *model.terms, *curves)))

@@ -84,41 +84,41 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     parameter; those of ``[simulation.truth]`` are fixed instead. Joint values are uniform in ``joint_share`` of
     the limits. Identification data carry the declared noise, validation data none. The tables need not exist yet.
     """
-    stated = read_problem(name)
-    if not stated.table.simulation:
-        raise InputError("table simulation", "nothing", "seed, configurations, ...", stated.path)
-    plan = validate(Simulation, stated.table.simulation, stated.path)
+    definition = read_problem(name)
+    if not definition.table.simulation:
+        raise InputError("table simulation", "nothing", "seed, configurations, ...", definition.path)
+    plan = validate(Simulation, definition.table.simulation, definition.path)
     rng = np.random.default_rng(plan.seed if seed is None else seed)
-    if not np.isfinite(stated.robot.limits).all():
-        raise InputError("key limits", "a joint without limits", "limits for every joint", stated.path)
+    if not np.isfinite(definition.robot.limits).all():
+        raise InputError("key limits", "a joint without limits", "limits for every joint", definition.path)
     taken: set[Path] = set()  # nothing else may have a table's name
-    for each, role in product(stated.observations, ("identification", "validation")):
+    for each, role in product(definition.observations, ("identification", "validation")):
         file = getattr(each, role)
         if file:
-            place = inside(stated.path.parent, file, f"key {role}", stated.path).resolve()
+            place = inside(definition.path.parent, file, f"key {role}", definition.path).resolve()
             if place.suffix.lower() != ".csv" or place in taken:
-                raise InputError(f"key {role}", f"{file!r}", "a unique name for every table, in .csv", stated.path)
+                raise InputError(f"key {role}", f"{file!r}", "a unique name for every table, in .csv", definition.path)
             taken.add(place)
-    fixtures, parameters = _parameters(stated)
+    fixtures, parameters = _parameters(definition)
     free = parameters.free
     x = plan.spread * rng.normal(size=len(free)) * free.scale
     dimensions = {name: (dimension,) for name, dimension in zip(free.names, free.dimensions, strict=True)}
-    with in_file(stated.path):
+    with in_file(definition.path):
         for (name, _), value in quantities(plan.truth, dimensions, "table simulation.truth").items():
             x[free.names.index(name)] = value
     tables: dict[str, Columns] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
         # drawn where no table of that role is, too: other tables of the same seed stay as they are
-        q = random_candidates(stated.robot, 2 * count, rng, plan.joint_share)
-        for each, of in zip(stated.observations, fixtures, strict=True):
+        q = random_candidates(definition.robot, 2 * count, rng, plan.joint_share)
+        for each, of in zip(definition.observations, fixtures, strict=True):
             file = getattr(each, role)
-            markers = tuple(plan.markers.get(each.identification, stated.tools))
+            markers = tuple(plan.markers.get(each.identification, definition.tools))
             for marker in markers:
-                pick(stated.tools, marker, "table simulation.markers", stated.path)
+                pick(definition.tools, marker, "table simulation.markers", definition.path)
             if count and file:
-                kind = stated.kinds[each.measurement]
-                maker = _Table(stated, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
+                kind = definition.kinds[each.measurement]
+                maker = _Table(definition, plan, parameters, x, each, kind, markers, of, rng, role == "identification")
                 tables[file], wrong = maker.made(q)
                 blunders += wrong
     truth = zip(free.names, free.dimensions, x.tolist(), strict=True)
@@ -297,16 +297,16 @@ class _Table:
 
     def _seen(self, count: int) -> Columns:
         """Return a camera's table: configurations in which it sees its whole board, and where every point appears."""
-        stated, plan = self.stated, self.plan
-        if stated.board is None:
-            raise InputError("key target", "nothing", "the points of the board that the camera sees", stated.path)
+        definition, plan = self.stated, self.plan
+        if definition.board is None:
+            raise InputError("key target", "nothing", "the points of the board that the camera sees", definition.path)
         if len(plan.image_px) != 2 or min(plan.image_px) < 1:
-            raise InputError("key simulation.image_px", f"{plan.image_px}", "width and height", stated.path)
-        board = stated.board
+            raise InputError("key simulation.image_px", f"{plan.image_px}", "width and height", definition.path)
+        board = definition.board
         names = list(board)
-        joints = list(joint_columns(stated.robot.joint_dimensions))
+        joints = list(joint_columns(definition.robot.joint_dimensions))
         one = self._read(on_board({"point": names[:1], **{n: ["0"] for n in ("u_px", "v_px", *joints)}}, board))
-        world = CalibrationProblem(stated.robot, self.parameters, one)
+        world = CalibrationProblem(definition.robot, self.parameters, one)
         width, height = plan.image_px
         points = np.array(list(board.values()))
         q = visible_configurations(world, points, count, self.rng, self.x, plan.joint_share, (width, height))

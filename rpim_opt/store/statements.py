@@ -118,9 +118,9 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     if set(values) not in ({"q"}, set(joints)):
         accepted = "x_mm, y_mm and z_mm of a box, all joints' q1_deg, ..., q_deg of all joints, or rows = [labels]"
         raise InputError(where, ", ".join(table) or "nothing", accepted)
-    stated = values["q"] if "q" in values else [values[name] for name in joints]
+    values_of_joints = values["q"] if "q" in values else [values[name] for name in joints]
     try:
-        q = np.array(stated, dtype=float)
+        q = np.array(values_of_joints, dtype=float)
     except ValueError:
         raise InputError(where, "lists of different lengths", f"{robot.dof} joint values a configuration") from None
     q = q.reshape(-1, q.shape[-1] if q.ndim else 1)
@@ -166,16 +166,16 @@ class PriorTable(Table):
         named = [(file, "key prior.population") for file in self.population]
         if self.earlier:
             named.append((self.earlier, "key prior.from"))
-        found = {}
+        files = {}
         for name, key in named:
             try:
-                found[name] = inside(path.parent, name, key, path)
-                if found[name].is_dir():
-                    found[name] = inside(path.parent, str(Path(name) / "result.json"), key, path)
+                files[name] = inside(path.parent, name, key, path)
+                if files[name].is_dir():
+                    files[name] = inside(path.parent, str(Path(name) / "result.json"), key, path)
             except InputError as error:
                 accepted = f"{error.accepted}; a copy there, `rpim-opt update`, or calibrate(prior=...) in a script"
                 raise InputError(key, error.found, accepted, path) from None
-        return found
+        return files
 
 
 def stated_prior(
@@ -276,17 +276,17 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
         marker=(str, ""),
         **sides_of,
     )
-    stated = dict(part(schema, table, "key acceptance", path))
-    sides = {name: (stated[name][0], stated[name][1]) for name in (*BOX, *joints) if stated[name] is not None}
+    keys = dict(part(schema, table, "key acceptance", path))
+    sides = {name: (keys[name][0], keys[name][1]) for name in (*BOX, *joints) if keys[name] is not None}
     axes = [axis for axis in BOX if axis in sides]
     if axes and len(axes) < len(BOX):
         raise InputError("table acceptance", f"{', '.join(axes)} alone", "x_mm, y_mm and z_mm of a box, or none", path)
     return Requirement(
-        limit=stated["limit"],
+        limit=keys["limit"],
         box=(sides["x"], sides["y"], sides["z"]) if axes else None,
         joints=tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX),
-        marker=stated["marker"],
-        confidence=stated["confidence"],
+        marker=keys["marker"],
+        confidence=keys["confidence"],
     )
 
 

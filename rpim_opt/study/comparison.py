@@ -144,10 +144,10 @@ def compare(
     code: dict[str, str] = {}
     if path is not None:
         require_package("joblib", "journal")
-        stated = {"problems given": tuple(sources.values()), "methods": tuple(compared.values())}
+        inputs = {"problems given": tuple(sources.values()), "methods": tuple(compared.values())}
         own = {name: metric for name, metric in figured.items() if METRICS.get(name) is not metric}
-        stated["metrics"] = tuple(figured), own
-        hashes = {f"set of {name}": content_hash(it, "journal") for name, it in stated.items()}
+        inputs["metrics"] = tuple(figured), own
+        hashes = {f"set of {name}": content_hash(it, "journal") for name, it in inputs.items()}
         code = replicates.package_code() | replicates.script_code() | hashes
         with refused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -163,9 +163,9 @@ def compare(
         "Metrics": figured,
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
     }
-    asked = {name: ", ".join(values) for name, values in axes.items() if values}
+    settings = {name: ", ".join(values) for name, values in axes.items() if values}
     generated = frozenset(label for label, source in sources.items() if source.drawn)
-    return Comparison(tuple(rows), tuple(figured), generated, asked, made)
+    return Comparison(tuple(rows), tuple(figured), generated, settings, made)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
@@ -292,9 +292,9 @@ class Comparison:
 
     def __repr__(self) -> str:
         """Return one line."""
-        said = ", ".join(f"{count} {status}" for status, count in Counter(row["status"] for row in self.rows).items())
+        counts = ", ".join(f"{count} {status}" for status, count in Counter(row["status"] for row in self.rows).items())
         what = f"{counted(len(self.methods), 'method')} on {counted(len(self.problems), 'problem')}"
-        return f"Comparison: {what}, {len(self.rows)} replicates ({said})"
+        return f"Comparison: {what}, {len(self.rows)} replicates ({counts})"
 
     def __str__(self) -> str:
         """Return that line, and the summary where there is one."""

@@ -272,22 +272,22 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
     """
     methods: list[Method] = []
     weights = [_selector(label, each) for label, each in _listed(selectors)]
-    for given, each in _listed(formulations):
-        name = given or FOLDER
-        stated = dict(options)
+    for own_name, each in _listed(formulations):
+        name = own_name or FOLDER
+        settings = dict(options)
         pairs = weights
         if each != FOLDER:
             formulation = formulation_of(each)
             ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
-            name = given or (each if isinstance(each, str) else ready)
-            stated["formulation"] = formulation
+            name = own_name or (each if isinstance(each, str) else ready)
+            settings["formulation"] = formulation
             if formulation.penalty is None:
                 pairs = [(NONE, 0.0)]
         for selector, weight in pairs:
             label = name if selector == NONE else f"{name}, {selector}"
             if name == selector == FOLDER:
                 label = "as in the folder"
-            own = stated if selector == FOLDER else {**stated, "weight": weight}
+            own = settings if selector == FOLDER else {**settings, "weight": weight}
             methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
     for label, each in _listed(functions):
         name, function = _named(label, each, BASELINES, "methods", "the problem")

@@ -211,7 +211,7 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
 
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> tuple[str, ...]:
     """Return the notes below the table."""
-    said = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
+    notes = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
     compared = sum(each.low is not None and each.method != reference for each in standings)
     if compared:
         problems = {row["problem"] for row in rows}
@@ -228,13 +228,13 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
             chance = (1 - CONFIDENCE) * compared
             text += " No correction for multiple comparisons: without any difference, "
             text += f"{chance:.2g} of {compared} would be marked by chance."
-        said.append(text)
+        notes.append(text)
     elif len(standings) > 1:
         few = f"fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one"
-        said.append(f"There are no intervals: {few}.")
+        notes.append(f"There are no intervals: {few}.")
     late = sum(each.unconverged for each in standings)
     if late:
-        said.append(f"{late} replicates did not converge; their figures count (column status).")
+        notes.append(f"{late} replicates did not converge; their figures count (column status).")
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
@@ -245,5 +245,5 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         if len(missing) < every[method]:
             where = f" ({listed(list(dict.fromkeys(missing)), 4)})"
         count = f"{len(missing)} of {every[method]} replicates{where}"
-        said.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
-    return tuple(said)
+        notes.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
+    return tuple(notes)

@@ -74,11 +74,11 @@ def run_cases(
         done = {key: stored[key] for key, _ in keyed if key in stored}
         progress(len(done), len(cases))
         tasks = [(key, work(case)) for key, case in keyed if key not in done]
-        for key, found in compute(tasks, workers):
-            text = json.dumps(found)
+        for key, row in compute(tasks, workers):
+            text = json.dumps(row)
             with _sentence(journal):
                 base.execute("INSERT INTO replicates VALUES (?, ?, ?)", (key, text, _digest(code, key, text)))
-            done[key] = found
+            done[key] = row
             progress(len(done), len(cases))
     return [{**case, **done[key]} for key, case in keyed]
 
@@ -219,15 +219,15 @@ def commit(folder: Path, *paths: Path) -> str:
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:
-        said = f"commit {git('describe', '--always').strip()}"
+        described = f"commit {git('describe', '--always').strip()}"
         changes = git(
             "status", "--porcelain", "--untracked-files=all", "--", *map(str, paths), ":(exclude,glob)**/results/**"
         )
     except (OSError, subprocess.CalledProcessError):
         return "in no repository"
     if "??" in {line[:2] for line in changes.splitlines()}:
-        return f"{said}, untracked"
-    return f"{said}, dirty" if changes else said
+        return f"{described}, untracked"
+    return f"{described}, dirty" if changes else described
 
 
 def provenance() -> dict[str, str]:
@@ -250,15 +250,15 @@ def script_code() -> dict[str, str]:
 
     Together they stand for the code of a script's functions, and for the globals that these read.
     """
-    found = {}
+    codes = {}
     for module in list(sys.modules.values()):
         file = Path(getattr(module, "__file__", None) or "")
         own = PACKAGE not in file.parents and not any(folder in file.resolve().parents for folder in LIBRARIES)
         if file.suffix == ".py" and own and file.is_file():
-            found[f"file {file.name} ({module.__name__})"] = sha256(file.read_bytes()).hexdigest()
+            codes[f"file {file.name} ({module.__name__})"] = sha256(file.read_bytes()).hexdigest()
             if module.__name__ == "__main__":
-                found["set of arguments of the script"] = repr(sys.argv[1:])
-    return found
+                codes["set of arguments of the script"] = repr(sys.argv[1:])
+    return codes
 
 
 def content_hash(thing: Any, where: str) -> str:

@@ -134,11 +134,11 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     ["data/*.csv"]``, it is that and Python files.
     """
     folder = path.parent
-    stated = getattr(study, "DEPENDS", None)
-    files = _matching(folder, "**" if stated is None else "**/*.py")
+    patterns = getattr(study, "DEPENDS", None)
+    files = _matching(folder, "**" if patterns is None else "**/*.py")
     results = {file.parent for file in files if file.name.startswith(f"{REPLICATES}.")}
     files = {file for file in files if not results.intersection(file.parents)}
-    for pattern in map(str, stated or ()):
+    for pattern in map(str, patterns or ()):
         named = _matching(folder, pattern) | _matching(folder, f"{pattern}/**")
         if not named and not glob.has_magic(pattern):
             raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
@@ -154,13 +154,13 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
 
 def _matching(folder: Path, pattern: str) -> set[Path]:
     """Return the files that match a pattern, without hidden and compiled ones."""
-    found: set[Path] = set()
+    files: set[Path] = set()
     for match in glob.iglob(str(folder / pattern), recursive=True):
-        found.add(Path(match))
-        if len(found) > MOST_FILES:
+        files.add(Path(match))
+        if len(files) > MOST_FILES:
             accepted = "DEPENDS = [...] in the study: names of the files that it reads"
             raise InputError("DEPENDS", f"more than {MOST_FILES} files in {folder}", accepted)
-    return {file for file in found if file.is_file() and file.suffix != ".pyc"}
+    return {file for file in files if file.is_file() and file.suffix != ".pyc"}
 
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:

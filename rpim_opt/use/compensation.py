@@ -413,8 +413,10 @@ class _Cell(NamedTuple):
         identified = dict(zip(p.names, values.tolist(), strict=True))
         moved = np.eye(4)
         if base:
-            stated, found = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
-            moved = np.linalg.inv(stated) @ found
+            nominal_base, identified_base = (
+                numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified)
+            )
+            moved = np.linalg.inv(nominal_base) @ identified_base
         measured = result.problem.sample().alone(which) if which else result.problem
         repeatability = measured.repeatability
         if repeatability is not None and tooled.stated:

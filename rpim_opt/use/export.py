@@ -137,7 +137,7 @@ def export_files(
             "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections, one or several"
         )
         raise InputError("export", "nothing to write", accepted)
-    said = write_all(writers, note)
+    messages = write_all(writers, note)
     requirement = whole.record.requirement
     if result is not whole:
         region = requirement or Requirement(limit=1.0)
@@ -150,7 +150,7 @@ def export_files(
         notes.append(
             " ".join(["Acceptance of the calibration, whole model:", verdict.sentences()[0], *verdict.reasons])
         )
-    return [target for target, _ in writers], [*filter(None, [note]), *notes, *said]
+    return [target for target, _ in writers], [*filter(None, [note]), *notes, *messages]
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
@@ -173,20 +173,20 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         alone = calibrate(result.stated, result.formulation)
     else:  # beside the prior of earlier results with that prior's rows, extensions at zero
         free = np.array(result.problem.parameters.free.names)
-        kept = ~np.isin(free, result.learned.added)
-        none = [0.0] * int(kept.sum())
-        penalty = prior_penalty(None, none, none, form.matrix[:, kept], form.c, None)
-        problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[kept]))
+        geometry = ~np.isin(free, result.learned.added)
+        none = [0.0] * int(geometry.sum())
+        penalty = prior_penalty(None, none, none, form.matrix[:, geometry], form.c, None)
+        problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[geometry]))
         alone = calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
     alone = replace(alone, record=result.record)
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
-    said = (
+    sentence = (
         f"Files hold no {joined(result.learned.extensions)}: written is the geometry that the same measurements give "
         f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
     )
-    return alone, [said]
+    return alone, [sentence]
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
@@ -348,12 +348,12 @@ def export_camera(result: Calibration, source: str | Path, target: str | Path) -
 
 def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple[Array, int, int]:
     """Return the numbers of a list ``key: data: [...]``, and where they stand."""
-    found = re.search(rf"^{key}:[^\n]*\n(?:[ \t]+[^\n]*\n)*?[ \t]+data:\s*\[([^\]]*)\]", text, re.MULTILINE)
-    numbers = np.array([numeral(each) for each in found[1].replace(",", " ").split()]) if found else np.empty(0)
-    if found is None or numbers.size != np.prod(shape) or not np.isfinite(numbers).all():
+    match = re.search(rf"^{key}:[^\n]*\n(?:[ \t]+[^\n]*\n)*?[ \t]+data:\s*\[([^\]]*)\]", text, re.MULTILINE)
+    numbers = np.array([numeral(each) for each in match[1].replace(",", " ").split()]) if match else np.empty(0)
+    if match is None or numbers.size != np.prod(shape) or not np.isfinite(numbers).all():
         accepted = f"data: [...] of {np.prod(shape)} finite numbers"
         raise InputError(f"key {key}", f"{numbers.size} numbers", accepted, path)
-    return numbers.reshape(shape), found.start(1), found.end(1)
+    return numbers.reshape(shape), match.start(1), match.end(1)
 
 
 def noted(text: str, ending: str, note: str) -> str:

@@ -228,11 +228,11 @@ def read_approaches(source: Any, units: str = "") -> Performance:
 def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str]) -> Performance:
     """Return the performance of a table whose columns are recognized by their names."""
     poses: dict[str, str] = {}
-    found: dict[str, dict[str, tuple[str, float]]] = {"measured": {}, "wanted": {}}
+    figures: dict[str, dict[str, tuple[str, float]]] = {"measured": {}, "wanted": {}}
     for name in columns:
         stem, unit = split(name)
         meaning = recognize(stem)
-        of = found.get(meaning.kind or "measured")
+        of = figures.get(meaning.kind or "measured")
         if meaning.stem in ("configuration", "label"):
             poses.setdefault(meaning.stem, name)
         elif of is not None and meaning.stem in {*AXES, *(stem for group in ROTATIONS for stem in group)}:
@@ -246,7 +246,7 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
                 )
             ours, size = FOREIGN.get(unit, (unit, 1.0))
             of[meaning.stem] = name, size * UNITS[ours].si
-    attained, commanded = found.values()
+    attained, commanded = figures.values()
     pose = poses.get("configuration", poses.get("label"))
     if pose is None or not set(AXES) <= set(attained):
         raise InputError("the header", listed(list(columns), 6), ACCEPTED)

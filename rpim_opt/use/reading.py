@@ -99,11 +99,11 @@ def read_commands(
     result: Calibration, source: str | Path, options: TableOptions | None = None
 ) -> tuple[Targets, tuple[str, ...]]:
     """Return the targets of a table, read with the options of the calibration's tables, and the ignored columns."""
-    found = _understood(result, source, pose, options or TableOptions(), targets=True)
+    understanding = _understood(result, source, pose, options or TableOptions(), targets=True)
     try:
-        if any(each.doubt == "quaternion" for each in found.tables):
+        if any(each.doubt == "quaternion" for each in understanding.tables):
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-        return _targets(dict(found.columns), result.problem.robot), found.left_out
+        return _targets(dict(understanding.columns), result.problem.robot), understanding.left_out
     except InputError as error:
         raise error.within(source) from None
 
@@ -149,36 +149,36 @@ def read_measurements(
     types = {block.measurement.name: block.measurement for block in blocks if block.measurement not in KNOWN}
     if not measurement and len(types) != 1:
         raise InputError("measurement", "several", choices("", types))
-    stated = pick(types, measurement or next(iter(types)), "measurement")
-    found = _understood(result, source, stated, options or TableOptions())
-    stems = {split_unit(name)[0] for name in found.columns}
-    kind = stated
-    if not stems >= set(stated.columns):  # poses may be validated by positions
-        parts = [part for part in stated.parts if not any(stems >= set(form) for form, _ in stated.forms)]
-        kind = next((part for part in parts if stems >= set(part.columns)), stated)
-    columns = found.columns
-    if found.left_out and not columns:
+    calibrated = pick(types, measurement or next(iter(types)), "measurement")
+    understanding = _understood(result, source, calibrated, options or TableOptions())
+    stems = {split_unit(name)[0] for name in understanding.columns}
+    kind = calibrated
+    if not stems >= set(calibrated.columns):  # poses may be validated by positions
+        parts = [part for part in calibrated.parts if not any(stems >= set(form) for form, _ in calibrated.forms)]
+        kind = next((part for part in parts if stems >= set(part.columns)), calibrated)
+    columns = understanding.columns
+    if understanding.left_out and not columns:
         accepted = f"joints' values and {', '.join(kind.columns)}"
-        known = f"only unknown columns {', '.join(found.left_out)}"[:200]
-        raise InputError("the header", known, accepted, found.file)
+        known = f"only unknown columns {', '.join(understanding.left_out)}"[:200]
+        raise InputError("the header", known, accepted, understanding.file)
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
     # the typical standard deviation of every component, as [noise] has it
-    known = [block for block in blocks if block.measurement is stated]
+    known = [block for block in blocks if block.measurement is calibrated]
     variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in known], axis=0)
     noise = {}
-    for (component, dimension), sigma in zip(stated.components.items(), np.sqrt(variance), strict=True):
+    for (component, dimension), sigma in zip(calibrated.components.items(), np.sqrt(variance), strict=True):
         if component in kind.components:
             unit = next(unit for unit in accepted_units(dimension) if UNITS[unit].si == 1.0)
             noise[f"{component}_{unit}"] = float(sigma)
-    data = rows_of(found, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
-    name = time_column(found.raw)
-    clock = None if name is None else (name, tuple(str(cell) for cell in found.raw[name]))
-    left_out = tuple(column for column in found.left_out if column != name)
+    data = rows_of(understanding, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
+    name = time_column(understanding.raw)
+    clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
+    left_out = tuple(column for column in understanding.left_out if column != name)
     lost = re.compile(r"rows without|line \d|\d+ more lines")
-    notes = [f"{each.file}: {note}" for each in found.tables for note in each.notes if lost.match(note)]
-    return Measured(data, left_out, (*notes, *found.notes), clock)
+    notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
+    return Measured(data, left_out, (*notes, *understanding.notes), clock)
 
 
 def _understood(

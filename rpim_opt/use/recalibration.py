@@ -89,8 +89,8 @@ class Moved(NamedTuple):
 
     def __str__(self) -> str:
         """Return it in mm or degrees."""
-        found = self.content()
-        return f"{self.name} {found['change']:+.4g} {found['unit']} (standard deviation {found['std']:.2g})"
+        figures = self.content()
+        return f"{self.name} {figures['change']:+.4g} {figures['unit']} (standard deviation {figures['std']:.2g})"
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""

@@ -150,11 +150,11 @@ def validate(result: Calibration, data: Dataset) -> Validation:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
         remarks += [*contact_remarks(problem), *known_points(problem, data)]
-    found = judged(result, data)
+    intervals = judged(result, data)
     return Validation(
-        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *found,
+        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *intervals,
         outside=result.outside(data), touched=touched, remarks=tuple(remarks),
-        mistake=misread(result, data) or displaced(result, data, found) or _elsewhere(result, error),
+        mistake=misread(result, data) or displaced(result, data, intervals) or _elsewhere(result, error),
     )  # fmt: skip
 
 

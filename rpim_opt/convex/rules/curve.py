@@ -41,10 +41,10 @@ def l_curve(program: Program) -> Selection:
     else:
         every = weight_grid(program, GRID)
         points = _points(solved(program, every))
-        kept = np.isfinite(points[:, 0])
-        failed = int(np.count_nonzero(~kept))
-        weights = every[kept]
-        score = menger(points[kept])
+        finite = np.isfinite(points[:, 0])
+        failed = int(np.count_nonzero(~finite))
+        weights = every[finite]
+        score = menger(points[finite])
     best = int(np.argmax(score))
     if not program.linear_penalty:  # where the last parameters vanish, a path bends like at a corner, far above noise
         peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1

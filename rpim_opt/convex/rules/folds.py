@@ -167,12 +167,12 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
     rows = [np.flatnonzero(part_of[model.group] == k) for k in range(len(parts))]
 
     def without(out: np.ndarray) -> Program:
-        kept = np.ones(len(model.group))
-        kept[out] = 0.0
-        return program.on(model.scaled(kept))
+        factors = np.ones(len(model.group))
+        factors[out] = 0.0
+        return program.on(model.scaled(factors))
 
     def error(weights: Array) -> Array:
-        found = []
+        left = []
         for out in rows:
             estimates = solved(without(out), weights)
             Z = np.array([each.z if each else np.full(model.A.shape[1], np.nan) for each in estimates])
@@ -180,8 +180,8 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
             which = np.unique(model.group[out], return_inverse=True)[1]
             sums = np.zeros((which.max() + 1, len(weights)))
             np.add.at(sums, which, squares.T)
-            found.append(sums)
-        norms2 = np.vstack(found)  # of the left-out configurations, at every weight
+            left.append(sums)
+        norms2 = np.vstack(left)  # of the left-out configurations, at every weight
         if program.loss_form is None:
             return np.median(np.sqrt(norms2), axis=0)
         return np.sqrt(np.sum(norms2, axis=0) / len(model.b))

@@ -123,18 +123,18 @@ def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate 
     """
     if program.closed_form:
         return list(program.path(weights))
-    found: dict[float, Estimate | None] = {}
+    estimates: dict[float, Estimate | None] = {}
     failure = None
     for weight in sorted(weights, reverse=True):
         try:
-            found[weight] = program.solve(weight)
+            estimates[weight] = program.solve(weight)
         except NoSolutionFound as error:
             if error.conflict is not None:
                 raise
-            found[weight], failure = None, error
-    if failure and len(found) > 1 and not any(found.values()):
+            estimates[weight], failure = None, error
+    if failure and len(estimates) > 1 and not any(estimates.values()):
         raise failure
-    return [found[weight] for weight in weights]
+    return [estimates[weight] for weight in weights]
 
 
 def skipped(count: int) -> str:
@@ -200,10 +200,10 @@ def grid_of(form: Ridge, count: int = 200) -> Array:
 def least_between(score: Score, weights: Array, best: int) -> tuple[float, float]:
     """Return the weight of smallest score between the neighbours of the best grid point, and that score."""
     low, high = np.log(weights[[best - 1, best + 1]])
-    found = minimize_scalar(
+    minimum = minimize_scalar(
         lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": 1e-6}
     )
-    return float(np.exp(found.x)), float(found.fun)
+    return float(np.exp(minimum.x)), float(minimum.fun)
 
 
 def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
@@ -212,13 +212,13 @@ def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
     It ends where the neighbours' scores do not differ from the best's, or their weights hardly from its own; or where
     a score is NaN: there the solver failed.
     """
-    weights, found = np.array(grid), score(grid)
+    weights, scores = np.array(grid), score(grid)
     while True:
-        best = int(np.nanargmin(found))
-        around = found[max(best - 1, 0) : best + 2]
+        best = int(np.nanargmin(scores))
+        around = scores[max(best - 1, 0) : best + 2]
         flat = not np.ptp(around) > SAME_SCORE * np.max(np.abs(around))
         if not 0 < best < len(weights) - 1 or flat or weights[best + 1] <= SAME_WEIGHT * weights[best - 1]:
-            return weights, found, best
+            return weights, scores, best
         between = np.sqrt(weights[best - 1 : best + 1] * weights[best : best + 2])
         weights = np.insert(weights, [best, best + 1], between)
-        found = np.insert(found, [best, best + 1], score(between))
+        scores = np.insert(scores, [best, best + 1], score(between))

@@ -58,11 +58,11 @@ class Canonical:
         from scipy import sparse
 
         every = [objective, *constraints]
-        stated = {v.id: v for e in every for v in e.variables()}
-        self.own = len(stated) - (variable.id in stated) > 0
-        for v in stated.values():  # atoms ask for the value of what they are made of, and may get a stale one
+        present = {v.id: v for e in every for v in e.variables()}
+        self.own = len(present) - (variable.id in present) > 0
+        for v in present.values():  # atoms ask for the value of what they are made of, and may get a stale one
             v.save_value(None)
-        anchor = [] if variable.id in stated else [variable == cp.Variable(variable.shape)]
+        anchor = [] if variable.id in present else [variable == cp.Variable(variable.shape)]
         problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor])
         self._chain: Any
         data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
@@ -231,7 +231,7 @@ class Clarabel:
 
         P (its upper triangle) and A are `csc_matrix` with entries at the same places every time.
         """
-        solver, found = self._solver, SimpleNamespace(status="")
+        solver, solution = self._solver, SimpleNamespace(status="")
         for k, attempt in enumerate(self.attempts):
             if k == 0 and solver is not None:
                 solver.update(P=P.data, q=q, A=A.data, b=b)
@@ -239,10 +239,10 @@ class Clarabel:
                 solver = import_module("clarabel").DefaultSolver(P, q, A, b, self.cones, _settings(attempt))
             if k == 0 and solver.is_data_update_allowed():  # not where it decomposes a matrix
                 self._solver = solver
-            found = solver.solve()
-            if str(found.status) in SOLVED:
-                return found
-        raise Unsolved(str(found.status))
+            solution = solver.solve()
+            if str(solution.status) in SOLVED:
+                return solution
+        raise Unsolved(str(solution.status))
 
 
 class Unsolved(RuntimeError):
@@ -320,14 +320,14 @@ class Small:
         p = self.penalty
         if self.loss is not None or not p.polyhedral:
             return self._by_cones(squares, weight, A, b)[0]
-        found = self._on_faces(squares, weight, self.face, self.near)
-        if found is not None:
-            return found
+        exact = self._on_faces(squares, weight, self.face, self.near)
+        if exact is not None:
+            return exact
         point, slack = self._by_cones(squares, weight, A, b)
         active = np.arange(p.zero, p.linear)
         face = active[(point.dual > slack)[active]]
-        found = self._on_faces(squares, weight, face, point.x)
-        return point if found is None else replace(found, iterations=point.iterations)
+        exact = self._on_faces(squares, weight, face, point.x)
+        return point if exact is None else replace(exact, iterations=point.iterations)
 
     # --- active set --------------------------------------------------------------------------------------------------
 
@@ -342,10 +342,10 @@ class Small:
                 return None
             seen.add(face.tobytes())
             active = np.concatenate([np.arange(p.zero), face])
-            found = on_face(squares, weight, p, active, near)
-            if found is None:
+            solution = on_face(squares, weight, p, active, near)
+            if solution is None:
                 return None
-            x, multipliers = found
+            x, multipliers = solution
             slack = p.b[inequalities] - A[inequalities] @ x
             tight = np.isin(inequalities, face)
             dual = multipliers[p.zero :]
@@ -394,12 +394,12 @@ class Small:
         scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
         P, matrix = data.filled(weight, np.concatenate(dense))
         P.data *= scale  # tolerances are absolute below one
-        found = data.clarabel.solve(P, cost * scale, matrix, np.concatenate(bounds))
-        x, z, s = np.array(found.x), np.array(found.z) / scale, np.array(found.s)
+        solution = data.clarabel.solve(P, cost * scale, matrix, np.concatenate(bounds))
+        x, z, s = np.array(solution.x), np.array(solution.z) / scale, np.array(solution.s)
         x[: p.size] += x0
         self.near = x[: p.size]
         own = slice(k, k + len(p.b))
-        point = Point(x[: p.size], z[own], int(found.iterations))
+        point = Point(x[: p.size], z[own], int(solution.iterations))
         if self.loss is not None and A is not None and b is not None:
             rest = np.zeros(self.loss.size)
             if self.sizes is None:
@@ -512,8 +512,8 @@ def nearest(p: Canonical, z: Array) -> Array:
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
     flat = sparse.csc_matrix((N + 1, N + 1))
-    found = Clarabel([*p.linear_cones, cone]).solve(flat, np.append(np.zeros(N), 1.0), A, bound)
-    return np.array(found.x)[p.at]
+    solution = Clarabel([*p.linear_cones, cone]).solve(flat, np.append(np.zeros(N), 1.0), A, bound)
+    return np.array(solution.x)[p.at]
 
 
 def on_face(

@@ -264,9 +264,9 @@ class Newton:
         if warm and warm_width:
             near = self._near(self.rows.entries(self._residual(z)), 3 * warm_width)
             if 0 < len(near) <= few:
-                found = self._exact(z, near, warm_width)
-                if found is not None:
-                    return found, warm_width
+                exact = self._exact(z, near, warm_width)
+                if exact is not None:
+                    return exact, warm_width
         while h > floor:
             v = self.rows.entries(self._residual(z))
             added = np.count_nonzero(np.abs(v) < h) * h * self.kink  # what smoothing may add to the loss
@@ -280,9 +280,9 @@ class Newton:
             if added <= self.accuracy * size:
                 return z, h
             if len(near) <= few:
-                found = self._exact(z, near, h)
-                if found is not None:
-                    return found, h
+                exact = self._exact(z, near, h)
+                if exact is not None:
+                    return exact, h
             h /= NARROWER
         return z, h
 

@@ -215,10 +215,10 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         if key in columns:
             raise InputError("the header", ", ".join(raw.columns), "every column once", path)
         columns[key] = [str(cell) for cell in cells]
-    said = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
+    conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
-        said.add("modified")
-    known = {CONVENTIONS.get(each, each) for each in said}
+        conventions.add("modified")
+    known = {CONVENTIONS.get(each, each) for each in conventions}
     if len(known) != 1 or not known <= set(CONVENTIONS.values()):
         accepted = (
             "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "

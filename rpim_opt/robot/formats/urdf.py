@@ -475,16 +475,16 @@ class _Urdf:
 
     def followers(self) -> dict[str, _Joint]:
         """Return the joints that follow one that moves on its own, and that none follows, by their prefixes."""
-        found = {joint.name: joint.element.find("mimic") for joint in self.joints.values()}
-        following = {name: mimic.get("joint", "") for name, mimic in found.items() if mimic is not None}
+        mimics = {joint.name: joint.element.find("mimic") for joint in self.joints.values()}
+        following = {name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None}
         ends = [name for name, led in following.items() if led not in following and name not in following.values()]
         return {f"{MIMIC}{_plain(name)}_": self.joints[name] for name in ends}
 
     def steps_between(self, base: str | None, tip: str | None) -> list[_Step]:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
-        for given in (base, tip):
-            if given is not None and given not in self.links:
-                raise InputError(f"link '{given}'", "nothing", choices(given, self.links), self.path)
+        for link_name in (base, tip):
+            if link_name is not None and link_name not in self.links:
+                raise InputError(f"link '{link_name}'", "nothing", choices(link_name, self.links), self.path)
         if base is None:
             roots = [link for link in self.links if link not in self.above]
             if len(roots) > 1:
@@ -657,11 +657,11 @@ def _masses(way: _Way, table: Array, G: Array) -> Gravity:
 
 def _inertial(urdf: _Urdf, name: str, body: _Element) -> tuple[float, Array]:
     """Return the mass [kg] of a link and its centre (3,) in the link's frame [m]; no mass where none is stated."""
-    found = {each.tag: each.attrib for inertial in body.findall("inertial")[:1] for each in inertial}
-    mass = _numbers(found.get("mass", {}).get("value", "0"), 1)
-    centre = _numbers(found.get("origin", {}).get("xyz", "0 0 0"), 3)
+    attributes = {each.tag: each.attrib for inertial in body.findall("inertial")[:1] for each in inertial}
+    mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
+    centre = _numbers(attributes.get("origin", {}).get("xyz", "0 0 0"), 3)
     if mass is None or centre is None or mass[0] < 0:
-        shown = f"mass {found.get('mass')}, origin {found.get('origin')}"
+        shown = f"mass {attributes.get('mass')}, origin {attributes.get('origin')}"
         accepted = "a mass that is not negative, and three finite numbers"
         raise InputError(f"link '{name}', inertial", shown[:80], accepted, urdf.path)
     return float(mass[0]), centre
