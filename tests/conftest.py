@@ -75,12 +75,6 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("rpim_opt.report.report.figure", figure)
 
 
-def pytest_configure(config: pytest.Config) -> None:
-    """Declare the markers that the lists of this file give."""
-    config.addinivalue_line("markers", "long: slow by cases.toml, which python -m tests.durations makes")
-    config.addinivalue_line("markers", "snippet: an example of a docstring, the README or a guide; run by .ci/run")
-
-
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: Any, log: Any) -> Any:
     """Leave most tests of a module to one worker, which makes their fixtures once."""

@@ -109,21 +109,21 @@ class TableOptions:
         for name in texts:
             if name not in cls.__dataclass_fields__:
                 raise InputError("key reading", f"'{name}'", choices(name, cls.__dataclass_fields__))
-        found: dict[str, Any] = dict(texts)
+        options: dict[str, Any] = dict(texts)
         for name in ("columns", "constants", "joints"):
-            found[name] = tuple(filter(None, texts.get(name, "").split(",")))
+            options[name] = tuple(filter(None, texts.get(name, "").split(",")))
         if "within" in texts:
-            found["within"] = numeral(texts["within"])
-        return cls(**found)
+            options["within"] = numeral(texts["within"])
+        return cls(**options)
 
     def texts(self) -> dict[str, str]:
         """Return the options that are set as texts."""
-        said = {name: getattr(self, name) for name in self.__dataclass_fields__}
-        said["within"] = "" if self.within is None else repr(self.within)
+        texts = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        texts["within"] = "" if self.within is None else repr(self.within)
         units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
-        said |= {"units": ",".join(units)}
-        said |= {name: ",".join(getattr(self, name)) for name in ("columns", "constants", "joints")}
-        return {name: text for name, text in said.items() if text}
+        texts |= {"units": ",".join(units)}
+        texts |= {name: ",".join(getattr(self, name)) for name in ("columns", "constants", "joints")}
+        return {name: text for name, text in texts.items() if text}
 
 
 class Head(NamedTuple):
@@ -198,15 +198,15 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
         elif columns is None and path.suffix.lower() in (".mat", ".npz"):
             columns = array_columns(path)
         if columns is not None:
-            found = [Column(name, Head(name), cells) for name, cells in columns.items()]
+            read = [Column(name, Head(name), cells) for name, cells in columns.items()]
         else:
-            found, notes, units = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
-        found = [each for column in found for each in _one_number_each(column)]
-        found, note = _one_row_each(found)
+            read, notes, units = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
+        read = [each for column in read for each in _one_number_each(column)]
+        read, note = _one_row_each(read)
     except InputError as error:
         raise error.within(path) from None
-    by_name = {column.name: column.cells for column in found}
-    return RawTable(by_name, {column.name: column.head for column in found}, (*notes, *note), units)
+    by_name = {column.name: column.cells for column in read}
+    return RawTable(by_name, {column.name: column.head for column in read}, (*notes, *note), units)
 
 
 def is_missing(cell: str) -> bool:
@@ -347,19 +347,19 @@ def _grouped(lines: Sequence[Sequence[str]]) -> tuple[list[str], list[str]]:
 
 def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
     """Return the rows of text directly above the data that are as wide as these, without a blank line among them."""
-    found: list[int] = []
+    headers: list[int] = []
     for i in reversed(range(max(first - LINES_OF_HEADER, 0), first)):
         row = _uncommented(grid.rows[i], width)
         filled = [place for place, cell in enumerate(row, start=1) if cell]
-        if found and grid.lines[i + 1] - grid.lines[i] > 1:
+        if headers and grid.lines[i + 1] - grid.lines[i] > 1:
             break
         if not any(map(str.isalpha, "".join(row))):
             continue  # a line of dashes
         wide = len(filled) >= width / 2 or (filled[-1] > width / 2 and filled[-1] > 1)
         if not wide or len(row) > width + 1:
             break
-        found.insert(0, i)
-    return found
+        headers.insert(0, i)
+    return headers
 
 
 def _uncommented(row: Sequence[str], width: int) -> list[str]:
@@ -478,12 +478,12 @@ def _one_number_each(column: Column) -> list[Column]:
     if len(counts) != 1 or counts == {0}:
         return [column]
     stem, unit = split(column.name)
-    found = []
+    single = []
     for i, part in enumerate(_parts(stem, counts.pop())):
         head = Head(part, stem if part in "xyz" else "", unit if part in "xyz" or part[:5] == "joint" else "")
         cells = [(list_of_numbers(str(cell)) or [""] * (i + 1))[i] for cell in column.cells]
-        found.append(Column(str(head), head, cells))
-    return found
+        single.append(Column(str(head), head, cells))
+    return single
 
 
 def _parts(stem: str, count: int) -> Sequence[str]:
@@ -534,8 +534,8 @@ def _without_letters(column: Column, letters: Sequence[str]) -> Column:
     """Return a column whose cells all name their row's coordinate, ``P1.X``, without it; others unchanged."""
     cells = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", str(cell).strip(), re.IGNORECASE)
              for cell, letter in zip(column.cells, letters, strict=True)]  # fmt: skip
-    found = [match[1] for match in cells if match]
-    return column._replace(cells=found) if len(found) == len(letters) else column
+    numbers = [match[1] for match in cells if match]
+    return column._replace(cells=numbers) if len(numbers) == len(letters) else column
 
 
 def _points(letters: Sequence[str], keys: Sequence[Column]) -> list[dict[str, int]]:

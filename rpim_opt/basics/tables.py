@@ -218,13 +218,13 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         return _excel(path, sheet)
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
-    whole, said = decoded(path, encoding)
+    whole, remarks = decoded(path, encoding)
     whole = SEXAGESIMAL.sub(_decimal, whole)
     text = FORTRAN.sub("e", NO_NUMBER.sub("", whole))
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
-    notes = list(said)
+    notes = list(remarks)
     if mark != ",":
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
         notes.append(
@@ -319,7 +319,7 @@ def list_of_numbers(cell: str) -> list[str]:
 
 def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], list[int]]:
     """Return the non-blank rows and their line numbers."""
-    kept: list[list[str]] = []
+    rows: list[list[str]] = []
     lines: list[int] = []
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=mark, strict=strict, skipinitialspace=True)
     numbered: Iterable[tuple[int, list[str]]] = ((reader.line_num, row) for row in reader)
@@ -335,12 +335,12 @@ def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], 
                 row = _with_lists(row, mark)
             if strict and len(row) > WIDEST:
                 raise InputError("the table", f"a row of {len(row)} cells", f"at most {WIDEST} columns")
-            kept.append(row)
+            rows.append(row)
             lines.append(number)
     except csv.Error as error:
         if strict:
             raise InputError(f"line {reader.line_num}", str(error), "short cells whose quotes end") from None
-    return kept, lines
+    return rows, lines
 
 
 def _with_lists(row: list[str], mark: str) -> list[str]:
@@ -439,15 +439,15 @@ def numbers(cells: Sequence[Any], column: str, labels: Sequence[str] = ()) -> np
             return values.astype(float)
     except (TypeError, ValueError):
         pass
-    found = []
+    converted = []
     for i, cell in enumerate(cells):
         text = "" if cell is None else str(cell).strip()
         value = math.nan if isinstance(cell, bool | np.bool_) else numeral(text)
         if math.isnan(value):
             row = labels[i] if labels else i + 1
             raise InputError(f"row {row}, column {column}", f"'{text[:40]}'", "a finite number")
-        found.append(value)
-    return np.array(found)
+        converted.append(value)
+    return np.array(converted)
 
 
 def texts(cells: Sequence[Any], column: str) -> tuple[str, ...]:

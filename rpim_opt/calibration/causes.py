@@ -125,11 +125,11 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return list(_of_rows(problem))
     ordered = _in_table_order(result, problem)
     better = better_reading(ordered)
-    found = list(part_way(ordered)) if better is None else [better.sentence]
-    if found:
-        return [*rows_without_values(problem), *found]
-    found = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
-    if not found:
+    causes = list(part_way(ordered)) if better is None else [better.sentence]
+    if causes:
+        return [*rows_without_values(problem), *causes]
+    causes = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
+    if not causes:
         error, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
         rows = own | (error <= np.nanmax(error[own]))  # held-out rows that are gross errors were not looked for
         alone, x = ordered.on(ordered.data.take(np.flatnonzero(rows))), result.x
@@ -137,11 +137,11 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
             p = problem.parameters
             alone = alone.identifying(p.identified & ~np.isin(p.names, result.learned.added))
             x = settled(alone)
-        found = list(shown_by_residuals(alone, x)) or list(scattering_joint(alone, x))
+        causes = list(shown_by_residuals(alone, x)) or list(scattering_joint(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
-    found = found or list(rounded(problem, error))
-    if found or error < LARGEST["length"]:  # which a robot's own effects may be
-        return found
+    causes = causes or list(rounded(problem, error))
+    if causes or error < LARGEST["length"]:  # which a robot's own effects may be
+        return causes
     return list(odd_columns(problem)) or list(odd_joint(problem)) or list(unrelated_rows(problem, error))
 
 
@@ -151,7 +151,7 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
     if apart is None:
         return problem
     numbers = [re.search(r"\d+$", label) for label in (*problem.data.label, *apart.label)]
-    rows = [int(found[0]) for found in numbers if found]
+    rows = [int(match[0]) for match in numbers if match]
     if len(set(rows)) < len(numbers):  # labels without numbers, or a table of its own
         return problem
     order = np.argsort(rows, kind="stable")

@@ -75,8 +75,8 @@ class Block(Brief):
         """Return the entries at ``index``, which become the rows ``row``."""
         covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
         columns = {name: values[index] for name, values in self.columns.items()}
-        stated = {name: getattr(self, name) for name in ROW_FIELDS}
-        rows = {name: values[index] for name, values in stated.items() if values is not None}
+        fields = {name: getattr(self, name) for name in ROW_FIELDS}
+        rows = {name: values[index] for name, values in fields.items() if values is not None}
         return replace(self, covariance=covariance, row=row, columns=columns, **rows)
 
 
@@ -117,13 +117,13 @@ class Dataset(Tabled):
         for block in self.blocks:
             units = {column: display(dimension) for column, dimension in block.measurement.columns.items()}
             for row, y, session in zip(block.row, block.y, block.session_names, strict=True):
-                found = {"label": self.label[row], "configuration": int(self.configuration[row])}
-                found |= {"measurement": block.measurement.name, "marker": " ".join(block.markers)}
+                cells = {"label": self.label[row], "configuration": int(self.configuration[row])}
+                cells |= {"measurement": block.measurement.name, "marker": " ".join(block.markers)}
                 if session:
-                    found["session"] = str(session)
+                    cells["session"] = str(session)
                 for (column, (unit, si)), value in zip(units.items(), y, strict=True):
-                    found[f"{column}_{unit}"] = float(value / si)
-                rows[row] = found
+                    cells[f"{column}_{unit}"] = float(value / si)
+                rows[row] = cells
         return rows
 
     def __len__(self) -> int:
@@ -151,8 +151,8 @@ class Dataset(Tabled):
     @property
     def temperatures(self) -> Array:
         """The temperatures (N',) [K] of the rows that state one."""
-        stated = [block.columns["temperature"] for block in self.blocks if "temperature" in block.columns]
-        return np.concatenate([np.zeros(0), *stated])
+        columns = [block.columns["temperature"] for block in self.blocks if "temperature" in block.columns]
+        return np.concatenate([np.zeros(0), *columns])
 
     def by_session(self) -> list[np.ndarray]:
         """Return the numbers (k,) of the configurations of every session, for cross-validation by sessions (`k_fold`).
@@ -172,8 +172,8 @@ class Dataset(Tabled):
     def of_robot(self, robot: str) -> Dataset:
         """Return the rows of one of several robots, as that robot's own."""
         rows = [i for i, name in enumerate(self.robot) if name == robot]
-        found = self.take(rows)
-        return replace(found, blocks=tuple(replace(block, robot="") for block in found.blocks))
+        part = self.take(rows)
+        return replace(part, blocks=tuple(replace(block, robot="") for block in part.blocks))
 
     @classmethod
     def of_robots(cls, parts: Mapping[str, Dataset]) -> Dataset:
@@ -322,9 +322,9 @@ class Dataset(Tabled):
                 raise error.named(f"y, {error.where}") from None
         if q.ndim != 3 or q.shape[:2] != (len(y), points) or y.shape[1:] != (c,):
             of_q = "(N, dof)" if points == 1 else f"(N, {points}, dof)"
-            stated = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
+            joints = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
             accepted = f"{of_q} joint values and (N, {c}) measured values: {', '.join(measurement.columns)}"
-            raise InputError("q and y", f"shapes {stated.shape} and {y.shape}", accepted)
+            raise InputError("q and y", f"shapes {joints.shape} and {y.shape}", accepted)
         k = len(measurement.components)
         rows = np.arange(N)
         covariance = np.array(sigma, dtype=float)
@@ -375,25 +375,25 @@ def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | No
     """Return the names (N,) of the rows' sessions, or None; refuse names that differ in punctuation alone."""
     if not len(names):
         return None
-    found = np.array([str(name) for name in names], dtype=object)
-    if len(found) != N:
-        raise InputError("session", f"{len(found)} names", f"{N}, one a row")
+    sessions = np.array([str(name) for name in names], dtype=object)
+    if len(sessions) != N:
+        raise InputError("session", f"{len(sessions)} names", f"{N}, one a row")
     called: dict[str, str] = {}
-    for name in dict.fromkeys(found):
+    for name in dict.fromkeys(sessions):
         other = called.setdefault(session_prefix(name), name)
         if other != name:
             raise InputError("column session", f"'{other}' and '{name}'", "names that differ in letters or digits")
-    return found
+    return sessions
 
 
 def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:
     """Return what a row states besides, in the shape of the joint values or with one number a row."""
     if values is None:
         return None
-    found = np.asarray(values, dtype=float)
-    if found.size != like.size or found.shape[:1] != like.shape[:1] or not np.isfinite(found).all():
-        raise InputError(what, f"shape {found.shape}", f"finite numbers of shape {like.shape}")
-    return found.reshape(like.shape)
+    numbers = np.asarray(values, dtype=float)
+    if numbers.size != like.size or numbers.shape[:1] != like.shape[:1] or not np.isfinite(numbers).all():
+        raise InputError(what, f"shape {numbers.shape}", f"finite numbers of shape {like.shape}")
+    return numbers.reshape(like.shape)
 
 
 def whole_configurations(data: Dataset, most: int) -> list[np.ndarray]:

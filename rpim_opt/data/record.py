@@ -64,8 +64,8 @@ class Requirement:
             box = f"the box {', '.join(sides)} mm of the base frame, "
         if not self.joints:
             return f"{box}joints within the measured ranges"
-        stated = ", ".join(str(joint) for joint, _ in self.joints)
-        return f"{box}joints {stated} within the stated ranges, others within the measured ones"
+        limited = ", ".join(str(joint) for joint, _ in self.joints)
+        return f"{box}joints {limited} within the stated ranges, others within the measured ones"
 
 
 @dataclass(frozen=True, eq=False)

@@ -457,23 +457,23 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None:
         return
-    found = fit_points(problem.robot, points)
+    fit = fit_points(problem.robot, points)
     label = [problem.data.label[i] for i in points.row]
-    far = np.flatnonzero(found.error > FAR * np.median(found.error))
+    far = np.flatnonzero(fit.error > FAR * np.median(fit.error))
     pairs = []
     for i, j in combinations(far, 2):
-        crossed = np.linalg.norm([points.y[i] - found.modelled[j], points.y[j] - found.modelled[i]], axis=1)
-        if points.marker[i] == points.marker[j] and (crossed < FITS * found.error[[i, j]]).all():
+        crossed = np.linalg.norm([points.y[i] - fit.modelled[j], points.y[j] - fit.modelled[i]], axis=1)
+        if points.marker[i] == points.marker[j] and (crossed < FITS * fit.error[[i, j]]).all():
             pairs.append(f"{label[i]} and {label[j]}")
     if pairs:
         yield f"the measured values of rows {listed(pairs)} fit each other's joint values: exchange them."
     if len(points.tools) < 2 or not len(far):
         return
     flange = forward_kinematics(problem.robot, points.q[far])
-    model = transformed((found.base @ flange)[:, None], found.tools)
+    model = transformed((fit.base @ flange)[:, None], fit.tools)
     error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
     error[np.arange(len(far)), points.marker[far]] = np.inf
-    markers = [label[i] for i in far[error.min(axis=1) < FITS * found.error[far]]]
+    markers = [label[i] for i in far[error.min(axis=1) < FITS * fit.error[far]]]
     if markers:
         yield (
             f"{_rows(markers, 'fits', 'fit')} another reflector than the stated one (column marker): reflectors "
@@ -483,7 +483,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit."""
-    found: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
+    causes: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
     for block in problem.data.blocks:
         if len(block.y) < FEWEST:  # lengths of a drawing are round
             continue
@@ -496,7 +496,7 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
         unit = next(exact, np.zeros(values.shape))
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
         remedy = "export more decimals, or state the rounding as their noise"
-        found.append((f"measured values are rounded to {unit.max(initial=0.0):.4g} mm", made, remedy))
+        causes.append((f"measured values are rounded to {unit.max(initial=0.0):.4g} mm", made, remedy))
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
@@ -507,12 +507,12 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
             digits = (angles * 10.0**decimals).round().astype(int)
             step = float(np.gcd.reduce(digits, axis=None)) / 10.0**decimals  # half degrees are rounded as well
             remedy = "export them with more decimals"
-            found.append((f"joint values are rounded to {step:g} {unit}", size * step / np.sqrt(12) * arm, remedy))
+            causes.append((f"joint values are rounded to {step:g} {unit}", size * step / np.sqrt(12) * arm, remedy))
     degrees = np.abs(np.degrees(_all_q(problem.data)[:, turning]))
     if ((degrees % 1).round(6) < 0.6).all():
         made = np.radians(0.4) / np.sqrt(3) * arm
-        found.insert(0, ("joint values look like degrees and minutes (no decimals from .60 on)", made, "convert them"))
-    for what, made, remedy in found:
+        causes.insert(0, ("joint values look like degrees and minutes (no decimals from .60 on)", made, "convert them"))
+    for what, made, remedy in causes:
         if ALIKE[0] * made < error < ALIKE[1] * made:
             yield (
                 f"{what}: that alone contributes {three_digits(1e3 * made)} mm, the residual RMS is "
@@ -573,8 +573,8 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     if left[best] >= min(FITS * whole, WRONG):  # free values take up much of any other mistake
         return
     q, i = fitted[best]
-    stated, found = points.q[:, i], q[:, i]
-    apart = np.abs(np.angle(np.exp(1j * (found - stated))))
+    measured, estimated = points.q[:, i], q[:, i]
+    apart = np.abs(np.angle(np.exp(1j * (estimated - measured))))
     label = [problem.data.label[row] for row in points.row]
     odd = [label[k] for k in np.flatnonzero(apart > LEAST_TRAVEL["revolute"] / 2)]
     what = f"{_rows(odd, 'has', 'have')} wrong values of joint {i + 1}"
@@ -756,13 +756,13 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     tried = list(_moves(problem, x, model))
     if transmission:
         tried += [*_gears(problem, model), *_scales(problem, x, model)]
-    found = _added(model, x, [columns for columns, _ in tried])
+    explained = _added(model, x, [columns for columns, _ in tried])
     several = list(_moves(problem, x, model, several=True))
     other = _added(model, x, [columns for columns, _ in several])
-    if other is not None and (found is None or other[2] < SEVERAL * found[2]):
-        tried, found = several, other
-    if found is not None:
-        number, coefficients, rest = found
+    if other is not None and (explained is None or other[2] < SEVERAL * explained[2]):
+        tried, explained = several, other
+    if explained is not None:
+        number, coefficients, rest = explained
         what, remedy = tried[number][1](coefficients)
         if what:
             yield f"{what} (that leaves {100 * rest:.0f} % of the residuals): {remedy}."

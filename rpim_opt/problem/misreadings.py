@@ -47,7 +47,7 @@ def misfits(robot: Robot, tries: Sequence[Points], zeros: bool = True) -> Array:
 
     Of more than `MANY` the quarter that fits best after `FIRST_STEPS` is fitted to the end: only the best one counts.
     """
-    found = np.full(len(tries), np.inf)
+    errors = np.full(len(tries), np.inf)
     sizes = np.array([len(points.row) for points in tries])
     for size in np.unique(sizes):
         some = np.flatnonzero(sizes == size)
@@ -56,12 +56,12 @@ def misfits(robot: Robot, tries: Sequence[Points], zeros: bool = True) -> Array:
         steps = STEPS
         if len(some) > MANY:
             fits = fit_arms(robot, candidates, FIRST_STEPS, zeros=zeros, robust=True)
-            found[some] = rms(fits) / extent
-            best = np.argsort(found[some])[: max(MANY, len(some) // 4)]
+            errors[some] = rms(fits) / extent
+            best = np.argsort(errors[some])[: max(MANY, len(some) // 4)]
             candidates = candidates._replace(zero=fits.zero, tools=fits.tools).take(best)
             some, extent, steps = some[best], extent[best], STEPS - FIRST_STEPS
-        found[some] = rms(fit_arms(robot, candidates, steps, zeros=zeros, robust=True)) / extent
-    return found
+        errors[some] = rms(fit_arms(robot, candidates, steps, zeros=zeros, robust=True)) / extent
+    return errors
 
 
 def pose_misfit(robot: Robot, data: Dataset) -> float:
@@ -230,15 +230,15 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
 
 def signs(joint_map: Array) -> Array:
     """Return the signs (m,) of joints that a joint map (m, dof) has on its diagonal."""
-    found = np.ones(len(joint_map))
-    found[np.flatnonzero(np.diag(joint_map) < 0)] = -1
-    return found
+    sign = np.ones(len(joint_map))
+    sign[np.flatnonzero(np.diag(joint_map) < 0)] = -1
+    return sign
 
 
 def coupling(joint_map: Array) -> str:
     """Return the description and remedy of a joint map (m, dof)."""
-    stated = signs(joint_map)[:, None] * joint_map + 0.0
-    rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in stated)
+    matrix = signs(joint_map)[:, None] * joint_map + 0.0
+    rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in matrix)
     return f"write coupling = [{rows}] in robot.toml"
 
 
@@ -450,22 +450,22 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                 "instrument's frame, up for instance, tells which"
             )
         return Better(words, remedy, mapping.nominal, mapping.left)
-    stated = float(misfits(robot, [points])[0])  # with zeros fitted, as of every other reading
-    if not np.isfinite(stated):
+    present = float(misfits(robot, [points])[0])  # with zeros fitted, as of every other reading
+    if not np.isfinite(present):
         return None
-    chain, left = _mistakes(robot, points, stated)
-    if stated > WRONG and not points.seen:
+    chain, left = _mistakes(robot, points, present)
+    if present > WRONG and not points.seen:
         for readings in (_factors, _orders, _other_robots):
-            if left < BETTER * stated:
+            if left < BETTER * present:
                 break
             chain, left = _best(robot, points, list(readings(robot, points)))
-            if chain and BETTER * stated <= left < FURTHER * stated:  # a second mistake behind it
+            if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
                 behind, changed = chain[0].robot or robot, chain[0].change(points)
                 second, size = _best(behind, changed, _readings(behind, changed))
-                if size < BETTER * stated:
+                if size < BETTER * present:
                     chain, left = [*chain, *second], size
-    if left < BETTER * stated and (left <= LEFT or points.seen):
-        return _told(robot, points, chain, stated, left)
+    if left < BETTER * present and (left <= LEFT or points.seen):
+        return _told(robot, points, chain, present, left)
     return None if points.seen else _sibling(robot, points)
 
 
@@ -544,10 +544,10 @@ def _best(robot: Robot, points: Points, readings: list[Misreading]) -> tuple[lis
 def _tried(robot: Robot, points: Points, readings: Sequence[Misreading], most: int = FEW) -> Array:
     """Return how badly readings fit, from so many rows."""
     tries = [each.change(points).evenly(most) for each in readings]
-    found = np.full(len(readings), np.inf)
+    errors = np.full(len(readings), np.inf)
     own = [i for i, each in enumerate(readings) if each.robot is None]
-    found[own] = misfits(robot, [tries[i] for i in own])
+    errors[own] = misfits(robot, [tries[i] for i in own])
     for i, each in enumerate(readings):
         if each.robot is not None:
-            found[i] = misfit(each.robot, tries[i])
-    return found
+            errors[i] = misfit(each.robot, tries[i])
+    return errors

@@ -90,12 +90,13 @@ def page(result: Calibration) -> str:
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     content = Content(result, accepted, workspace, composition)
+    headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
         f"Calibration: {heading}",
         f"Robot calibration report, {result.record.made[:10]}",
         heading,
-        [*_headline(content), ("notes", warnings)],
+        [*headline, ("notes", warnings)],
         [(name, blocks) for name, blocks in sections if blocks],
     )
 

@@ -123,33 +123,33 @@ def new_problem(
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
     arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
     paths = [data] if isinstance(data, str | Path) else data
-    found = understand_of(arm, paths, measurement, options)
+    understanding = understand_of(arm, paths, measurement, options)
     if understood is not None:
-        understood(found)
+        understood(understanding)
     names = {name: f"{chain}_{name}" if chain else name for name in (IDENTIFICATION, VALIDATION, TARGET)}
     board = stated_target(target, names[TARGET])
-    kind, how = _kind(arm, found, board, measurement)
+    kind, how = _kind(arm, understanding, board, measurement)
     noise = usual_noise(kind)
-    rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
-    columns = found.columns
+    rows = rows_of(understanding, on_board(understanding.columns, board.board), arm, kind)
+    columns = understanding.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
     held = np.zeros(len(rows), dtype=bool)
-    said = f'# validation = "{names[VALIDATION]}"   # a table that is used for no choice; none was given'
+    validated_by = f'# validation = "{names[VALIDATION]}"   # a table that is used for no choice; none was given'
     if hold_out is not None:
         held = _held_out(rows, hold_out, seed)
-        said = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
+        validated_by = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
     tables = {names[IDENTIFICATION]: _rows(columns, ~held)}
     if hold_out is not None:
         tables[names[VALIDATION]] = _rows(columns, held)
         rows = rows.take(np.flatnonzero(~held))
     if validation is not None:
-        other = understand_of(arm, [validation], kind.name, found.options)
+        other = understand_of(arm, [validation], kind.name, understanding.options)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[names[VALIDATION]] = other.columns
         if understood is not None:
             understood(other)
-        said = f'validation = "{names[VALIDATION]}"\n# from {Path(validation).name}; used for no choice'
+        validated_by = f'validation = "{names[VALIDATION]}"\n# from {Path(validation).name}; used for no choice'
     if board.table:
         tables[names[TARGET]] = board.table
     handed = [Path(file) for file in (*paths, validation) if file is not None]
@@ -165,14 +165,16 @@ def new_problem(
         "target": board.stated,
         "drawing": f"a copy of {source.name}" if chain else drawing,
         "columns": how,
-        "data": Path(found.file).name,
+        "data": Path(understanding.file).name,
         "count": len(rows),
-        "validation": said,
+        "validation": validated_by,
         "raw": {toml(str(name)): sha256_of(file) for name, file in zip(_names(handed), handed, strict=True)},
         "fixture": kind.start is not None,
-        "reading": [(name, toml(text)) for name, text in replace(found.options, joints=arm.names).texts().items()],
+        "reading": [
+            (name, toml(text)) for name, text in replace(understanding.options, joints=arm.names).texts().items()
+        ],
     }
-    with in_file(found.file):
+    with in_file(understanding.file):
         text, guessed = _problem_text(arm, kind, rows, noise, context)
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
     contents["problem.toml"] = before + text.encode()
@@ -193,7 +195,7 @@ def new_problem(
         notes.append(
             f"Chain '{chain}' identifies the URDF's own origins; {folder} takes another chain by --chain NAME."
         )
-    return Started(folder, counts, tuple(notes), replace(found, kind=kind))
+    return Started(folder, counts, tuple(notes), replace(understanding, kind=kind))
 
 
 def _names(files: Sequence[Path]) -> list[str]:
@@ -283,8 +285,8 @@ def _kind(
     kind = found.kind
     if target.board and not kind.by_camera:
         raise InputError("--target", "a board", f"none: measurement {kind.name} sees no points of one", found.file)
-    stated = any(name.startswith("target_x") for name in found.columns)
-    if kind.by_camera and not target.board and not stated:
+    on_target = any(name.startswith("target_x") for name in found.columns)
+    if kind.by_camera and not target.board and not on_target:
         accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
         raise InputError("the target", "nothing", accepted, found.file)
     if measurement is not None:
@@ -313,10 +315,12 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
             squares += np.sum((T[:, :3, 3] - block.y[:, :3]) ** 2, axis=1).tolist()
         misfit[name] = float(np.sqrt(np.mean(squares)))
     best, other = sorted(misfit, key=lambda name: misfit[name])
-    said = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
+    figures = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CAMERA_CLEARLY * misfit[best]:
-        raise InputError("the camera", f"no clear mounting ({best} leaves {said})", f"--measurement {best} or {other}")
-    return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {said}"
+        raise InputError(
+            "the camera", f"no clear mounting ({best} leaves {figures})", f"--measurement {best} or {other}"
+        )
+    return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {figures}"
 
 
 # --- the text of problem.toml -------------------------------------------------------------------------------------
@@ -375,8 +379,8 @@ def _at_links(names: Sequence[str], carried: Sequence[Carried], at_base: bool) -
     instead = {"tool_": mounts.get(False, "tool_")}
     if at_base:
         instead["base_"] = mounts.get(True, "")
-    found = [(frame_of(name), name.rpartition("_")[2], name) for name in names]
-    moved = [(instead.get(frame, frame), axis, name) for frame, axis, name in found]
+    parts = [(frame_of(name), name.rpartition("_")[2], name) for name in names]
+    moved = [(instead.get(frame, frame), axis, name) for frame, axis, name in parts]
     return [name if frame == frame_of(name) else frame + axis for frame, axis, name in moved if frame]
 
 
@@ -385,14 +389,14 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     rows = posed(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):
         return arm.base, "The base is that of the robot's file: these measurements do not depend on it."
-    found, _, verdict = locate(arm.robot, rows, tools)
-    if same_place(found, arm.base):
-        offset = 1e3 * np.linalg.norm(found[:3] - arm.base[:3])
+    located, _, verdict = locate(arm.robot, rows, tools)
+    if same_place(located, arm.base):
+        offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
         how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
         return arm.base, how
-    if np.linalg.norm(found[:3]) > FARTHEST:
+    if np.linalg.norm(located[:3]) > FARTHEST:
         verdict = "implausibly far away: are the units right?"
-    return None, f"Guessed: the data put the base at {placed(found)}, {kind.words.frame} ({verdict})."
+    return None, f"Guessed: the data put the base at {placed(located)}, {kind.words.frame} ({verdict})."
 
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:

@@ -95,9 +95,9 @@ class Understanding:
 
     def content(self) -> dict[str, Any]:
         """Return the same as a document."""
-        said = [f"{each.file}: {note}" for each in self.tables for note in each.notes]
+        of_tables = [f"{each.file}: {note}" for each in self.tables for note in each.notes]
         columns = [{"file": each.file, **meant._asdict()} for each in self.tables for meant in each.meant]
-        notes = [*said, *self.notes]
+        notes = [*of_tables, *self.notes]
         return {"columns": columns, "measurement": self.kind.name, "rows": self.count, "notes": notes}
 
 
@@ -149,10 +149,10 @@ def understand_tables(
     ('joined by label: 2 rows of 2 with joints and 2 measured.',)
     """
     arm = read_arm(find_source(robot), urdf_base, urdf_tip, dh)
-    found = understand_of(arm, data, measurement, options)
-    if not found.kind.by_camera:  # what it sees is another table
-        rows_of(found, found.columns, arm, found.kind)
-    return found
+    understanding = understand_of(arm, data, measurement, options)
+    if not understanding.kind.by_camera:  # what it sees is another table
+        rows_of(understanding, understanding.columns, arm, understanding.kind)
+    return understanding
 
 
 def usual_noise(kind: Measurement) -> dict[str, float]:
@@ -203,9 +203,11 @@ def understand_of(
         tables = _tables(files, arm, kind, options, targets)
         stems = set().union(*(each.stems for each in tables))
         if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
-            found = _whole(files, arm, kind, options, tables)
+            understanding = _whole(files, arm, kind, options, tables)
             doubt = next((each.doubt for each in tables if each.doubt), "")
-            return _checked(found, files, arm, doubt) if doubt and kind.turning and not targets else found
+            return (
+                _checked(understanding, files, arm, doubt) if doubt and kind.turning and not targets else understanding
+            )
     names = ", ".join(name for _, raw in files for name in raw.columns)
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
@@ -244,8 +246,8 @@ def _tables(
     tables = []
     for path, raw in files:
         with in_file(path):
-            found = understand(raw, arm.robot, kind, options, arm.names, targets)
-            tables.append(replace(found, file=path.name) if path else found)
+            understood = understand(raw, arm.robot, kind, options, arm.names, targets)
+            tables.append(replace(understood, file=path.name) if path else understood)
     return tables
 
 
@@ -257,8 +259,8 @@ def _whole(
     shown = []  # in what is shown the columns by which rows were joined are not left out
     for each in tables:
         joins = [m.column.lower() in whole.keys and m.meaning == "left out" for m in each.meant]
-        said = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
-        meant = tuple(m._replace(**said) if joined else m for m, joined in zip(each.meant, joins, strict=True))
+        join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
+        meant = tuple(m._replace(**join) if joined else m for m, joined in zip(each.meant, joins, strict=True))
         shown.append(replace(each, meant=meant))
     return Understanding(kind, whole.columns, whole.raw, tuple(shown), whole.notes, options, str(files[0][0] or ""))
 
@@ -268,12 +270,14 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
 
     Turns that fit clearly better in another convention than roll, pitch, yaw are asked for.
     """
-    found: dict[str, Understanding] = {}
+    alternatives: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
     for reading in READINGS[doubt]:
         options = replace(first.options, **{doubt: reading})
-        found[reading] = _whole(files, arm, first.kind, options, _tables(files, arm, first.kind, options))
-        data = read_data(found[reading].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, first.kind)
+        alternatives[reading] = _whole(files, arm, first.kind, options, _tables(files, arm, first.kind, options))
+        data = read_data(
+            alternatives[reading].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, first.kind
+        )
         misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data)))
     best, second = sorted(misfit, key=lambda reading: misfit[reading])[:2]
     figures = ", ".join(f"{reading} {misfit[reading]:.2f} deg" for reading in (best, second))
@@ -287,4 +291,4 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
         accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
         raise InputError("the order of the quaternion", f"an ambiguous order ({figures})", accepted, first.file)
     note = f"the quaternion's order is {best}: the nominal robot misses {figures}."
-    return replace(found[best], notes=(*found[best].notes, note))
+    return replace(alternatives[best], notes=(*alternatives[best].notes, note))

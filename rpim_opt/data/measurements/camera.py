@@ -195,9 +195,9 @@ def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: 
     if spread.ndim == 4:
         spread = spread[view, point]
     label = tuple(f"v{v}/{names[p]}" for v, p in zip(view, point, strict=True))
-    found = Dataset.of(q[view], uv[view, point], spread, label, kind, columns=columns)
-    block = replace(found.blocks[0], point=names[point][:, None])
-    return replace(found, blocks=(block,), configuration=view)
+    data = Dataset.of(q[view], uv[view, point], spread, label, kind, columns=columns)
+    block = replace(data.blocks[0], point=names[point][:, None])
+    return replace(data, blocks=(block,), configuration=view)
 
 
 def on_board(table: Columns, board: Board) -> Columns:
@@ -226,10 +226,10 @@ def on_board(table: Columns, board: Board) -> Columns:
 
 def board_of(data: Dataset) -> dict[str, Array]:
     """Return the points that the rows of cameras name, by name."""
-    found = {}
+    board = {}
     for block in data.blocks:
         if not block.measurement.by_camera or block.point is None:
             continue
         places = np.column_stack([block.columns[stem] for stem in TARGET])
-        found |= {str(name): place for name, place in zip(block.point[:, 0], places, strict=True)}
-    return found
+        board |= {str(name): place for name, place in zip(block.point[:, 0], places, strict=True)}
+    return board

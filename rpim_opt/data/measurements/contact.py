@@ -183,7 +183,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
         for what in ("torque", "approach"):
             both = [getattr(one, what) for one in (first, second)]
             own[what] = None if any(values is None for values in both) else np.concatenate(both, axis=1)
-        stated = Block(
+        relation = Block(
             each.measurement,
             q=np.concatenate([first.q, second.q], axis=1),
             y=np.array([[each.value]]),
@@ -195,7 +195,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
             point=np.array([each.between], dtype=object),
             **own,
         )
-        blocks.append(stated)
+        blocks.append(relation)
         label = " to ".join(each.between)
         if label in labels:  # planes may have both an angle and a distance
             label = f"{label}, {each.measurement.name.removeprefix('known_')}"

@@ -281,8 +281,8 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     apart = right - left[partner]
     least = np.full(len(left), np.inf)
     np.minimum.at(least, partner, np.abs(apart))
-    kept = np.flatnonzero((np.abs(apart) <= within) & (np.abs(apart) == least[partner]))
-    return partner[kept], kept, apart[kept]
+    rows = np.flatnonzero((np.abs(apart) <= within) & (np.abs(apart) == least[partner]))
+    return partner[rows], rows, apart[rows]
 
 
 def _by_time(joints: Side, values: Side, key: str, within: float) -> Pairing:
@@ -324,7 +324,7 @@ def _clock_tolerance(joints: Side, values: Side) -> float:
 def _times(tables: Sequence[Understood], key: str) -> tuple[list[str], Array]:
     """Return the columns of times of some tables, in lower case, and the times [s] of all rows."""
     clocks = []
-    found = []
+    times = []
     for table in tables:
         name = time_column(table.raw)
         if key and key.lower() != "time":
@@ -334,8 +334,8 @@ def _times(tables: Sequence[Understood], key: str) -> tuple[list[str], Array]:
             where = f"--time-tolerance, {table.file}"
             raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
         clocks.append(name.lower())
-        found.append(seconds(name, table.raw[name]))
-    return clocks, np.concatenate(found)
+        times.append(seconds(name, table.raw[name]))
+    return clocks, np.concatenate(times)
 
 
 def time_column(names: Iterable[str]) -> str | None:

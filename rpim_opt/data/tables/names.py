@@ -166,7 +166,7 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
         raise InputError("--quaternion", f"'{order}'", " or ".join(ORDERS))
     for i, (name, letter) in enumerate(zip(quaternion_columns(read, dof), order, strict=False), start=1):
         read[name] = read[name]._replace(stem=f"q{letter}", why=f"component {i} of a quaternion, order {order}")
-    stems = {found.stem for found in read.values()}
+    stems = {reading.stem for reading in read.values()}
     if {"qx", "qy", "qz"} <= stems and "qw" not in stems:
         zeroth = [name for name in read if re.fullmatch(r"q_?0", name.strip().lower())]
         read.update({name: read[name]._replace(stem="qw", why="beside qx, qy, qz") for name in zeroth})
@@ -211,12 +211,12 @@ def quaternion_columns(read: Readings, dof: int) -> list[str]:
 
     ``q0 ... q3`` are one where other columns are the joints.
     """
-    found: dict[str, dict[int, str]] = {}
+    components: dict[str, dict[int, str]] = {}
     for name in read:
         match = QUATERNION.fullmatch(name.strip().lower())
         if match:
-            found.setdefault(match[1], {})[int(match[2])] = name
-    for prefix, columns in found.items():
+            components.setdefault(match[1], {})[int(match[2])] = name
+    for prefix, columns in components.items():
         if sorted(columns) in ([0, 1, 2, 3], [1, 2, 3, 4]):
             others = {each.stem for name, each in read.items() if name not in columns.values()}
             counted = any(all(f"q{i + first}" in others for i in range(dof)) for first in (0, 1))
@@ -231,14 +231,14 @@ def quaternions(angles: np.ndarray, rotation: str) -> dict[str, list[str]]:
     Of ``intrinsic zyx`` the turn about z is first, and the column rz has it; of ``intrinsic zyz`` the columns have the
     first, second and third turn.
     """
-    kept = np.isfinite(angles).all(axis=1)
+    finite = np.isfinite(angles).all(axis=1)
     rotations = scipy.spatial.transform.Rotation
     if rotation == "vector":
-        found = rotations.from_rotvec(angles[kept])
+        turned = rotations.from_rotvec(angles[finite])
     else:
         how, order = rotation.split()
         places = ["xyz".index(axis) for axis in order] if len(set(order)) == 3 else [0, 1, 2]
-        found = rotations.from_euler(order.upper() if how == "intrinsic" else order, angles[kept][:, places])
+        turned = rotations.from_euler(order.upper() if how == "intrinsic" else order, angles[finite][:, places])
     cells = np.full((len(angles), 4), "", dtype=object)
-    cells[kept] = [list(map(repr, row)) for row in found.as_quat().tolist()]
+    cells[finite] = [list(map(repr, row)) for row in turned.as_quat().tolist()]
     return {f"q{part}": list(cells[:, "xyzw".index(part)]) for part in "wxyz"}

@@ -333,12 +333,14 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
     """Return the declared noise for rows without a stated one: standard deviations [SI], or a ``tracker``."""
     declared: dict[str, Any] = {}
     plain = dict(noise)
-    stated = plain.pop("tracker", None)
-    if stated is not None:
-        if not isinstance(stated, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
-            raise InputError("table noise, key tracker", repr(stated)[:60], "a table, for positions and poses")
-        given = quantities(stated, TRACKER, "table noise.tracker")
-        terms = {"range_ppm" if dimension == "ratio" else stem: value for (stem, dimension), value in given.items()}
+    tracker = plain.pop("tracker", None)
+    if tracker is not None:
+        if not isinstance(tracker, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
+            raise InputError("table noise, key tracker", repr(tracker)[:60], "a table, for positions and poses")
+        of_tracker = quantities(tracker, TRACKER, "table noise.tracker")
+        terms = {
+            "range_ppm" if dimension == "ratio" else stem: value for (stem, dimension), value in of_tracker.items()
+        }
         if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
             raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
         declared["tracker"] = LaserTracker(**terms)

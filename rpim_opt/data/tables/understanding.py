@@ -92,8 +92,8 @@ def understand(
     robot's file has. Of ``targets`` what was commanded counts, and rows may lack either values.
     """
     options = options or TableOptions()
-    stated = options.units
-    options = replace(options, units={**raw.units, **stated})
+    units = options.units
+    options = replace(options, units={**raw.units, **units})
     if options.rotation not in ("", "vector") and not known_names.EULER.fullmatch(options.rotation):
         accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
         raise InputError("--rotation", f"'{options.rotation}'", accepted)
@@ -101,18 +101,18 @@ def understand(
     read, rotation = _readings(raw, robot, kind, options, joints, targets)
     if options.constants:
         more = raw.with_constants(options.constants)
-        found = _readings(more, robot, kind, options, joints, targets)
-        if any(re.fullmatch(r"q\d+", found[0][name].stem) for name in raw.columns):  # the file with the joints
-            raw, (read, rotation) = more, found
+        interpreted = _readings(more, robot, kind, options, joints, targets)
+        if any(re.fullmatch(r"q\d+", interpreted[0][name].stem) for name in raw.columns):  # the file with the joints
+            raw, (read, rotation) = more, interpreted
     rotation = options.rotation or rotation
-    columns, meant = _under_our_names(raw.columns, read, kind, known, options.units, stated)
+    columns, meant = _under_our_names(raw.columns, read, kind, known, options.units, units)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         columns, meant = _as_quaternions(columns, meant, rotation)
-    kept, notes = range(len(next(iter(columns.values()), ()))), []
+    rows, notes = range(len(next(iter(columns.values()), ()))), []
     if not targets:
-        kept, columns, notes = _rows_with_values(columns, robot, kind)
-    cells = {name: [cells[i] for i in kept] for name, cells in raw.columns.items()}
-    notes = [*raw.notes, *notes, *_unused_units(meant, stated)]
+        rows, columns, notes = _rows_with_values(columns, robot, kind)
+    cells = {name: [cells[i] for i in rows] for name, cells in raw.columns.items()}
+    notes = [*raw.notes, *notes, *_unused_units(meant, units)]
     return Understood(columns, cells, tuple(meant), tuple(notes), _doubt(read, robot, options, rotation))
 
 
@@ -124,8 +124,8 @@ def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> 
     turned = [names[turn] for turn in TURNED]
     angles = [(split_unit(name)[1] or UNITS["rad"]).si * _values(columns[name], name) for name in turned]
     others = {name: cells for name, cells in columns.items() if name not in turned}
-    said = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
-    new = {"meaning": said, "name": "qw, qx, qy, qz", "unit": ""}
+    meaning_of_turn = "rotation vector" if rotation == "vector" else f"turn, {rotation}"
+    new = {"meaning": meaning_of_turn, "name": "qw, qx, qy, qz", "unit": ""}
     meant = [each._replace(**new) if each.name in turned else each for each in meant]
     return others | known_names.quaternions(np.column_stack(angles), rotation), meant
 
@@ -160,7 +160,7 @@ def _readings(
     names = [*number_columns(robot, kind), *text_columns(kind)]
     read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
     rotation = ""
-    stems = {found.stem for found in read.values()}
+    stems = {reading.stem for reading in read.values()}
     for words, why in known_names.JOINTS:
         if dof == len(words) and stems >= set(words):
             _rename(read, {word: f"q{i}" for i, word in enumerate(words, start=1)}, why)
@@ -192,8 +192,8 @@ def _readings(
     # of several labels the stated key, or the one that does more than count the rows
     labels = [name for name, each in read.items() if each.stem == "label"]
     count = [str(i) for i in range(1, len(next(iter(table.values()), ())) + 1)]
-    stated = [name for name in labels if name.lower() == options.key.lower()]
-    chosen = stated or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
+    keys = [name for name in labels if name.lower() == options.key.lower()]
+    chosen = keys or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
     if len(labels) > 1 and len(chosen) == 1:
         read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
     return read, rotation
@@ -215,20 +215,20 @@ def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[st
         return Reading(stem, unit, "by its name")
     if stem.lower() in names:  # elsewhere such a column holds labels
         return Reading(stem.lower(), unit, "touched point")
-    found = recognize(stem, joints)
-    if group and not found.why:  # the words of a group that tell nothing
+    reading = recognize(stem, joints)
+    if group and not reading.why:  # the words of a group that tell nothing
         rests = [rest for _, rest in endings(stem)]
         inner = [Reading(rest, "", "by its name") if rest in known else recognize(rest, joints) for rest in rests]
-        inside = next((each for each in inner if each.why), found)
-        found = inside._replace(kind=found.kind or inside.kind)
-    return found._replace(unit=unit)
+        inside = next((each for each in inner if each.why), reading)
+        reading = inside._replace(kind=reading.kind or inside.kind)
+    return reading._replace(unit=unit)
 
 
 def _in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[str]) -> Readings:
     """Return ROS' joints in the robot's order, where columns name0, ... name them."""
-    matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", found.stem) for name, found in read.items()}
+    matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", reading.stem) for name, reading in read.items()}
     named = {int(match[1]): name for name, match in matches.items() if match}
-    if not named or f"q{min(named)}" not in {found.stem for found in read.values()}:
+    if not named or f"q{min(named)}" not in {reading.stem for reading in read.values()}:
         return {}
     places: dict[str, int] = {}  # 0 for a joint that the robot does not have
     for i, column in named.items():
@@ -244,9 +244,11 @@ def _in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[
             raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
     why = "the joint that its column of names names"
     return {
-        name: found._replace(stem=f"q{places[found.stem]}" if places[found.stem] else f"another {found.stem}", why=why)
-        for name, found in read.items()
-        if found.stem in places
+        name: reading._replace(
+            stem=f"q{places[reading.stem]}" if places[reading.stem] else f"another {reading.stem}", why=why
+        )
+        for name, reading in read.items()
+        if reading.stem in places
     }
 
 
@@ -256,13 +258,13 @@ def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
 
 def _from_one(read: Readings, dof: int) -> Readings:
     """Return the joints counted from 1, where they are counted from 0."""
-    if all(found.stem != "q0" for found in read.values()):
+    if all(reading.stem != "q0" for reading in read.values()):
         return {}
     count = {f"{stem}{i}": f"{stem}{i + 1}" for i in range(dof) for stem in ("q", "tau")}
     return {
-        name: found._replace(stem=count[found.stem], why=f"{found.why}, counted from 0")
-        for name, found in read.items()
-        if found.stem in count
+        name: reading._replace(stem=count[reading.stem], why=f"{reading.why}, counted from 0")
+        for name, reading in read.items()
+        if reading.stem in count
     }
 
 
@@ -280,7 +282,7 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     whole = {}
     for prefix, each in _prefixed(read, joints).items():
         counted = each | _from_one(each, len(wanted))
-        missing = sorted(wanted - {found.stem for found in counted.values()})
+        missing = sorted(wanted - {reading.stem for reading in counted.values()})
         if not missing:
             whole[prefix] = counted
         elif len(missing) < len(wanted) / 2 and not known:  # is it one that did not move
@@ -298,30 +300,30 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
 
 def _prefixed(read: Readings, joints: Sequence[str]) -> dict[str, Readings]:
     """Return the meanings of unknown names without what stands before them, by that."""
-    found: dict[str, Readings] = {}
+    by_prefix: dict[str, Readings] = {}
     for name, each in read.items():
         for prefix, rest in endings(split(name)[0]):
             known = recognize(rest, joints)
             if known.why and known.kind != "derived" and not each.why:
                 bare = prefix.strip(" ._/:-")
                 new = Reading(known.stem, each.unit, f"{known.why}, of {bare}", known.kind or each.kind)
-                found.setdefault(bare, {})[name] = new
+                by_prefix.setdefault(bare, {})[name] = new
                 break  # the shortest prefix: orientation/x is no x
-    return found
+    return by_prefix
 
 
 def _counted(read: Readings, robot: Robot) -> Readings:
     """Return the joints from numbered columns of any word with joint units, if no joints are known otherwise."""
     if any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
         return {}
-    found: dict[str, Readings] = {}
+    by_stem: dict[str, Readings] = {}
     for name, each in read.items():
         match = re.fullmatch(r"(\D+?)_?([1-9]\d?)", each.stem)
         if match and each.unit and not each.why:
             why = f"'{match[1]}' counted from 1, in units of joints"
-            found.setdefault(match[1], {})[name] = Reading(f"q{match[2]}", each.unit, why, each.kind)
+            by_stem.setdefault(match[1], {})[name] = Reading(f"q{match[2]}", each.unit, why, each.kind)
     wanted = {(f"q{i}", dimension) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    whole = [of for of in found.values() if wanted <= {(each.stem, dimension_of(each.unit)) for each in of.values()}]
+    whole = [of for of in by_stem.values() if wanted <= {(each.stem, dimension_of(each.unit)) for each in of.values()}]
     return whole[0] if len(whole) == 1 else {}
 
 
@@ -329,12 +331,12 @@ def _counted_coordinates(read: Readings) -> Readings:
     """Return x, y, z of three columns of one word that are counted, ``p_1, p_2, p_3``, if nothing else is measured."""
     if any(each.stem in (*COORDINATES, "distance", "q0") for each in read.values()):
         return {}
-    found: dict[str, dict[str, str]] = {}
+    by_stem: dict[str, dict[str, str]] = {}
     for name, each in read.items():
         match = re.fullmatch(r"(\D*?)_?(\d)", each.stem)
         if match and not each.why and (not each.unit or dimension_of(each.unit) == "length"):
-            found.setdefault(match[1], {})[match[2]] = name
-    triples = [columns for columns in found.values() if sorted(columns) in (list("123"), list("012"))]
+            by_stem.setdefault(match[1], {})[match[2]] = name
+    triples = [columns for columns in by_stem.values() if sorted(columns) in (list("123"), list("012"))]
     if len(triples) != 1:
         return {}
     names = [triples[0][number] for number in sorted(triples[0])]
@@ -391,17 +393,17 @@ def _under_our_names(
     unitless: dict[str, str] = {}
     turned = {each.stem for each in read.values()} & {"qw", "rx", "r11"}
     for name, cells in table.items():
-        found = read[name]
-        if found.stem not in known and found.stem not in text_columns(kind):
-            meant.append(Meant(name, "left out", "", "", found.why or "not used by this measurement type"))
+        reading = read[name]
+        if reading.stem not in known and reading.stem not in text_columns(kind):
+            meant.append(Meant(name, "left out", "", "", reading.why or "not used by this measurement type"))
             continue
-        dimensions = [dimension for dimension in known.get(found.stem, []) if dimension]
+        dimensions = [dimension for dimension in known.get(reading.stem, []) if dimension]
         if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
             dimensions = ["length"]
-        unit, why = _unit(name, found, dimensions, units, stated)
+        unit, why = _unit(name, reading, dimensions, units, stated)
         if unit and dimension_of(unit) not in dimensions:
             accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"
-            raise InputError("the header", f"column '{name}' ({meaning(found.stem)}) in {unit}", accepted)
+            raise InputError("the header", f"column '{name}' ({meaning(reading.stem)}) in {unit}", accepted)
         if unit in FOREIGN:
             ours, size = FOREIGN[unit]
             cells = ["" if np.isnan(value) else repr(float(size * value)) for value in _values(cells, name)]
@@ -409,13 +411,13 @@ def _under_our_names(
             unit = ours
         if not unit and dimensions:
             unitless[name] = dimensions[0]
-        new = f"{found.stem}_{unit}" if unit else found.stem
+        new = f"{reading.stem}_{unit}" if unit else reading.stem
         if new in columns:
             other = next(each.column for each in meant if each.name == new)
             raise InputError("the header", f"columns '{other}' and '{name}' for {new}", "one of them")
         columns[new] = cells
-        said = kind.words.columns.get(found.stem) or meaning(found.stem)
-        meant.append(Meant(name, said, new, unit, f"{found.why}; unit {why}" if why else found.why))
+        words_of_column = kind.words.columns.get(reading.stem) or meaning(reading.stem)
+        meant.append(Meant(name, words_of_column, new, unit, f"{reading.why}; unit {why}" if why else reading.why))
     if unitless:
         examples = {"angle": "deg", "length": "mm", "torque": "Nm", "mass": "kg"}
         missing = ",".join(examples.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
@@ -456,8 +458,8 @@ def _unit(
 def _values(cells: Sequence[Any], name: str) -> np.ndarray:
     """Return the numbers (N,) of cells, NaN where there is none."""
     missing = [is_missing(str(cell)) for cell in cells]
-    found = numbers([0.0 if lacks else cell for cell, lacks in zip(cells, missing, strict=True)], name)
-    return np.where(missing, np.nan, found)
+    values = numbers([0.0 if lacks else cell for cell, lacks in zip(cells, missing, strict=True)], name)
+    return np.where(missing, np.nan, values)
 
 
 # --- rows ----------------------------------------------------------------------------------------------------------
@@ -483,10 +485,10 @@ def _rows_with_values(
         if rows:
             notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
         out.update(rows)
-    kept = [i for i in range(count) if i not in out]
-    if columns and not kept:
+    usable = [i for i in range(count) if i not in out]
+    if columns and not usable:
         raise InputError("the table", "no row with values", "at least one")
-    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in kept] for name, cells in columns.items()}
+    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in usable] for name, cells in columns.items()}
     own = [str(cell).strip() for cell in whole.get("label", ())]
     both = [f"{label}/{marker}" for label, marker in zip(own, whole.get("marker", ()), strict=False)]
     if both and not _unique(own) and _unique(both):
@@ -496,7 +498,7 @@ def _rows_with_values(
         again = next((label for label in own if own.count(label) > 1), "")
         notes.append(f"labels are not unique ('{again}'): rows are numbered.")
         del whole["label"]
-    return kept, whole, notes
+    return usable, whole, notes
 
 
 def _unique(labels: Sequence[str]) -> bool:

@@ -119,10 +119,10 @@ def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
         there = transformed(pose_at(step), points)
         return (there[:, :2] / np.maximum(there[:, 2:], 1e-6) - xy).ravel()
 
-    found = scipy.optimize.least_squares(
+    solution = scipy.optimize.least_squares(
         residual, np.zeros(6), method="lm", x_scale="jac", xtol=1e-10, ftol=1e-15, gtol=1e-15
     )
-    return pose_at(found.x), float(2 * found.cost)
+    return pose_at(solution.x), float(2 * solution.cost)
 
 
 def rows_by_view(data: Dataset, block: Block) -> Iterator[np.ndarray]:
@@ -190,16 +190,16 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
             xy = normalized(block.y, camera)
             _, _, planar = _plane(points)
             covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
-            found = []  # the first entry of each view, and its pose
+            placed_views = []  # the first entry of each view, and its pose
             for view in rows_by_view(data, block):
                 if len(view) >= FEWEST[planar]:
                     with suppress(InputError):  # points on a line
-                        found.append((int(view[0]), view_pose(points[view], xy[view])))
-            if not found:
+                        placed_views.append((int(view[0]), view_pose(points[view], xy[view])))
+            if not placed_views:
                 accepted = f"views of {FEWEST[planar]} points or more"
                 raise InputError("the camera", "no view that shows a pose", accepted)
-            index = np.array([i for i, _ in found])
-            T = np.array([there for _, there in found])
+            index = np.array([i for i, _ in placed_views])
+            T = np.array([there for _, there in placed_views])
             focus = float(np.sqrt(camera["fx"] * camera["fy"]))
             spread = np.sqrt(np.trace(covariance[index], axis1=1, axis2=2) / 2)
             deviation = UNCERTAIN * spread / focus * T[:, 2, 3]

@@ -288,10 +288,10 @@ def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
     of that agree, with all of them and with parts of it.
     """
     first = _likeliest(pairs)
-    found = [loops.graduated(first)]
-    if not np.array_equal(found[0].weights > 0, first):
-        found.append(loops.graduated(np.ones(len(pairs), dtype=bool)))
-    most = max(each.weights.sum() for each in found)
+    solutions = [loops.graduated(first)]
+    if not np.array_equal(solutions[0].weights > 0, first):
+        solutions.append(loops.graduated(np.ones(len(pairs), dtype=bool)))
+    most = max(each.weights.sum() for each in solutions)
     if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
         members = np.flatnonzero(first)
         around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
@@ -299,9 +299,9 @@ def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
         if len(members) <= FEW:  # turning alike, one may be wrong all the same
             parts += list(first & ~np.eye(len(first), dtype=bool)[members])
         distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
-        found += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
-    least = min(each.cost for each in found)
-    return next(each for each in found if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
+        solutions += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
+    least = min(each.cost for each in solutions)
+    return next(each for each in solutions if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
 
 
 def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:
@@ -318,9 +318,9 @@ def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array
         return np.ones((N, N), dtype=bool)
     angles = []
     rough = np.zeros(N)
-    for given in (flange[:, :3, :3], measured[:, :3, :3]):
-        rotations = proper(given)
-        rough += np.linalg.norm(given - rotations, axis=(1, 2))  # taken for the nearest rotations
+    for matrices in (flange[:, :3, :3], measured[:, :3, :3]):
+        rotations = proper(matrices)
+        rough += np.linalg.norm(matrices - rotations, axis=(1, 2))  # taken for the nearest rotations
         flat = rotations.reshape(-1, 9)
         angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
     chord = sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
@@ -422,11 +422,11 @@ def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
     settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
     P = scipy.sparse.csc_matrix((len(q), len(q)))
-    found = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
+    solution = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
     M = np.zeros((n, n))
-    M[rows, columns] = M[columns, rows] = np.array(found.z) / root
+    M[rows, columns] = M[columns, rows] = np.array(solution.z) / root
     eigenvalues = np.linalg.eigvalsh(M)
-    return Moments(M, size * np.array(found.x)[1:], float(abs(eigenvalues[-2]) / eigenvalues[-1]))
+    return Moments(M, size * np.array(solution.x)[1:], float(abs(eigenvalues[-2]) / eigenvalues[-1]))
 
 
 @dataclass(frozen=True, eq=False)
@@ -484,8 +484,8 @@ def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smal
         normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
         drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
         lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
-    found = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
-    best = min([*found, *near], key=lambda R: _value(L, R))
+    rounded = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
+    best = min([*rounded, *near], key=lambda R: _value(L, R))
     value = _value(L, best)
     x = lifted(best)
     C = rotation_constraints(len(best))

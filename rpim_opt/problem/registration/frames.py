@@ -83,13 +83,15 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         how = f"by registration of positions: {error.found}"
         names = list(places)
         number = np.array([names.index(name) for name in marker.tolist()])
-        stated = np.array([place[:3] for place in places.values()])
+        nominal = np.array([place[:3] for place in places.values()])
         # refuses points on a line
-        register(transformed(flange, stated[number]), y)
-        spread = np.full(len(stated), TOOL_ERROR)
+        register(transformed(flange, nominal[number]), y)
+        spread = np.full(len(nominal), TOOL_ERROR)
         zero = np.zeros((1, len(robot.mdh)))
         q = q @ robot.joint_map.T
-        fit = fit_arms(robot, Candidates(q[None], y[None], number[None], zero, stated[None], stated, spread), steps=12)
+        fit = fit_arms(
+            robot, Candidates(q[None], y[None], number[None], zero, nominal[None], nominal, spread), steps=12
+        )
         base = fit.base[0]
         for place, fitted in zip(places.values(), fit.tools[0], strict=True):
             place[:3] = fitted
@@ -121,7 +123,7 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
     that an instrument has seen. Each other one is put where its touches are nearest to those of the robots so far.
     """
     known: dict[str, Array] = {}
-    found = {}
+    bases = {}
     for robot, arm in problem.arms.items():
         p = problem.parameters.of_robot(robot)
         touched: dict[str, list[Array]] = {}
@@ -143,17 +145,17 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
         if p.identified[k].all() and not seen:
             with suppress(InputError):  # too few, or on a line
                 base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
-                found[robot] = frame_numbers(base)
+                bases[robot] = frame_numbers(base)
         for name, place in places.items():
             there = transformed(base, place)
             distance = float(np.linalg.norm(there - known.setdefault(name, there)))
             # of a base that touches do not place, too few of them say nothing
-            placed = robot in found or seen or not p.identified[k].all()
+            placed = robot in bases or seen or not p.identified[k].all()
             if placed and distance > APART:
                 what = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
                 accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
                 raise InputError(f"together, problem '{robot}'", what, accepted)
-    return found
+    return bases
 
 
 MISPLACED = 3.0  # how many scales a frame may be from where it is stated before the statement counts as a mistake
@@ -277,13 +279,13 @@ def _of_measurements(
     for block in data.blocks:
         kind = block.measurement
         names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
-        given: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
-        if names and not given and kind.start is not None:
+        values_of: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
+        if names and not values_of and kind.start is not None:
             tool = numeric_frame(tools[block.markers[0]])
             T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
-            given = kind.start(T[:, :3, 3], block.y)
-            located |= {names[name] for name in given}
-        values |= {full: (kind.parameters[name], float(given.get(name, 0.0))) for name, full in names.items()}
+            values_of = kind.start(T[:, :3, 3], block.y)
+            located |= {names[name] for name in values_of}
+        values |= {full: (kind.parameters[name], float(values_of.get(name, 0.0))) for name, full in names.items()}
     return values, located
 
 
@@ -317,13 +319,13 @@ def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: 
 
 def starting_cameras(data: Dataset, own: Mapping[str, float]) -> dict[str, float]:
     """Return focal lengths and centres [px] by name of cameras without entries in ``own``."""
-    found = {}
+    values = {}
     for block in camera_blocks(data):
         names = {name: of_fixture(name, block.fixture) for name in block.measurement.parameters}
         if len(block.row) and not any(full in own for name, full in names.items() if name.startswith("camera_")):
             start = starting_camera(data, block)
-            found |= {of_fixture(f"camera_{name}", block.fixture): value for name, value in start.items()}
-    return found
+            values |= {of_fixture(f"camera_{name}", block.fixture): value for name, value in start.items()}
+    return values
 
 
 def relocated(problem: Source) -> Source | None:

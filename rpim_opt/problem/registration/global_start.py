@@ -102,13 +102,13 @@ class JointMapping:
     @property
     def ambiguities(self) -> tuple[str, ...]:
         """Return sentences on alternatives of equal fit; no mirror image of an arm whose joints count as stated."""
-        stated = bool((self.sign > 0).all())
-        return self._said([other for other in self.alternatives if not (other.mirror and stated)])
+        as_nominal = bool((self.sign > 0).all())
+        return self._said([other for other in self.alternatives if not (other.mirror and as_nominal)])
 
     def _said(self, alternatives: Sequence[Alternative]) -> tuple[str, ...]:
-        said = []
+        sentences = []
         if self.mirrored:
-            said.append(
+            sentences.append(
                 "A left-handed measured frame with the joints as stated fits as well: a known direction in the "
                 "instrument's frame (such as up) or measured orientations would decide."
             )
@@ -116,17 +116,17 @@ class JointMapping:
             what = described(self.joint_types, other.sign, other.zero).capitalize()
             if other.mirror:
                 first = described(self.joint_types, self.sign, self.zero)
-                said.append(
+                sentences.append(
                     f"{what}, fits as well as {first}: lengths do not tell an arm from its mirror image; a few "
                     "positions would decide, or write what the set-up confirms as sign and theta_deg in robot.toml."
                 )
                 continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
-            said.append(
+            sentences.append(
                 f"{what} fits as well, and predicts {three_digits(1e3 * other.apart)} mm at other "
                 f"configurations: measure at ({values}) to decide."
             )
-        return tuple(said)
+        return tuple(sentences)
 
 
 def described(joint_types: tuple[str, ...], sign: Array, zero: Array) -> str:
@@ -177,10 +177,10 @@ def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | N
     needed |= set(_anchor(problem)) if points.lengths else {f"base_{c}" for c in FRAME}
     if not needed <= set(problem.parameters.free.names) or explained(problem.robot, points):
         return None
-    found = search(problem.robot, points)
-    if found is None or found.mirrored:
+    mapping = search(problem.robot, points)
+    if mapping is None or mapping.mirrored:
         return None
-    return found, with_mapping(problem, points, found)
+    return mapping, with_mapping(problem, points, mapping)
 
 
 def _anchor(problem: CalibrationProblem) -> list[str]:
@@ -212,8 +212,8 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
     if not points.lengths:
         places["base_"] = fit.base[0]
     elif names := _anchor(problem):
-        stated = numeric_frame(p.nominal[[p.names.index(f"base_{c}") for c in FRAME]])
-        anchor = transformed(stated, -fit.base[0, :3, 3])
+        base = numeric_frame(p.nominal[[p.names.index(f"base_{c}") for c in FRAME]])
+        anchor = transformed(base, -fit.base[0, :3, 3])
         values |= dict(zip(names, [*anchor, fit.offset[0]], strict=True))
     several = len(fit.tools[0]) // len(points.names)
     for name, tool in zip(points.names, fit.tools[0].reshape(len(points.names), several, 3), strict=True):
@@ -287,8 +287,8 @@ def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Arr
 
 def _signed(robot: Robot, points: Points, sign: Array) -> Candidates:
     """Return candidates of the points with signs (B, dof) of their joints."""
-    found = Candidates.of(robot, [replace(points, q=each * points.q) for each in sign])
-    return found._replace(spread=np.full(len(found.stated), 3.0 * found.spread.max()))
+    candidates = Candidates.of(robot, [replace(points, q=each * points.q) for each in sign])
+    return candidates._replace(spread=np.full(len(candidates.stated), 3.0 * candidates.spread.max()))
 
 
 def _round(robot: Robot, points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
@@ -309,10 +309,10 @@ def _judged(
     if not least <= ACCEPTED * points.extent or (small and EXPLAINED * least >= left[0]):
         return None
     best = int(np.argmin(left))
-    kept = fits.error[best] <= GROSS * np.median(fits.error[best])
-    equations = (1 if points.lengths else 3) * int(kept.sum())
+    inliers = fits.error[best] <= GROSS * np.median(fits.error[best])
+    equations = (1 if points.lengths else 3) * int(inliers.sum())
     free = max(equations - max(robot.dof - 2, 0) - fits.tools[0].size - 6, 1)
-    cost = (fits.error[:, kept] ** 2).sum(axis=1)
+    cost = (fits.error[:, inliers] ** 2).sum(axis=1)
     chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
     near = [i for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
     turning = _turning(robot)
@@ -323,32 +323,32 @@ def _judged(
     )
     zeros = [_gauged(robot, fits.zero[i]) for i in range(len(sign))]
     classes: list[list[int]] = []
-    said: list[Array] = []
+    predictions: list[Array] = []
     for i in near:
         T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
         there = transformed(T[:, None], fits.tools[i])
         if points.lengths:
             there -= there.mean(axis=(0, 1))
-        gaps = [_apart(there, other, points.lengths) for other in said]
+        gaps = [_apart(there, other, points.lengths) for other in predictions]
         if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
             classes[int(np.argmin(gaps))].append(i)
         else:
             classes.append([i])
-            said.append(there)
+            predictions.append(there)
     plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
     same = 0.5 * max(least, LEAST_NOISE)
 
     def mirrors(first: int) -> list[bool]:
-        return [points.lengths and bool(_apart(-there, said[first], True) <= same) for there in said]
+        return [points.lengths and bool(_apart(-there, predictions[first], True) <= same) for there in predictions]
 
     first = min([0, *np.flatnonzero(mirrors(0)).tolist()], key=lambda k: _plain(sign[plainest[k]], zeros[plainest[k]]))
     mirror = mirrors(first)
     others = []
     for k, i in enumerate(plainest):
         if k != first:
-            far = np.linalg.norm(said[k] - said[first], axis=-1).max(axis=-1)
+            far = np.linalg.norm(predictions[k] - predictions[first], axis=-1).max(axis=-1)
             told_by = elsewhere[int(np.argmax(far))]
-            apart = _apart(said[k], said[first], points.lengths)
+            apart = _apart(predictions[k], predictions[first], points.lengths)
             others.append(Alternative(sign[i], zeros[i], apart, told_by, mirror[k]))
     nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
     left_handed = False

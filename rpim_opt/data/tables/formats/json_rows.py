@@ -17,12 +17,12 @@ def read(text: str) -> Rows:
     lines = [line for line in text.splitlines() if line.strip()]
     try:
         if not text.lstrip().startswith("[") and len(lines) > 1 and lines[0].rstrip().endswith("}"):
-            found = [parse_json(line) for line in lines]
+            content = [parse_json(line) for line in lines]
         else:
-            found = parse_json(text)
+            content = parse_json(text)
     except ValueError as error:
         raise InputError("the JSON text", str(error), "a whole JSON file, or an object a line") from None
-    return _rows(found)
+    return _rows(content)
 
 
 def read_yaml(text: str) -> Rows:
@@ -31,10 +31,10 @@ def read_yaml(text: str) -> Rows:
     try:
         if any(isinstance(token, yaml.AliasToken) for token in yaml.scan(text)):
             raise InputError("the YAML text", "an alias (*)", "values written out")
-        found = [document for document in yaml.safe_load_all(text) if document is not None]
+        documents = [document for document in yaml.safe_load_all(text) if document is not None]
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise InputError("the YAML text", " ".join(str(error).split())[:200], "a whole YAML file") from None
-    return _rows(found[0] if len(found) == 1 else found)
+    return _rows(documents[0] if len(documents) == 1 else documents)
 
 
 def _rows(found: Any) -> Rows:

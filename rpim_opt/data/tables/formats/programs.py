@@ -51,19 +51,19 @@ def read_fanuc(text: str) -> Rows:
     named = all(comments) and len(set(comments)) == len(comments)
     rows = []
     for number, comment, fields in points:
-        found = re.findall(r"\b(J\d|[XYZWPR])\s*=\s*([+-]?[\d.]+)\s*(deg|mm)", fields)
-        values = {f"{'' if name[0] == 'J' else 'commanded '}{name} [{unit}]": value for name, value, unit in found}
+        numbers = re.findall(r"\b(J\d|[XYZWPR])\s*=\s*([+-]?[\d.]+)\s*(deg|mm)", fields)
+        values = {f"{'' if name[0] == 'J' else 'commanded '}{name} [{unit}]": value for name, value, unit in numbers}
         rows.append((comment if named else f"P{number}", values))
     return _rows(rows)
 
 
 def read_kuka(text: str) -> Rows:
     """Return the targets; a prefix X of all names, as in inline forms, is removed."""
-    found = KUKA.findall(text)
-    found = [each for each in found if re.search(r"\bA1\b", each[1], re.IGNORECASE)] or found
-    inline = all(name.upper().startswith("X") for name, _ in found)
+    targets = KUKA.findall(text)
+    targets = [each for each in targets if re.search(r"\bA1\b", each[1], re.IGNORECASE)] or targets
+    inline = all(name.upper().startswith("X") for name, _ in targets)
     rows = []
-    for name, fields in found:
+    for name, fields in targets:
         pairs = re.findall(rf"\b([A-Z]\d?)\s+({NUMBER})", fields, re.IGNORECASE)
         values = {KUKA_NAMES[key.upper()]: value for key, value in pairs if key.upper() in KUKA_NAMES}
         rows.append((name[1:] if inline else name, values))
@@ -126,18 +126,18 @@ def read_kawasaki(text: str) -> Rows:
 def read_staubli(text: str) -> Rows:
     """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]``."""
     array, i = "", -1
-    found = []
+    targets = []
     for element, fields in STAUBLI.findall(text):
-        given = dict(re.findall(r'\b(\w+)\s*=\s*"([^"]*)"', fields))
+        attributes = dict(re.findall(r'\b(\w+)\s*=\s*"([^"]*)"', fields))
         if element == "Data":
-            array, i = given.get("name", ""), -1
+            array, i = attributes.get("name", ""), -1
             continue
         i += 1
-        values = {new: given[name] for name, new in STAUBLI_NAMES.items() if name in given}
-        found.append((array, given.get("key", str(i)), values))
-    found = [each for each in found if "J1 [deg]" in each[2]] or found
-    several = len({array for array, _, _ in found}) > 1
-    return _rows([(f"{array}[{key}]" if several else key, values) for array, key, values in found])
+        values = {new: attributes[name] for name, new in STAUBLI_NAMES.items() if name in attributes}
+        targets.append((array, attributes.get("key", str(i)), values))
+    targets = [each for each in targets if "J1 [deg]" in each[2]] or targets
+    several = len({array for array, _, _ in targets}) > 1
+    return _rows([(f"{array}[{key}]" if several else key, values) for array, key, values in targets])
 
 
 FORMATS = (

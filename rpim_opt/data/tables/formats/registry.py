@@ -50,20 +50,20 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     if not fitting and ending in BINARY:
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
-    found = None
+    format = None
     rows: Rows = ()
     if fitting:
         with in_file(path):
             require_file(path, LARGEST_DATA)
             text, _ = decoded(path, options.encoding if options else "")
-            found = next((each for each in fitting if each.shown_by(text)), None)
-            rows = found.read(text) if found else ()
-        if not rows and (found or ending not in TEXTS):
+            format = next((each for each in fitting if each.shown_by(text)), None)
+            rows = format.read(text) if format else ()
+        if not rows and (format or ending not in TEXTS):
             names = " or ".join(each.name for each in fitting)
             raise InputError("the file", "neither targets nor rows", f"{names} with some", path)
-    if found is None:
+    if format is None:
         return read_table(path, options)
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
     raw = read_table(path, options, columns)
-    return replace(raw, notes=(f"read as {found.name}.", *raw.notes))
+    return replace(raw, notes=(f"read as {format.name}.", *raw.notes))
