@@ -336,7 +336,7 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
             continue
         label = [problem.data.label[row] for row in block.row]
         _, first, which = np.unique(block.y, axis=0, return_index=True, return_inverse=True)
-        for i, k in enumerate(first[which]):
+        for i, k in enumerate(first[which.ravel()]):  # a column in NumPy 2.0
             if not np.allclose(block.q[i], block.q[k]):
                 both = f"rows {label[k]} and {label[i]}"
                 yield f"{both} have the same measured values in different configurations: copied?"
