@@ -82,7 +82,7 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
 
     Of harmonics those of joints that turned far enough.
     """
-    names_of: dict[str, list[str]] = {}
+    candidates: dict[str, list[str]] = {}
     known = set(problem.parameters.free.names)
     for robot, arm in problem.arms.items():
         travel = np.ptp(problem.alone(robot).joint_values, axis=0)
@@ -90,14 +90,16 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
             if extension in TURNED:
                 turned = {str(i) for i, angle in enumerate(travel, start=1) if angle > TURNED[extension]}
                 names = [name for name in names if name.rpartition("_")[2].lstrip("cosin") in turned]
-            names_of.setdefault(extension, []).extend(problem.parameters.called(robot, name) for name in names)
+            candidates.setdefault(extension, []).extend(problem.parameters.called(robot, name) for name in names)
     prefixes = {session_prefix(name) for name in problem.data.sessions}
     if 2 <= len(prefixes) <= len(np.unique(problem.data.configuration)) / 2:  # sessions differ from configurations
-        names_of[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
+        candidates[SESSIONS] = [n for n in problem.parameters.names if frame_of(n) in prefixes]
     grows = [n for n in problem.parameters.names if own_name(n) == EXPANSION]
     if grows and np.ptp(problem.data.temperatures) > 0:
-        names_of[WARMTH] = grows
-    new = {extension: tuple(dict.fromkeys(n for n in names if n not in known)) for extension, names in names_of.items()}
+        candidates[WARMTH] = grows
+    new = {
+        extension: tuple(dict.fromkeys(n for n in names if n not in known)) for extension, names in candidates.items()
+    }
     return {extension: names for extension, names in new.items() if names}
 
 

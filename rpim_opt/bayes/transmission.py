@@ -80,10 +80,10 @@ def admitted(
     models = Models(bare, estimator, deviation, skip=(SECOND,))
     used = np.isin(models.names, p.free.names)
     before = named(fit.problem, fit.point.v)
-    columns_given = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
+    evidence_with = partial(_given, models.columns, used, np.array([before[name] for name in models.names[used]]))
     start = np.log([max(getattr(fit.laid.repeatability, kind), LEAST) for kind in models.columns.noise])
-    plain = columns_given(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
-    likeliest = _most_likely(columns_given, models, plain)
+    plain = evidence_with(np.zeros((len(models.columns.data.y), 0))).optima([start], ACCURACY)[0]
+    likeliest = _most_likely(evidence_with, models, plain)
     if likeliest is None:
         return None
     point, curves, columns = likeliest

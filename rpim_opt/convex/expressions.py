@@ -275,10 +275,10 @@ class Term:
             self.variable.save_value(value)
             if any(np.any(limit.violation() > 0) for limit in self._domain):  # 1 / x is a number there, no atom's
                 return float("inf")
-            value_of_term = self._evaluated(value)
-        if value_of_term is None or not np.isfinite(value_of_term):
+            result = self._evaluated(value)
+        if result is None or not np.isfinite(result):
             return float("inf")
-        return float(value_of_term)
+        return float(result)
 
     def slope(self, value: Array) -> Array | None:
         """Return the gradient (n,), None where CVXPY knows none, or outside the domain."""

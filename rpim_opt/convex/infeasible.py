@@ -36,15 +36,15 @@ def conflict(structure: Structure) -> Conflict | None:
     if _possible(units):
         return None
     units_left = _irreducible(units)
-    single = _irreducible([[demand_of] for unit in units_left for demand_of in unit])
-    names = tuple(demand_of.name for unit in single for demand_of in unit)
+    single = _irreducible([[statement] for unit in units_left for statement in unit])
+    names = tuple(statement.name for unit in single for statement in unit)
     parameters = structure.parameters
     parsed = [function for function in structure.formulation.constraints if isinstance(function, Parsed)]
     slacks = []
     for kind, count in (("boxes", structure.n), ("statements", len(parsed))):
         slack = cp.Variable(max(count, 1), nonneg=True)
         loosened = _units(structure, z, **{kind: slack})
-        _solved(cp.sum(slack), [demand for unit in loosened for demand_of in unit for demand in demand_of.demands])
+        _solved(cp.sum(slack), [demand for unit in loosened for statement in unit for demand in statement.demands])
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
     by_box, by_statement = slacks
     bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
@@ -90,24 +90,24 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
     units: list[list[Stated]] = []
     count = 0
     for k, function in enumerate(stated.constraints):
-        demands_of: list[Stated] = []
+        unit: list[Stated] = []
         if isinstance(function, Box):
             more = boxes + np.zeros(structure.n)
             for sign, side in zip("><", function.bounds(parameters), strict=True):
                 for i in np.flatnonzero(np.isfinite(side)):
                     bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
                     demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
-                    demands_of.append(Stated(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
+                    unit.append(Stated(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
         elif isinstance(function, Parsed):
             by = None if isinstance(statements, int) else function.scale(parameters) * statements[count]
-            demands_of.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
+            unit.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
             count += 1
         else:
             demands = [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
             name = name_of(function, k)
             several = len(demands) > 1
-            demands_of = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
-        units.append(demands_of)
+            unit = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
+        units.append(unit)
     return units
 
 

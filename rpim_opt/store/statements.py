@@ -118,9 +118,9 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     if set(values) not in ({"q"}, set(joints)):
         accepted = "x_mm, y_mm and z_mm of a box, all joints' q1_deg, ..., q_deg of all joints, or rows = [labels]"
         raise InputError(where, ", ".join(table) or "nothing", accepted)
-    values_of_joints = values["q"] if "q" in values else [values[name] for name in joints]
+    joints_of_place = values["q"] if "q" in values else [values[name] for name in joints]
     try:
-        q = np.array(values_of_joints, dtype=float)
+        q = np.array(joints_of_place, dtype=float)
     except ValueError:
         raise InputError(where, "lists of different lengths", f"{robot.dof} joint values a configuration") from None
     q = q.reshape(-1, q.shape[-1] if q.ndim else 1)

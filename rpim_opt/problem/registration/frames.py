@@ -279,13 +279,13 @@ def _of_measurements(
     for block in data.blocks:
         kind = block.measurement
         names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
-        values_of: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
-        if names and not values_of and kind.start is not None:
+        start_values: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
+        if names and not start_values and kind.start is not None:
             tool = numeric_frame(tools[block.markers[0]])
             T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
-            values_of = kind.start(T[:, :3, 3], block.y)
-            located |= {names[name] for name in values_of}
-        values |= {full: (kind.parameters[name], float(values_of.get(name, 0.0))) for name, full in names.items()}
+            start_values = kind.start(T[:, :3, 3], block.y)
+            located |= {names[name] for name in start_values}
+        values |= {full: (kind.parameters[name], float(start_values.get(name, 0.0))) for name, full in names.items()}
     return values, located
 
 
