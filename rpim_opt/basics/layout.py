@@ -245,14 +245,23 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
 
 
 def _summaries(columns: Sequence[Column]) -> int:
-    """Return how many rows at the end are means, extremes or spreads of all rows above, whatever they are called."""
+    """Return how many rows at the end are means, extremes or spreads of all rows above, whatever they are called.
+
+    One of them has to be a mean or a spread: the end of a path may be where its joints are largest, more than once.
+    """
     table = np.array([[numeral(cell) for cell in each.cells] for each in columns if _is_numeric(each.cells)]).T
     for count in range(min(MOST_SUMMARIES, len(table) - FEWEST_ROWS), 0, -1):
-        above, row = table[:-count], table[-count]
-        spread, there = above.std(axis=0), np.isfinite(row)
-        for each in (above.mean(axis=0), spread, above.min(axis=0), above.max(axis=0)):
-            if there.sum() > 2 and (np.abs(row - each) <= SAME * spread)[there].all():
-                return count
+        above, below = table[:-count], table[-count:]
+        mean, spread = above.mean(axis=0), above.std(axis=0)
+
+        def shows(row: np.ndarray, figures: np.ndarray, spread: np.ndarray = spread) -> bool:
+            there = np.isfinite(row)
+            return bool(there.sum() > 2 and (np.abs(row - figures) <= SAME * spread)[there].all())
+
+        known = (mean, spread, above.min(axis=0), above.max(axis=0))
+        central = any(shows(row, each) for row in below for each in known[:2])
+        if central and any(shows(below[0], each) for each in known):
+            return count
     return 0
 
 

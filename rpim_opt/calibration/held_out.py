@@ -68,7 +68,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     return Judged(sigmas, allowed, float(covered.mean()) if len(covered) else None)
 
 
-def displaced(result: Calibration, data: Dataset, found: Judged) -> str:
+def displaced(result: Calibration, data: Dataset, intervals: Judged) -> str:
     """Say that measurements are displaced together, by the motion that registers them; empty where they are not.
 
     It is said where rows are outside their prediction intervals and the motion takes more than half of the RMS error,
@@ -76,7 +76,7 @@ def displaced(result: Calibration, data: Dataset, found: Judged) -> str:
     """
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
-    if len(rows) < FEWEST or not (found.sigmas > found.allowed)[rows].any():
+    if len(rows) < FEWEST or not (intervals.sigmas > intervals.allowed)[rows].any():
         return ""
     measured = result.measured_positions(data)[rows]
     predicted = measured - vectors[rows]

@@ -11,6 +11,7 @@ import polars as pl
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.basics.layout import read_table
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from tests.simulate import ARM
 from tests.test_cli import run
@@ -256,3 +257,15 @@ def test_excel_says_what_is_missing(monkeypatch, tmp_path: Path) -> None:
         ro.InputError, match=r"Excel files: found no package openpyxl.*pip install 'rpim-opt\[tables\]'"
     ):
         ro.read_data(path, ARM2, NOISE)
+
+
+def test_the_end_of_a_path_is_no_summary_of_it(tmp_path: Path) -> None:
+    """Where all joints are largest, and stay; a mean of all rows above is one, whatever it is called."""
+    path = np.vstack([np.linspace(0, 1, 9)[:, None] * [10.0, 20.0, 30.0], [[10.0, 20.0, 30.0]] * 2])
+    lines = ["label;q1_deg;q2_deg;q3_deg", *(f"P{i};{a};{b};{c}" for i, (a, b, c) in enumerate(path.tolist()))]
+    file = tmp_path / "path.csv"
+    file.write_text("\n".join(lines), encoding="utf-8")
+    assert len(read_table(file).columns["q1_deg"]) == 11
+    mean, largest = (";".join(f"{v:.6f}" for v in row) for row in (path.mean(axis=0), path.max(axis=0)))
+    file.write_text("\n".join([*lines, f"largest;{largest}", f"middle;{mean}"]), encoding="utf-8")
+    assert len(read_table(file).columns["q1_deg"]) == 11
