@@ -21,8 +21,8 @@ NOISY = 3.0
 """Residual RMS over the stated noise above which the fit is not that of the stated instrument."""
 REACH = 0.003
 """Residual RMS over the length of the arm that a robot's own effects stay below."""
-REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 5e-3), "joint": ("mrad", 5e-3)}
-"""Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise."""
+REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
+"""Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
 ANGULAR = 0.02
 """Residual RMS of orientations [rad] that a robot's own effects stay below."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
