@@ -572,14 +572,16 @@ def compensate(
     base: Annotated[bool, Option("--base", help="Correct for deviations of the base as well.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
     largest: Annotated[float, Option(help="Largest permitted correction of a joint [rad or m].")] = 0.2,
-    limit: Annotated[Number, Option(help="Largest residual error [mm]; rows above it are marked, exit code 1.")] = None,
+    limit: Annotated[
+        Number, Option(help="Largest error left plus its U (k = 2) [mm]; rows above are marked, exit 1.")
+    ] = None,
     out: Table = None,
     despite_verdict: Despite = False,
 ) -> Answer:
     """Correct joint commands so that the real robot goes where the nominal one would.
 
-    Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or above the limit,
-    without one above twice its standard uncertainty.
+    Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or error and uncertainty
+    above the limit, without one the error above twice its standard uncertainty.
     """
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)

@@ -134,7 +134,7 @@ def _concatenated(tables: Sequence[Parameters]) -> Parameters:
         return list(chain.from_iterable(getattr(table, what) for table in tables))
 
     fields: dict[str, Any] = {what: tuple(listed(what)) for what in ("names", "dimensions")}
-    fields |= {what: tuple(dict.fromkeys(listed(what))) for what in ("own_frames", "terms", "unstated_tools")}
+    fields |= {what: tuple(dict.fromkeys(listed(what))) for what in ("own_frames", "terms")}
     fields |= {what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")}
     return Parameters(**fields)
 

@@ -139,8 +139,6 @@ class Parameters(Tabled):
         Prefixes of the frames of measurements, ``plane_``: their rotations are angles as those of base and tool are.
     terms
         Names of the parameters of a user's own terms (`Model`), which are the robot's as those of the table are.
-    unstated_tools
-        Markers of reflectors whose nominal place nobody stated: it is where their search begins, and no TCP.
 
     Examples
     --------
@@ -168,7 +166,6 @@ class Parameters(Tabled):
     identified: np.ndarray
     own_frames: tuple[str, ...] = ()
     terms: tuple[str, ...] = ()
-    unstated_tools: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse fields of different lengths."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal
 
 from pydantic import Field, model_validator
 
@@ -103,12 +103,6 @@ class FrameTable(Table):
     def numbers(self) -> tuple[float, ...]:
         """The six numbers [m, rad]."""
         return tuple(getattr(self, c) for c in FRAME)
-
-
-class ToolTable(FrameTable):
-    """Pose of a reflector in the flange frame, the controller's TCP unless it is a guess, where its search begins."""
-
-    guessed: bool = False
 
 
 class RepeatabilityTable(Table):
@@ -250,15 +244,11 @@ class ProblemTable(Table):
     """Patterns of what chains share besides the origins of the URDF's joints; or by chain, what it shares."""
 
 
-F = TypeVar("F", bound=FrameTable)
-
-
 @dataclass(frozen=True, eq=False)
 class ProblemFile:
     """The checked content of a problem file, before any table is read.
 
     ``placed`` are the tables that place a measurement's anchor, plane or sphere; ``base`` is None for registration.
-    ``unstated_tools`` are the markers of ``tools`` that are guessed.
     """
 
     path: Path
@@ -268,7 +258,6 @@ class ProblemFile:
     kinds: Mapping[str, Measurement]
     observations: tuple[Observation, ...]
     tools: Mapping[str, tuple[float, ...]]
-    unstated_tools: tuple[str, ...]
     base: tuple[float, ...] | None
     chains: tuple[str, ...] = ()
     board: Board | None = None
@@ -276,7 +265,6 @@ class ProblemFile:
     def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
         """Return the parameters with the file's scales, tolerances and selection of identified parameters."""
         table = self.table
-        parameters = replace(parameters, unstated_tools=self.unstated_tools)
         parameters = parameters.scaled(table.scale, self.path).toleranced(table.tolerance, self.path)
         return parameters.identify(identifiable(table.identify, self.robot, parameters, data))
 
@@ -336,15 +324,13 @@ def read_problem(
         arm = replace(arm, robot=replace(arm.robot, model=KinematicModel(terms)))
     base = None
     if table.base != "auto":
-        base = _frame(table.base, "base", path, FrameTable).numbers if table.base else tuple(arm.base)
+        base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
     if not table.tool:
-        places = {"": ToolTable.model_construct(**dict(zip(FRAME, arm.tool, strict=True)), guessed=True)}
-    elif any(split_unit(key)[0] in ToolTable.model_fields for key in table.tool):  # one without a name is the only one
-        places = {"": _frame(table.tool, "tool", path, ToolTable)}
+        tools = {"": tuple(arm.tool)}
+    elif any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
+        tools = {"": _frame(table.tool, "tool", path)}
     else:
-        places = {marker: _frame(place, f"tool.{marker}", path, ToolTable) for marker, place in table.tool.items()}
-    tools = {marker: place.numbers for marker, place in places.items()}
-    unstated = tuple(marker for marker, place in places.items() if place.guessed)
+        tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
     board = None
     if isinstance(table.target, str):
         board = read_board(inside(path.parent, table.target, "key target", path))
@@ -354,7 +340,7 @@ def read_problem(
             board = grid_board(pattern.columns, pattern.rows, pattern.spacing)
         except InputError as error:
             raise InputError("key target", error.found, error.accepted, path) from None
-    return ProblemFile(path, table, placed, arm.robot, kinds, tuple(observations), tools, unstated, base, chains, board)
+    return ProblemFile(path, table, placed, arm.robot, kinds, tuple(observations), tools, base, chains, board)
 
 
 def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
@@ -398,7 +384,8 @@ def stated_repeatability(table: ProblemTable, path: Path) -> Repeatability | Non
     return Repeatability(numbers.position, numbers.orientation, numbers.joint)
 
 
-def _frame(table: Any, where: str, path: Path, kind: type[F]) -> F:
+def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
+    """Return the six numbers [m, rad] of a frame's table."""
     if not isinstance(table, dict):
         raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
-    return part(kind, table, f"key {where}", path)
+    return part(FrameTable, table, f"key {where}", path).numbers

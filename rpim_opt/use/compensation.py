@@ -27,8 +27,6 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR
-from rpim_opt.problem.registration.frames import MISPLACED
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -41,9 +39,10 @@ from rpim_opt.use.reading import Targets, read_targets
 SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
 REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
-KNOWN_TOOL = 0.01  # largest scale [m, rad] of a reflector that is known: deviations of a wider one count as its own
-EXPANDED = 2.0  # standard uncertainties up to which an error left by the model does not show
+EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
+BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
+NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations that nobody measured, so that a reading has a covariance
 BANK = 2000
 TRIALS = 12
 """Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
@@ -59,14 +58,16 @@ class Compensation:
     ``orientation_error`` [rad] likewise, NaN where orientations do not count. ``std`` (N,) [m] is the standard
     uncertainty of the position in the instrument's frame, sqrt(tr J C J' + tr R), with the covariance C of all
     identified parameters, those of the base included, their Jacobian J and the repeatability R; infinite without C.
+    ``orientation_std`` (N,) [rad] is that of the orientation, with R where orientations were measured.
 
     ``status`` of a row is ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
     prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
-    ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where any of the
-    latter leaves more than that. A row that would be ``"ok"`` is ``"extrapolated"`` beyond the measured joint ranges,
-    where no measurement checked the model; ``outside`` are all rows there. ``note`` says why a robot is not delivered
-    that is used all the same, ``point`` which point is moved, with its place in the flange frame. ``limit`` [m] is the
-    largest error that is accepted; infinite where none is stated.
+    ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where the position
+    error and its expanded uncertainty (k = 2) together exceed ``limit`` [m], infinite where none is stated. A row that
+    would be ``"ok"`` is ``"extrapolated"`` beyond the measured joint ranges, where no measurement checked the model;
+    ``outside`` are all rows there. ``note`` says why a robot is not delivered that is used all the same, ``point``
+    which point is moved, with its place in the flange frame. ``beside`` (N,) [m] is how far a stated position is from
+    that of the nominal robot at the joint values stated beside it, NaN where there are none.
     """
 
     robot: Robot
@@ -78,6 +79,8 @@ class Compensation:
     position_error: Array
     orientation_error: Array
     std: Array
+    orientation_std: Array
+    beside: Array
     status: tuple[str, ...]
     outside: Outside = field(default_factory=Outside)
     note: str = ""
@@ -93,6 +96,7 @@ class Compensation:
             "position in the instrument's frame [mm], standard uncertainty": self.std,
             "orientation [mrad], nominal command": self.orientation_before,
             "orientation [mrad], corrected, by the model": self.orientation_error,
+            "orientation in the instrument's frame [mrad], standard uncertainty": self.orientation_std,
         }.items():
             if np.isfinite(values).all():
                 shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
@@ -105,16 +109,28 @@ class Compensation:
         for status in ("limited", "near singular", UNREACHABLE, ABOVE):
             at = [i for i, each in enumerate(self.status) if each == status]
             if at:
-                named = listed([f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm left)" for i in at])
+                left = [f"{1e3 * self.position_error[i]:.3f} mm left" for i in at]
+                if status == ABOVE:
+                    left = [
+                        f"{text}, U {1e3 * EXPANDED * self.std[i]:.3f} mm" for i, text in zip(at, left, strict=True)
+                    ]
+                named = listed([f"{self.label[i]} ({text})" for i, text in zip(at, left, strict=True)])
                 where = " in the robot's base frame" if status == UNREACHABLE else ""
                 lines.append(f"{status.capitalize()}{where}: {named}.")
         if self.missed:
             lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target; do not execute these rows.")
+        far = [i for i in np.argsort(-np.nan_to_num(self.beside)) if self.beside[i] > BESIDE]
+        if far:
+            lines.append(
+                f"Positions of {len(far)} rows are far from the joint values beside them, at most "
+                f"{1e3 * self.beside[far[0]]:.0f} mm (row {self.label[far[0]]}); the commands reach the positions. Are "
+                "they of another tool (--tool), or in another frame than the robot's base?"
+            )
         return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])
 
     @property
     def missed(self) -> list[str]:
-        """The labels of rows that miss their target: unreachable, or the position error is above the limit.
+        """The labels of rows that miss their target: unreachable, or error and uncertainty are above the limit.
 
         Without a limit an error counts that exceeds twice its standard uncertainty.
         """
@@ -132,7 +148,7 @@ class Compensation:
         joints = joint_columns(self.robot.joint_dimensions)
         commands = {name: self.q[:, i] / si for i, (name, si) in enumerate(joints.items())}
         left = {"position_error_mm": self.position_error, "orientation_error_mrad": self.orientation_error}
-        left["std_mm"] = self.std
+        left |= {"std_mm": self.std, "orientation_std_mrad": self.orientation_std}
         figures = commands | {name: 1e3 * values for name, values in left.items()}
         return {"label": self.label, **{k: v.tolist() for k, v in figures.items()}, "status": self.status}
 
@@ -200,19 +216,18 @@ def compensate(
     without ``q`` every pose is looked for from several configurations within the limits that come near. ``orientation``
     says whether orientations count, ``label`` names the rows, ``robot`` is which of several.
 
-    **Tool.** ``tool`` (6,) is in the flange frame, x, y, z [m], roll, pitch, yaw [rad]: the controller's TCP, which the
-    robot has exactly there. By default it is the reflector of the calibration (``marker`` of several): the controller's
-    robot has it where it is stated, the real one as identified. Where no place is stated, or the data contradict it,
-    both have it as identified. The flange frame is that of the DH table, after the last joint.
+    **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
+    frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
+    (``marker`` of several) as identified. The flange frame is that of the DH table, after the last joint.
 
     **Loads.** Joints are in the middle of their backlash. ``torque`` (N, dof) [Nm] is required, and zero if need be,
     where compliances were identified from measured ones; ``payload`` [kg], one or (N,), and ``payload_centre`` (3,) in
     the flange frame [m] where they were identified without, by default as the problem states them.
 
-    ``largest`` is the largest correction of a joint [rad or m], ``limit`` the position error left by the model above
-    which a command counts as one that misses its target [m]. A calibration that is not delivered raises NotDelivered
-    unless ``despite_verdict``; InputError for shapes that do not fit, numbers that are not finite, a reflector that is
-    not known.
+    ``largest`` is the largest correction of a joint [rad or m], ``limit`` [m] what the position error left by the model
+    and its expanded uncertainty (k = 2) may be together; a command above it counts as one that misses its target. A
+    calibration that is not delivered raises NotDelivered unless ``despite_verdict``; InputError for shapes that do not
+    fit, numbers that are not finite, a reflector that is not known.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
@@ -221,7 +236,7 @@ def compensate(
     >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
     2.64 mm, 0.0000 mm left
     >>> print(found.csv().splitlines()[0])
-    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,status
+    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status
     """
     note = result.verdict.require(despite_verdict)
     arm = pick(result.problem.arms, robot, "robot")
@@ -253,7 +268,8 @@ def compensate(
 
     parts = on_all_cores(compensated, range(0, N, BLOCK))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    above = (whole["position_error"] > limit) & (whole["status"] != UNREACHABLE)
+    expanded = np.where(np.isfinite(whole["std"]), EXPANDED * whole["std"], 0.0)
+    above = (whole["position_error"] + expanded > limit) & (whole["status"] != UNREACHABLE)
     commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
     outside = result.outside(commands)
     status = np.where(above, ABOVE, whole["status"])
@@ -331,7 +347,7 @@ class _Tooled(NamedTuple):
 
     @classmethod
     def of(cls, result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str) -> _Tooled:
-        """Take a stated tool in the place of the first reflector, or a reflector: as identified if no TCP is stated."""
+        """Take a stated tool in the place of the first reflector, or a reflector as identified."""
         whole = result.problem.parameters
         places = whole.places_of(robot)
         p = whole.of_robot(robot)
@@ -362,17 +378,10 @@ class _Tooled(NamedTuple):
                 C = C[np.ix_(still, still)]
             point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
             return cls(replace(p, nominal=nominal, identified=identified), x, C, marker, point, True)
-        where = f"stated at {placed(nominal[at])} in the flange frame"
-        contradicted = np.abs(x[at]) > MISPLACED * (np.minimum(p.scale[at], KNOWN_TOOL) + NOMINAL_ERROR)
-        unstated = marker in p.unstated_tools and p.identified[at].any()
-        if unstated or contradicted.any():
-            reason = (
-                "no place is stated" if unstated else f"the data contradict the stated place ({placed(nominal[at])})"
-            )
-            nominal[at] = p.values(x)[at]
-            x[at] = 0.0
-            where = f"as identified at {placed(nominal[at])} in the flange frame, since {reason}"
-        point = f"Target point: the reflector, {where}; a controller with another TCP needs --tool."
+        nominal[at] = p.values(x)[at]
+        x[at] = 0.0
+        where = f"{'as identified, ' if p.identified[at].any() else ''}at {placed(nominal[at])} in the flange frame"
+        point = f"Target point: the reflector, {where}; for the controller's TCP state --tool."
         return cls(replace(p, nominal=nominal), x, C, marker, point)
 
 
@@ -380,7 +389,7 @@ class _Cell(NamedTuple):
     """The controller's robot, the identified one, and the uncertainty of where that is.
 
     ``problem`` has the robot's data, ``x`` are the deviations (n,) of its identified parameters and ``covariance``
-    theirs; ``noise`` is the covariance (3, 3) [m^2] of a reading, and ``level`` the noise's variance over it.
+    theirs; ``noise`` is the covariance (k, k) [SI] of a reading, and ``level`` the noise's variance over it.
     """
 
     robot: Robot
@@ -422,13 +431,15 @@ class _Cell(NamedTuple):
         if repeatability is not None and tooled.stated:
             repeatability = replace(repeatability, at=values)
         problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability)
+        noise = np.eye(len(kind.components)) * NO_NOISE
+        noise[:3, :3] += position_noise(measured)
         require_same_torques(robot, p, measured_torques(problem.data), torques)
         loads = loads_on(robot, p, problem.data, torques)
         prefix = tool_prefix(tooled.marker)
         return cls(
             robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, tooled.x[p.identified],
-            tooled.covariance, tooled.marker, position_noise(measured), result.variance_factor,
+            tooled.covariance, tooled.marker, noise, result.variance_factor,
         )  # fmt: skip
 
     def compensated(self, targets: Targets, largest: float) -> dict[str, Array]:
@@ -445,10 +456,12 @@ class _Cell(NamedTuple):
         if poses is not None:
             commands, target = self._commands(poses, q, load), poses
             missed = self.nominal.at(commands, load, poses)[1]
+            beside = np.full(N, np.nan) if q is None else self._norms(self.nominal.at(q, load, poses)[1])[0]
         else:
             commands = np.asarray(q)
             target, error, _ = self.nominal.at(commands, load, np.zeros((N, len(self.kind.columns))))
             missed = np.zeros_like(error)
+            beside = np.full(N, np.nan)
         _, before, J = self.identified.at(commands, load, target)
         W = attainable(J)
         unit = joint_units(self.robot, J.shape[1])
@@ -463,6 +476,7 @@ class _Cell(NamedTuple):
         cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
         position_before, orientation_before = self._norms(before)
         position_error, orientation_error = self._norms(left)
+        std, orientation_std = self._std(corrected, torque, payload)
         return {
             "nominal": commands,
             "q": corrected,
@@ -470,22 +484,26 @@ class _Cell(NamedTuple):
             "orientation_before": orientation_before,
             "position_error": position_error,
             "orientation_error": orientation_error,
-            "std": self._std(corrected, torque, payload),
+            "std": std,
+            "orientation_std": orientation_std,
+            "beside": beside,
             "status": np.select(list(cases.values()), list(cases), "near singular"),
         }
 
-    def _std(self, q: Array, torque: Array | None, payload: Array | None) -> Array:
-        """Return sqrt(tr (J C J' + R)) (N,) [m] of the positions reached at commands; R is the repeatability's."""
+    def _std(self, q: Array, torque: Array | None, payload: Array | None) -> tuple[Array, Array]:
+        """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached; R is the repeatability's."""
+        k = len(self.kind.components)
+        problem = self.problem.measuring(q, self.kind, self.marker, torque, payload, covariance=self.noise)
         if self.covariance is None:
-            return np.full(len(q), np.inf)
-        problem = self.problem.measuring(q, position, self.marker, torque, payload, covariance=self.noise)
-        J = problem.jacobian(self.x)
-        known = np.isfinite(np.diag(self.covariance))
-        C = np.where(np.outer(known, known), self.covariance, 0.0)
-        variance = np.sum((J @ C) * J, axis=1).reshape(len(q), 3).sum(axis=1)
-        variance += np.trace(noise_covariances(problem, self.level).robot[0], axis1=1, axis2=2)
-        unknown = (np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), 3).any(axis=1)
-        return np.where(unknown, np.inf, np.sqrt(np.maximum(variance, 0.0)))
+            variance = np.full((len(q), k), np.inf)
+        else:
+            J = problem.jacobian(self.x)
+            known = np.isfinite(np.diag(self.covariance))
+            C = np.where(np.outer(known, known), self.covariance, 0.0)
+            variance = np.sum((J @ C) * J, axis=1).reshape(len(q), k)
+            variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
+            variance[(np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), k)] = np.inf
+        return self._norms(np.sqrt(np.maximum(variance, 0.0)))
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""

@@ -186,7 +186,6 @@ def problem_from(
     """
     if isinstance(robot, str | Path):
         robot = read_arm(Path(robot) if Path(robot).is_file() else find_robot(str(robot)))
-    unstated = tool is None
     if isinstance(robot, Described):
         tool = robot.tool if tool is None else tool
         robot = robot.robot
@@ -199,7 +198,6 @@ def problem_from(
     if placed is None and not any(block.measurement.registers for block in data.blocks):
         placed = np.zeros(6)  # lengths do not depend on it
     parameters = starting_parameters(robot, data, placed, {"": start})
-    parameters = replace(parameters, unstated_tools=("",) if unstated else ())
     problem = CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
     found = relocated(problem)
     return found if isinstance(found, CalibrationProblem) else problem
@@ -332,14 +330,12 @@ def relocated(problem: Source) -> Source | None:
     """Return the problem with base and reflectors registered to the data, if the stated ones contradict them."""
     p = problem.parameters
     nominal = p.nominal.copy()
-    unstated = list(p.unstated_tools)
     if len(problem.arms) > 1:  # each by itself; of a frame that they share the first one's word counts
         for name in problem.arms:
             alone = relocated(problem.sample().alone(name))
             if alone is not None:
                 k = p.places_of(name)
                 nominal[k] = np.where(nominal[k] == p.nominal[k], alone.parameters.nominal, nominal[k])
-                unstated += alone.parameters.unstated_tools
         for name, place in met(problem.sample()).items():
             own = p.of_robot(name)
             base = _frame_of(own, "base_")
@@ -355,14 +351,13 @@ def relocated(problem: Source) -> Source | None:
             there, located, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
         except InputError:
             return None
-        for marker, k, place in [(None, base, there), *((m, k, located[m]) for m, k in at.items())]:
+        for k, place in [(base, there), *((k, located[marker]) for marker, k in at.items())]:
             if _misplaced(p, k, place):
                 free = p.identified[k]
                 nominal[k[free]] = place[free]
-                unstated += [] if marker is None else [marker]
     if (nominal == p.nominal).all():
         return None
-    return problem.with_parameters(replace(p, nominal=nominal, unstated_tools=tuple(dict.fromkeys(unstated))))
+    return problem.with_parameters(replace(p, nominal=nominal))
 
 
 def _frame_of(p: Parameters, prefix: str) -> np.ndarray:
