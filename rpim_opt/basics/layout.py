@@ -9,11 +9,11 @@ from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, in_file
 from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
@@ -126,44 +126,23 @@ class TableOptions:
         return {name: text for name, text in texts.items() if text}
 
 
-class Head(NamedTuple):
-    """Head of a column: its name, the group above it, and its unit."""
-
-    name: str
-    group: str = ""
-    unit: str = ""
-
-    def __str__(self) -> str:
-        """Return it as one name."""
-        unit = f" [{self.unit}]" if self.unit else ""
-        return f"{self.group} {self.name}".strip() + unit
-
-
-class Column(NamedTuple):
-    """A column: its unique name, its head, and its cells."""
-
-    name: str
-    head: Head
-    cells: Sequence[Any]
-
-
 @dataclass(frozen=True)
 class RawTable:
     """A table as in its file, with numbers in Python's notation.
 
-    ``columns`` are cells by what stands above them (a name that is there again has its place behind it, ``X #7``),
-    ``heads`` the same taken apart; ``notes`` say how it was read, and what was left out, a sentence each; ``units`` are
-    those that stand above the header, as `parse_units` has them.
+    ``columns`` are cells by what stands above them, ``Position X [mm]`` (a name that is there again has its place
+    behind it, ``X #7``), ``groups`` what of it groups columns; ``notes`` say how it was read, and what was left out, a
+    sentence each; ``units`` are those that stand above the header, as `parse_units` has them.
     """
 
     columns: Columns
-    heads: Mapping[str, Head] = field(default_factory=dict)
+    groups: Mapping[str, str] = field(default_factory=dict)
     notes: tuple[str, ...] = ()
     units: Mapping[str, str] = field(default_factory=dict)
 
     def with_constants(self, constants: Sequence[str]) -> RawTable:
         """Return the table with columns of one value each, ``torso_lift [m]=0.15``."""
-        columns, heads = dict(self.columns), dict(self.heads)
+        columns = dict(self.columns)
         for text in constants:
             name, mark, value = (part.strip() for part in text.rpartition("="))
             if not mark or math.isnan(numeral(value)):
@@ -171,8 +150,7 @@ class RawTable:
             if name in columns:
                 raise InputError("constants", f"'{name}', which the table has", "a column that it lacks")
             columns[name] = [value] * len(next(iter(columns.values()), ()))
-            heads[name] = Head(name)
-        return replace(self, columns=columns, heads=heads)
+        return replace(self, columns=columns)
 
 
 def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
@@ -190,23 +168,15 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     (['Joints J1 [deg]', 'Joints J2 [deg]', 'Position X [mm]', 'Position Y [mm]'], ['1.5'])
     """
     options = options or TableOptions()
-    notes: list[str] = []
-    units: dict[str, str] = {}
-    try:
+    with in_file(path):
         if columns is None and path.suffix.lower() == ".parquet":
             columns = read_columns(path)
         elif columns is None and path.suffix.lower() in (".mat", ".npz"):
             columns = array_columns(path)
-        if columns is not None:
-            read = [Column(name, Head(name), cells) for name, cells in columns.items()]
-        else:
-            read, notes, units = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
-        read = [each for column in read for each in _one_number_each(column)]
-        read, note = _one_row_each(read)
-    except InputError as error:
-        raise error.within(path) from None
-    by_name = {column.name: column.cells for column in read}
-    return RawTable(by_name, {column.name: column.head for column in read}, (*notes, *note), units)
+        if columns is None:
+            grid = read_grid(path, options.sheet, options.encoding, options.separator)
+            return _one_row_each(_one_number_each(_of_grid(grid, options)))
+        return _one_row_each(_one_number_each(RawTable(columns)))
 
 
 def is_missing(cell: str) -> bool:
@@ -214,8 +184,8 @@ def is_missing(cell: str) -> bool:
     return MISSING.fullmatch(cell.strip()) is not None
 
 
-def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str], dict[str, str]]:
-    """Return the columns of the table in a file, notes on how it was read, and the units stated above its header."""
+def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
+    """Return the table in a file: the rows with most numbers, below the texts directly above them."""
     counts = [_count(row) for row in grid.rows]
     most = max(counts, default=0)
     if not grid.rows:
@@ -226,41 +196,35 @@ def _of_grid(grid: Grid, options: TableOptions) -> tuple[list[Column], list[str]
     numeric = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, numeric, options)
     full = [i for i in numeric if _letters(next(filter(None, grid.rows[i]))) not in SUMMARIES]
-    columns, mark = _columns([grid.rows[i] for i in full], heads, options)
+    columns, groups, mark = _columns([grid.rows[i] for i in full], heads, options)
     full = full[: len(full) - _summaries(columns)]
-    columns = [each._replace(cells=each.cells[: len(full)]) for each in columns]
     left = sorted(set(range(numeric[0], len(grid.rows))) - set(full))
     notes = [*grid.notes, *_notes(grid, above, left, options)]
     if mark == ",":
-        notes.append(
-            f"decimal commas: {'as requested' if options.decimal else 'no comma can be a thousands separator'}."
-        )
+        why = "as requested" if options.decimal else "no comma can be a thousands separator"
+        notes.append(f"decimal commas: {why}.")
     units: dict[str, str] = {}
     lines = [" ".join(filter(None, row)) for row in grid.rows[: above[0] if above else 0]]
     for stated in filter(None, map(UNITS_LINE.fullmatch, lines)):
         with suppress(InputError):  # a sentence that happens to begin so
             units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
             notes.append(f"units above the header: {stated[1]}.")
-    return columns, notes, units
+    return RawTable({name: cells[: len(full)] for name, cells in columns.items()}, groups, tuple(notes), units)
 
 
-def _summaries(columns: Sequence[Column]) -> int:
+def _summaries(columns: Columns) -> int:
     """Return how many rows at the end are means, extremes or spreads of all rows above, whatever they are called.
 
     One of them has to be a mean or a spread: the end of a path may be where its joints are largest, more than once.
     """
-    table = np.array([[numeral(cell) for cell in each.cells] for each in columns if _is_numeric(each.cells)]).T
+    table = np.array([[numeral(cell) for cell in cells] for cells in columns.values() if _is_numeric(cells)]).T
     for count in range(min(MOST_SUMMARIES, len(table) - FEWEST_ROWS), 0, -1):
         above, below = table[:-count], table[-count:]
-        mean, spread = above.mean(axis=0), above.std(axis=0)
-
-        def shows(row: np.ndarray, figures: np.ndarray, spread: np.ndarray = spread) -> bool:
-            there = np.isfinite(row)
-            return bool(there.sum() > 2 and (np.abs(row - figures) <= SAME * spread)[there].all())
-
-        known = (mean, spread, above.min(axis=0), above.max(axis=0))
-        central = any(shows(row, each) for row in below for each in known[:2])
-        if central and any(shows(below[0], each) for each in known):
+        figures = np.array([above.mean(axis=0), above.std(axis=0), above.min(axis=0), above.max(axis=0)])
+        there = np.isfinite(below)[:, None]
+        same = np.abs(below[:, None] - figures) <= SAME * above.std(axis=0)  # (row, figure, column)
+        shows = (same | ~there).all(axis=2) & (there.sum(axis=2) > 2)
+        if shows[:, :2].any() and shows[0].any():
             return count
     return 0
 
@@ -313,12 +277,12 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
     return full
 
 
-def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list[Head], list[int]]:
-    """Return the head of every column, and the numbers of the header's rows."""
+def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list[tuple[str, str]], list[int]]:
+    """Return every column's name with its unit, and what groups it; and the numbers of the header's rows."""
     width = Counter(len(grid.rows[i]) for i in full).most_common(1)[0][0]
     above = _header_rows(grid, full[0], width)
     if options.columns:
-        return [Head(name) for name in options.columns], above
+        return [(name, "") for name in options.columns], above
     if not above:
         found = f"no header above '{', '.join(grid.rows[full[0]][:4])}, ...'"
         accepted = f"a header, or --columns with {width} names, such as label,q1_deg,...,x_mm,y_mm,z_mm"
@@ -332,26 +296,24 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         lacking = [""] * (width - len(signs))
         units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
         lines = lines[:-1]
-    names, groups = _grouped([[*line, *[""] * (width - len(line))] for line in lines])
-    return [Head(*parts) for parts in zip(names, groups, units, strict=True)], above
-
-
-def _grouped(lines: Sequence[Sequence[str]]) -> tuple[list[str], list[str]]:
-    """Return the names of columns and what groups them, from lines of a header whose cells may be merged."""
-    *grouping, last = lines
-    names = list(last)
-    groups = [""] * len(names)
-    downwards = set()  # merged downwards: the name stands higher up
-    for i, name in enumerate(last):
-        if not name and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping):
-            downwards.add(i)
-            names[i] = next(row[i] for row in reversed(grouping) if row[i])
+    *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
+    groups = [""] * width
+    downwards = [  # merged downwards: the name stands higher up
+        not name and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping) for i, name in enumerate(names)
+    ]
     for row in grouping:
         group = ""  # merged with what is right of it
         for i, cell in enumerate(row):
-            group = "" if i in downwards else cell or group
+            if downwards[i]:
+                names[i] = cell or names[i]
+            group = "" if downwards[i] else cell or group
             groups[i] = f"{groups[i]} {group}".strip()
-    return names, groups
+    return [(_with_unit(name, unit), group) for name, unit, group in zip(names, units, groups, strict=True)], above
+
+
+def _with_unit(name: str, unit: str) -> str:
+    """Return a name with the unit that stands elsewhere in place of its own."""
+    return f"{split(name)[0]} [{unit}]" if unit else name
 
 
 def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
@@ -388,8 +350,10 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
 # --- columns and their numbers -------------------------------------------------------------------------------------
 
 
-def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOptions) -> tuple[list[Column], str]:
-    """Return the columns, those of numbers with decimal points, and the decimal mark that they had."""
+def _columns(
+    rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], options: TableOptions
+) -> tuple[dict[str, list[str]], dict[str, str], str]:
+    """Return the columns, those of numbers with decimal points, their groups, and the decimal mark that they had."""
     width = len(heads)
     for number, row in enumerate(rows, start=1):  # blank cells at the end may be missing or too many
         while len(row) > width and not row[-1]:
@@ -400,26 +364,28 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[Head], options: TableOpt
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))
-    columns: dict[str, Column] = {}
-    for j, head in enumerate(heads):
+    columns: dict[str, list[str]] = {}
+    groups: dict[str, str] = {}
+    for j, (name, group) in enumerate(heads):
         cells = [row[j] for row in rows]
-        if str(head) == "-" or (not head.name and not any(cells)):
+        full = f"{group} {name}".strip()
+        if full == "-" or (not name and not any(cells)):
             continue
-        name = str(head) if head.name else f"column {j + 1}"
-        if name in columns:
-            name = f"{name} #{j + 1}"
         unit = "" if _is_numeric(cells) else _unit_of(cells)
         if unit:
             cells = [cell.removesuffix(unit).strip() for cell in cells]
-            head = head._replace(unit=unit)
-        columns[name] = Column(name, head, cells)
-    numeric = {name: column.cells for name, column in columns.items() if _is_numeric(column.cells)}
+        full = _with_unit(full, unit) if name else f"column {j + 1}"
+        if full in columns:
+            full = f"{full} #{j + 1}"
+        columns[full] = cells
+        if name:
+            groups[full] = group
+    numeric = {name: cells for name, cells in columns.items() if _is_numeric(cells)}
     mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), options.decimal)
     grouping = "," if mark == "." else "."
     for name, cells in numeric.items():
-        cells = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
-        columns[name] = columns[name]._replace(cells=cells)
-    return list(columns.values()), mark
+        columns[name] = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
+    return columns, groups, mark
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
@@ -436,22 +402,22 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
     stated = {"comma": ",", "point": "."}.get(stated, stated)
     if stated not in ("", ",", "."):
         raise InputError("--decimal", f"'{stated}'", "comma or point")
-    marks = [(_mark(cell), cell) for cell in cells]
-    if stated:
-        for mark, cell in marks:
-            if mark not in ("", "?", stated) and not GROUPED.fullmatch(cell):
-                raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the mark that the numbers have")
-        return stated
-    shown = {mark: cell for mark, cell in reversed(marks) if mark}
+    shown: dict[str, str] = {}  # the first cell with every mark
+    for cell in cells:
+        if not stated or not GROUPED.fullmatch(cell):
+            shown.setdefault(_mark(cell), cell)
+    shown.pop("", None)
     doubtful = shown.pop("?", "")
+    if stated:
+        shown.pop(stated, None)
+        for cell in shown.values():
+            raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the mark that the numbers have")
+        return stated
     if len(shown) > 1:
         raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark, or --decimal with it")
     if not shown and doubtful:
-        raise InputError(
-            "the numbers",
-            f"'{doubtful}', whose mark may separate thousands or decimals",
-            "--decimal comma, or --decimal point",
-        )
+        found = f"'{doubtful}', whose mark may separate thousands or decimals"
+        raise InputError("the numbers", found, "--decimal comma, or --decimal point")
     return next(iter(shown), ".")
 
 
@@ -480,19 +446,25 @@ def _unit_of(cells: Sequence[str]) -> str:
 # --- cells that list numbers, rows that hold one coordinate ----------------------------------------------------------
 
 
-def _one_number_each(column: Column) -> list[Column]:
-    """Split a column whose cells list numbers into one column a number; return any other unchanged."""
-    lists = [list_of_numbers(cell) for cell in column.cells if isinstance(cell, str) and not is_missing(cell)]
-    counts = set(map(len, lists))
-    if len(counts) != 1 or counts == {0}:
-        return [column]
-    stem, unit = split(column.name)
-    single = []
-    for i, part in enumerate(_parts(stem, counts.pop())):
-        head = Head(part, stem if part in "xyz" else "", unit if part in "xyz" or part[:5] == "joint" else "")
-        cells = [(list_of_numbers(str(cell)) or [""] * (i + 1))[i] for cell in column.cells]
-        single.append(Column(str(head), head, cells))
-    return single
+def _one_number_each(table: RawTable) -> RawTable:
+    """Return a table with one column a number in place of every column whose cells list numbers."""
+    columns: dict[str, Sequence[Any]] = {}
+    groups = dict(table.groups)
+    for name, cells in table.columns.items():
+        lists = [list_of_numbers(cell) for cell in cells if isinstance(cell, str) and not is_missing(cell)]
+        counts = set(map(len, lists))
+        if len(counts) != 1 or counts == {0}:
+            columns[name] = cells
+            continue
+        stem, unit = split(name)
+        rows = [list_of_numbers(str(cell)) for cell in cells]
+        for i, part in enumerate(_parts(stem, counts.pop())):
+            new = _with_unit(part, unit) if part.startswith("joint") else part
+            if part in "xyz":
+                new = f"{stem} {_with_unit(part, unit)}"
+                groups[new] = stem
+            columns[new] = [numbers[i] if numbers else "" for numbers in rows]
+    return replace(table, columns=columns, groups=groups)
 
 
 def _parts(stem: str, count: int) -> Sequence[str]:
@@ -508,49 +480,48 @@ def _parts(stem: str, count: int) -> Sequence[str]:
     return [f"joint {i}" for i in range(1, count + 1)]
 
 
-def _one_row_each(columns: list[Column]) -> tuple[list[Column], list[str]]:
-    """Return the columns of a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point."""
-    axis = next((each for each in columns if {str(cell).lower() for cell in each.cells} == set("xyz")), None)
+def _one_row_each(table: RawTable) -> RawTable:
+    """Return a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point; others as is."""
+    texts = {name: {str(cell).lower() for cell in cells} for name, cells in table.columns.items()}
+    axis = next((name for name, different in texts.items() if different == set("xyz")), None)
     if axis is None:
-        return columns, []
-    letters = [str(cell).lower() for cell in axis.cells]
-    others = [_without_letters(each, letters) for each in columns if each is not axis]
-    points = _points(letters, others)
+        return table
+    others = {name: [str(cell) for cell in cells] for name, cells in table.columns.items()}
+    letters = [cell.lower() for cell in others.pop(axis)]
+    for name, cells in others.items():  # cells that all name their row's coordinate, P1.X
+        named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell.strip(), re.IGNORECASE)
+                 for cell, letter in zip(cells, letters, strict=True)]  # fmt: skip
+        without = [match[1] for match in named if match]
+        if len(without) == len(letters):
+            others[name] = without
+    points = _points(letters, others.values())
     if not points:
         accepted = "a column that names its point, all three once"
-        raise InputError("the header", f"a row a coordinate ('{axis.name}')", accepted)
-    whole = []
+        raise InputError("the header", f"a row a coordinate ('{axis}')", accepted)
+    columns: dict[str, Sequence[Any]] = {}
     values = []
-    for each in others:
-        cells = [{each.cells[i] for i in rows.values()} for rows in points]
-        if all(len(own) == 1 for own in cells):
-            whole.append(each._replace(cells=[own.pop() for own in cells]))
-        elif _is_numeric(list(map(str, each.cells))):
-            values.append(each)
-    measured = [each for each in values if VALUE.search(each.name)] or values
+    for name, cells in others.items():
+        own = [{cells[i] for i in rows.values()} for rows in points]
+        if all(len(each) == 1 for each in own):
+            columns[name] = [each.pop() for each in own]
+        elif _is_numeric(cells):
+            values.append(name)
+    measured = [name for name in values if VALUE.search(name)] or values
     if len(measured) != 1:
-        found = f"a row a coordinate, with values {', '.join(each.name for each in measured) or 'nowhere'}"
+        found = f"a row a coordinate, with values {', '.join(measured) or 'nowhere'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    value = measured[0]
+    (value,) = measured
     for letter in "xyz":
-        head = Head(letter, "", value.head.unit or split(value.name)[1])
-        cells = [str(value.cells[rows[letter]]) if letter in rows else "" for rows in points]
-        whole.append(Column(str(head), head, cells))
-    return whole, [f"a row a coordinate: column '{value.name}' by '{axis.name}'."]
+        cells = [others[value][rows[letter]] if letter in rows else "" for rows in points]
+        columns[_with_unit(letter, split(value)[1])] = cells
+    note = f"a row a coordinate: column '{value}' by '{axis}'."
+    return replace(table, columns=columns, notes=(*table.notes, note))
 
 
-def _without_letters(column: Column, letters: Sequence[str]) -> Column:
-    """Return a column whose cells all name their row's coordinate, ``P1.X``, without it; others unchanged."""
-    cells = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", str(cell).strip(), re.IGNORECASE)
-             for cell, letter in zip(column.cells, letters, strict=True)]  # fmt: skip
-    numbers = [match[1] for match in cells if match]
-    return column._replace(cells=numbers) if len(numbers) == len(letters) else column
-
-
-def _points(letters: Sequence[str], keys: Sequence[Column]) -> list[dict[str, int]]:
+def _points(letters: Sequence[str], keys: Iterable[Sequence[str]]) -> list[dict[str, int]]:
     """Return the row of every point's coordinates; points are named by the first column with three rows a name."""
     for key in keys:
-        rows = list(zip((str(cell).strip() for cell in key.cells), letters, strict=True))
+        rows = list(zip((cell.strip() for cell in key), letters, strict=True))
         points: dict[str, dict[str, int]] = {}
         for i, (name, letter) in enumerate(rows):
             points.setdefault(name, {})[letter] = i

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import product
 from pathlib import Path
@@ -37,32 +38,19 @@ SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
 
-class Whole(NamedTuple):
-    """One table: cells by our names, the same rows' by the files' names, how it was put together in sentences.
+class Key(NamedTuple):
+    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
 
-    ``keys`` are the files' names of the columns by which rows were joined, in lower case.
-    """
-
-    columns: Columns
-    raw: Columns
-    notes: tuple[str, ...]
-    keys: Sequence[str] = ()
-
-
-class Pairing(NamedTuple):
-    """Rows of two tables that belong together, their names, the columns that tell it, and sentences on it."""
-
-    left: list[int]
-    right: list[int]
-    names: list[str]
+    how: str
     columns: Sequence[str]
-    notes: list[str]
+    left: list[str]
+    right: list[str]
 
 
 def together(
     tables: Sequence[Understood], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
-) -> Whole:
-    """Return several tables as one; ``key`` and ``within`` are those of `TableOptions`.
+) -> Understood:
+    """Return several tables as one, with notes on how; ``key`` and ``within`` are those of `TableOptions`.
 
     Tables that have joint and measured values each are stacked. Where some have the one and some the other, rows of
     equal keys (the label by default, else the only name that both have), or of the nearest times, are one row.
@@ -76,56 +64,15 @@ def together(
         lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
         found = f"{lost or 'some tables'} with only part of joint and measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
-    joints, values = Side(moving, _stacked(moving)), Side(seen, _stacked(seen))
-    pairing = _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
-    sides = ((joints.whole, pairing.left), (values.whole, pairing.right))
-    whole = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.columns.items()}
-    raw = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.raw.items()}
-    whole.pop("label", None)
-    if len(set(pairing.names)) == len(pairing.names):
-        whole = {"label": pairing.names, **whole}
-    else:  # several measured values of a configuration
-        whole.setdefault("configuration", pairing.names)
-    return Whole(whole, raw, (*joints.whole.notes, *values.whole.notes, *pairing.notes), pairing.columns)
+    joints, values = _stacked(moving), _stacked(seen)
+    return _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
 
 
-class Side(NamedTuple):
-    """The tables of joint values, or those of measured ones, and all their rows below each other."""
-
-    tables: Sequence[Understood]
-    whole: Whole
-
-    @property
-    def file(self) -> str:
-        """The name of the first file."""
-        return self.tables[0].file
-
-    @property
-    def raw(self) -> Mapping[str, list[Any]]:
-        """The columns that all files have, by names in lower case."""
-        return _raw(self.tables)
-
-    @property
-    def labels(self) -> list[str]:
-        """Labels of the rows, or their numbers."""
-        return _labels(self.whole.columns)
-
-    def naming(self) -> dict[str, list[str]]:
-        """Return the keys of columns, labels or left out, that name every row differently."""
-        raw = self.raw
-        free = [each.column for each in self.tables[0].meant if each.name in ("", "label", "configuration")]
-        cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
-        return {name: keys for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)}
-
-
-# --- below each other ----------------------------------------------------------------------------------------------
-
-
-def _stacked(tables: Sequence[Understood]) -> Whole:
+def _stacked(tables: Sequence[Understood]) -> Understood:
     """Return the rows of several tables below each other, in the units of the first."""
     first = tables[0]
     if len(tables) == 1:
-        return Whole(first.columns, first.raw, ())
+        return replace(first, notes=())
     wanted = {split_unit(name)[0]: name for name in first.columns if name != "label"}
     whole: dict[str, list[Any]] = {name: [] for name in wanted.values()}
     for table in tables:
@@ -141,7 +88,7 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
             if old is not None and new is not None and old.si != new.si:
                 cells = [repr(float(cell) * old.si / new.si) for cell in cells]
             whole[name].extend(cells)
-    labels = [_labels(table.columns) for table in tables]
+    labels = [_labels(table) for table in tables]
     counts = ", ".join(f"{table.file} {len(own)}" for table, own in zip(tables, labels, strict=True))
     notes = [f"rows of the files are stacked: {counts}."]
     names = [name for own in labels for name in own]
@@ -151,27 +98,42 @@ def _stacked(tables: Sequence[Understood]) -> Whole:
             files = [str(i) for i in range(1, len(files) + 1)]
         names = [f"{file}:{name}" for file, own in zip(files, labels, strict=True) for name in own]
         notes.append("labels occur in several files: they are prefixed with the name of the file.")
-    return Whole({"label": names, **whole}, _raw(tables), tuple(notes))
+    lower = [_lower(table) for table in tables]
+    raw = {
+        name: [cell for own in lower for cell in own[name]] for name in lower[0] if all(name in own for own in lower)
+    }
+    return replace(first, columns={"label": names, **whole}, raw=raw, notes=tuple(notes))
 
 
-def _labels(columns: Columns) -> list[str]:
-    count = len(next(iter(columns.values())))
-    return [str(label) for label in columns.get("label", range(1, count + 1))]
+def _beside(joints: Understood, left: Sequence[int], values: Understood, right: Sequence[int],
+            names: Sequence[str]) -> Understood:  # fmt: skip
+    """Return rows of joints and the rows of measured values that belong to them as one table of rows of these names."""
+    sides = ((joints, left), (values, right))
+    whole = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.columns.items()}
+    raw = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.raw.items()}
+    whole.pop("label", None)
+    if len(set(names)) == len(names):
+        whole = {"label": list(names), **whole}
+    else:  # several measured values of a configuration
+        whole.setdefault("configuration", list(names))
+    return replace(values, columns=whole, raw=raw, notes=(*joints.notes, *values.notes))
+
+
+def _labels(table: Understood) -> list[str]:
+    """Return the labels of the rows, or their numbers."""
+    count = len(next(iter(table.columns.values())))
+    return [str(label) for label in table.columns.get("label", range(1, count + 1))]
+
+
+def _lower(table: Understood) -> Columns:
+    """Return the columns of the file by names in lower case."""
+    return {name.lower(): cells for name, cells in table.raw.items()}
 
 
 # --- by a key ------------------------------------------------------------------------------------------------------
 
 
-class Key(NamedTuple):
-    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
-
-    how: str
-    columns: Sequence[str]
-    left: list[str]
-    right: list[str]
-
-
-def _by_key(joints: Side, values: Side, key: str) -> Pairing:
+def _by_key(joints: Understood, values: Understood, key: str) -> Understood:
     """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
     place = {name: i for i, name in enumerate(chosen.left)}
@@ -188,18 +150,19 @@ def _by_key(joints: Side, values: Side, key: str) -> Pairing:
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
-    known = set(names)
-    lonely = [name for name in chosen.left if name not in known] + [name for name in chosen.right if name not in place]
+    lonely = [name for name in chosen.left if name not in set(names)]
+    lonely += [name for name in chosen.right if name not in place]
     if lonely:
         notes.append(f"without a match, left out: {listed(lonely)}.")
-    return Pairing([place[name] for name in names], right, names, chosen.columns, notes)
+    whole = _beside(joints, [place[name] for name in names], values, right, names)
+    return replace(whole, notes=(*whole.notes, *notes), keys=tuple(chosen.columns))
 
 
-def _key(joints: Side, values: Side, key: str) -> Key:
+def _key(joints: Understood, values: Understood, key: str) -> Key:
     """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
     pairs = [
         Key(f"{name} = {other}", (name.lower(), other.lower()), own, others)
-        for (name, own), (other, others) in product(joints.naming().items(), values.naming().items())
+        for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
         if len(set(own) & set(others)) >= SAME * min(len(own), len(others))
         and (key in ("", "row") or key.lower() in (name.lower(), other.lower()))
     ]
@@ -207,13 +170,13 @@ def _key(joints: Side, values: Side, key: str) -> Key:
     pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
     if key == "row":
         return _row_numbers(joints, values, pair if telling else None)
-    if key in ("", "label") and "label" in joints.whole.columns:
-        labels = _normal(joints.labels)
+    if key in ("", "label") and "label" in joints.columns:
+        labels = _normal(joints.columns["label"])
         for column in ("label", "configuration"):
-            others = _normal(values.whole.columns.get(column, ()))
+            others = _normal(values.columns.get(column, ()))
             if set(labels) & set(others) and not (telling and _running(labels)):
                 return Key("label", (), labels, others)
-    left, right = joints.raw, values.raw
+    left, right = _lower(joints), _lower(values)
     common = [name for name in left if name in right]
     name = key.lower()
     if not key and len(common) == 1 and not (telling and pair):
@@ -226,9 +189,17 @@ def _key(joints: Side, values: Side, key: str) -> Key:
     raise InputError("--key", found, f"a common column, {OTHER_KEYS}")
 
 
-def _row_numbers(joints: Side, values: Side, pair: Key | None) -> Key:
+def _naming(table: Understood) -> dict[str, list[str]]:
+    """Return the keys of columns, labels or left out, that name every row differently."""
+    raw = _lower(table)
+    free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
+    cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
+    return {name: keys for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)}
+
+
+def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Key:
     """Return the numbers of the rows as the key, unless a pair of columns shows that the rows are in another order."""
-    count, other = len(joints.labels), len(values.labels)
+    count, other = len(_labels(joints)), len(_labels(values))
     if count != other:
         found = f"{count} rows of joints and {other} measured"
         raise InputError("--key row", found, "equal numbers of both, or a common column")
@@ -246,13 +217,6 @@ def _row_numbers(joints: Side, values: Side, pair: Key | None) -> Key:
 def _running(keys: Sequence[str]) -> bool:
     """Whether keys count the rows."""
     return keys == [str(i) for i in range(1, len(keys) + 1)]
-
-
-def _raw(tables: Sequence[Understood]) -> Mapping[str, list[Any]]:
-    """Return the columns that all files have, below each other, by names in lower case."""
-    lower = [{name.lower(): cells for name, cells in table.raw.items()} for table in tables]
-    common = [name for name in lower[0] if all(name in table for table in lower)]
-    return {name: [cell for table in lower for cell in table[name]] for name in common}
 
 
 def _normal(cells: Sequence[Any]) -> list[str]:
@@ -285,19 +249,18 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     return partner[rows], rows, apart[rows]
 
 
-def _by_time(joints: Side, values: Side, key: str, within: float) -> Pairing:
+def _by_time(joints: Understood, values: Understood, key: str, within: float) -> Understood:
     """Return the rows of the nearest times."""
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
-    clocks, there = _times(joints.tables, key)
-    other_clocks, then = _times(values.tables, key)
+    clocks, (there, then) = zip(*(_times(side, key) for side in (joints, values)), strict=True)
     rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
     left, right, apart = partners(there, then, within + rounding)
     if not len(left):
         nearest = float(np.abs(there - then[0]).min())
         found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
         raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
-    labels = values.labels
+    labels = _labels(values)
     notes = [
         f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
@@ -306,36 +269,32 @@ def _by_time(joints: Side, values: Side, key: str, within: float) -> Pairing:
     if lonely:
         several = f"{len(lonely)} measured rows without a match within {within:g} s, left out"
         notes.append(f"{several}: {listed(lonely)}.")
-    names = [labels[i] for i in right]
-    return Pairing(left.tolist(), right.tolist(), names, [*clocks, *other_clocks], notes)
+    whole = _beside(joints, left.tolist(), values, right.tolist(), [labels[i] for i in right])
+    return replace(whole, notes=(*whole.notes, *notes), keys=clocks)
 
 
-def _clock_tolerance(joints: Side, values: Side) -> float:
+def _clock_tolerance(joints: Understood, values: Understood) -> float:
     """Return a small part of the time between rows [s] where every measured row has a partner within it, else 0."""
-    if any(time_column(table.raw) is None for side in (joints, values) for table in side.tables):
+    if any(time_column(side.raw) is None for side in (joints, values)):
         return 0.0
-    there, then = _times(joints.tables, "")[1], _times(values.tables, "")[1]
+    there, then = (_times(side, "")[1] for side in (joints, values))
     if min(len(there), len(then)) < 2:
         return 0.0
     within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
     return within if len(partners(there, then, within)[1]) == len(then) else 0.0
 
 
-def _times(tables: Sequence[Understood], key: str) -> tuple[list[str], Array]:
-    """Return the columns of times of some tables, in lower case, and the times [s] of all rows."""
-    clocks = []
-    times = []
-    for table in tables:
-        name = time_column(table.raw)
-        if key and key.lower() != "time":
-            name = next((column for column in table.raw if column.lower() == key.lower()), None)
-        if name is None:
-            lacks = f"no column '{key}'" if key else "no column of times"
-            where = f"--time-tolerance, {table.file}"
-            raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
-        clocks.append(name.lower())
-        times.append(seconds(name, table.raw[name]))
-    return clocks, np.concatenate(times)
+def _times(table: Understood, key: str) -> tuple[str, Array]:
+    """Return the column of a table's times, in lower case, and the times [s] of its rows."""
+    columns = _lower(table)
+    name = key.lower() if key.lower() in columns else None
+    if key.lower() in ("", "time"):
+        name = time_column(columns)
+    if name is None:
+        lacks = f"no column '{key}'" if key else "no column of times"
+        where = f"--time-tolerance, {table.file}"
+        raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
+    return name, seconds(name, columns[name])
 
 
 def time_column(names: Iterable[str]) -> str | None:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.layout import Head, RawTable, TableOptions, is_missing
+from rpim_opt.basics.layout import RawTable, TableOptions, is_missing
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import FOREIGN, UNITS, dimension_of, split, split_unit
@@ -57,6 +57,7 @@ class Understood:
 
     ``columns`` are cells by our names, ``raw`` those that the file has, of the same rows. ``doubt`` is the option that
     says how orientations are to be read where only a check against the robot shows it: ``quaternion``, ``rotation``.
+    Of several files as one, ``file`` is the first, and ``keys`` are the columns that joined them, in lower case.
     """
 
     columns: Columns
@@ -65,6 +66,7 @@ class Understood:
     notes: tuple[str, ...]
     doubt: str = ""
     file: str = "the table"
+    keys: Sequence[str] = ()
 
     @property
     def stems(self) -> set[str]:
@@ -158,7 +160,7 @@ def _readings(
     """Return the meaning of every column, None for ignored ones, and the rotation convention in the names."""
     table, dof = raw.columns, robot.dof
     names = [*number_columns(robot, kind), *text_columns(kind)]
-    read = {name: _read(name, raw.heads.get(name), names, kind.names, joints) for name in table}
+    read = {name: _read(name, raw.groups.get(name, ""), names, kind.names, joints) for name in table}
     rotation = ""
     stems = {reading.stem for reading in read.values()}
     for words, why in known_names.JOINTS:
@@ -199,15 +201,13 @@ def _readings(
     return read, rotation
 
 
-def _read(name: str, head: Head | None, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
+def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
     """Return the meaning of a column; an unknown name becomes its stem."""
     text = name.partition(" #")[0]
-    stem, unit = split(text)
-    group = ""
-    if head is not None and head.name:
-        group = split(head.group)[0]
-        stem = f"{group} {split(head.name)[0]}".strip()
-        unit = next(filter(None, (split(part)[1] for part in (f"x [{head.unit}]", head.name, head.group))), "")
+    stem, unit = split(text.removeprefix(group).strip())
+    group, of_group = split(group)
+    stem = f"{group} {stem}".strip()
+    unit = unit or of_group
     for whole in (text, stem):
         if whole in joints:
             return Reading(f"q{joints.index(whole) + 1}", unit, "a joint of the robot's file")
