@@ -67,6 +67,14 @@ class Region:
             inside[inside] = ((at >= self.box[:, 0]) & (at <= self.box[:, 1])).all(axis=1)
         return inside
 
+    def rows(self, data: Dataset) -> np.ndarray:
+        """Return which rows of measurements have all their points in the region or near it (N,)."""
+        inside = np.zeros(len(data), dtype=bool)
+        for block in data.blocks:
+            points = [self.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
+            inside[block.row] = np.all(points, axis=0)
+        return inside
+
     def drawn(self) -> Array:
         """Return configurations (N, dof) that represent the region; InputError if none reaches the box."""
         return within(self.problem, self.box, self.marker)
@@ -307,18 +315,17 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         lacking.append(
             "Lacking: measurements that identify the parameter combinations that neither data nor penalty determine."
         )
+    elif mapped.largest > limit and repeatability > limit:
+        lacking.append(
+            f"Lacking: a more precise repeatability. Its upper bound, {1e3 * repeatability:.3f} mm, may exceed the "
+            "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
+        )
     elif mapped.largest > limit:
-        if repeatability > limit:
-            lacking.append(
-                f"Lacking: a more precise repeatability. Its upper bound, {1e3 * repeatability:.3f} mm, may exceed the "
-                "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
-            )
-        else:
-            lacking.append(
-                f"Lacking: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
-                f"robot's repeatability would leave {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
-                "--augment --count 10` names the configurations that help most."
-            )
+        lacking.append(
+            f"Lacking: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
+            f"robot's repeatability would leave {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
+            "--augment --count 10` names the configurations that help most."
+        )
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "undecided"
@@ -349,16 +356,13 @@ def _held_out(
         error, sigmas, allowed, coverage = held.error[kept], held.sigmas[kept], held.allowed[kept], held.coverage
     else:
         return None, [], ["Lacking: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
-    inside = np.isfinite(error)
+    inside = np.isfinite(error) & region.rows(apart)
     instrument = np.zeros(len(apart))  # what it may add to an error, with the required confidence
     for block in apart.blocks:
-        points = [region.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
-        inside[block.row] &= np.all(points, axis=0)
         lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
-        covariance = np.broadcast_to(block.covariance, (len(block.row), *block.covariance.shape[1:]))
         if lengths:
-            of_lengths = covariance[:, lengths][:, :, lengths]
-            instrument[block.row] = distance_quantile(of_lengths, STATED, requirement.confidence)
+            covariance = block.covariance[:, lengths][:, :, lengths]
+            instrument[block.row] = distance_quantile(covariance, STATED, requirement.confidence)
     missing = [apart.label[i] for i in np.flatnonzero(inside & (error > requirement.limit + instrument))]
     unexplained = np.nan_to_num(sigmas) > np.nan_to_num(allowed, nan=np.inf)
     beyond = [apart.label[i] for i in np.flatnonzero(unexplained)]
@@ -390,23 +394,13 @@ def _held_out(
             lacking.append(f"Lacking: valid prediction intervals. Only {share}.")
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
-        if not _any_inside(result, region):
+        if not any(region.rows(part.data).any() for part in result.problem.rows()):
             lacking.append("Lacking: measurements in the region. No identification row is in it either.")
     if excluded:
         sentence += f". Not counted: {listed(excluded, MOST)}, excluded as outliers by the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
     document |= {"beyond": beyond, "excluded": excluded, "coverage95": coverage, "sentence": f"{sentence}."}
     return document, missed, lacking
-
-
-def _any_inside(result: Calibration, region: Region) -> bool:
-    """Whether any identification row is in the region with all its points."""
-    for part in result.problem.rows():
-        for block in part.data.blocks:
-            points = [region.inside(block.q[:, point], SLACK) for point in range(block.q.shape[1])]
-            if np.all(points, axis=0).any():
-                return True
-    return False
 
 
 def repeatability_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:

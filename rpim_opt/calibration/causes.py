@@ -11,25 +11,9 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.verdict import BAD, NOISY, kept_rows, noise_ratio, rms
+from rpim_opt.calibration.verdict import BAD, NOISY, UNITS, kept_rows, noise_ratio, residuals, rms
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.diagnosis import (
-    computed_columns,
-    copied_rows,
-    exchanged_rows,
-    left_out_together,
-    mixed_reflectors,
-    moved_far,
-    odd_columns,
-    odd_joint,
-    part_way,
-    rounded,
-    rows_without_values,
-    scattering_joint,
-    shared_rows,
-    shown_by_residuals,
-    unrelated_rows,
-)
+from rpim_opt.problem import diagnosis
 from rpim_opt.problem.misreadings import Better, better_reading
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
@@ -72,22 +56,19 @@ def likely_causes(result: Outcome) -> list[str]:
     if not result.problem.keeps_rows:
         return []
     problem = cast(CalibrationProblem, result.problem)
-    shared = [*shared_rows(problem.data, result.record.validation), *copied_rows(problem.data)]
-    if result.learned is not None:
-        shared += left_out_together(problem.labels, {row.label for row in result.learned.left_out})
+    learned, free = result.learned, problem.parameters.free
+    shared = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
+    if learned is not None:
+        shared += diagnosis.left_out_together(problem.labels, {row.label for row in learned.left_out})
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     kept = kept_rows(result)
-    kinds = {"length": (1e3, "mm"), "angle": (1e3, "mrad"), "pixel": (1.0, "px")}
-    errors = {kind: np.where(kept, problem.errors(result.x, kind), np.nan) for kind in kinds}
-    ratios = [noise_ratio(problem, each, kind) for kind, each in errors.items()]
-    figures = [f"{three_digits(size * rms(errors[kind]))} {unit}" for kind, (size, unit) in kinds.items()]
-    signs = [
-        f"residual RMS {figure}, {three_digits(ratio)} times the stated noise"
-        for figure, ratio in zip(figures, ratios, strict=True)
-        if ratio > NOISY
-    ]
-    learned, free = result.learned, problem.parameters.free
+    sizes = residuals(result, kept)
+    signs = []
+    for dimension, (size, ratio) in sizes.items():
+        unit, si = UNITS[dimension]
+        if ratio > NOISY:
+            signs.append(f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the stated noise")
     if learned is not None and learned.curves is not None:  # beyond those of gears, or no transmission errors at all
         size, ratio = learned.curves.size.value, result.noise_test().ratio
         if size > LARGEST_CURVE:
@@ -109,12 +90,12 @@ def likely_causes(result: Outcome) -> list[str]:
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
-        causes = [*_found(result, problem), *(computed_columns(problem) if len(problem.arms) == 1 else ())]
+        causes = [*_found(result, problem), *(diagnosis.computed_columns(problem) if len(problem.arms) == 1 else ())]
     elif not kept.all():
         causes = list(_of_rows(problem))
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
-    if max(ratios) > HOPELESS:
+    if max(ratio for _, ratio in sizes.values()) > HOPELESS:
         return [*head, NOTHING]
     return []
 
@@ -125,10 +106,10 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return list(_of_rows(problem))
     ordered = _in_table_order(result, problem)
     better = better_reading(ordered)
-    causes = list(part_way(ordered)) if better is None else [better.sentence]
+    causes = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
     if causes:
-        return [*rows_without_values(problem), *causes]
-    causes = [*_of_rows(problem), *(list(moved_far(problem)) or list(mixed_reflectors(problem)))]
+        return [*diagnosis.rows_without_values(problem), *causes]
+    causes = [*_of_rows(problem), *(list(diagnosis.moved_far(problem)) or diagnosis.mixed_reflectors(problem))]
     if not causes:
         error, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
         rows = own | (error <= np.nanmax(error[own]))  # held-out rows that are gross errors were not looked for
@@ -137,12 +118,13 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
             p = problem.parameters
             alone = alone.identifying(p.identified & ~np.isin(p.names, result.learned.added))
             x = settled(alone)
-        causes = list(shown_by_residuals(alone, x)) or list(scattering_joint(alone, x))
+        causes = list(diagnosis.shown_by_residuals(alone, x)) or list(diagnosis.scattering_joint(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
-    causes = causes or list(rounded(problem, error))
+    causes = causes or list(diagnosis.rounded(problem, error))
     if causes or error < LARGEST["length"]:  # which a robot's own effects may be
         return causes
-    return list(odd_columns(problem)) or list(odd_joint(problem)) or list(unrelated_rows(problem, error))
+    causes = list(diagnosis.odd_columns(problem)) or list(diagnosis.odd_joint(problem))
+    return causes or list(diagnosis.unrelated_rows(problem, error))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:
@@ -180,9 +162,7 @@ def refuse_misread(result: Outcome, data: Dataset) -> None:
 def misread(result: Outcome, data: Dataset) -> str:
     """Return the result of `better_fitting` as a sentence, empty for None."""
     better = better_fitting(result, data)
-    if better is None:
-        return ""
-    return f"Likely: {better.sentence}"
+    return "" if better is None else f"Likely: {better.sentence}"
 
 
 def mistakes(causes: Sequence[str]) -> list[str]:
@@ -192,6 +172,6 @@ def mistakes(causes: Sequence[str]) -> list[str]:
 
 def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
     """Say which rows cannot be right, whatever the others are."""
-    yield from rows_without_values(problem)
+    yield from diagnosis.rows_without_values(problem)
     if len(problem.arms) == 1:
-        yield from exchanged_rows(problem)
+        yield from diagnosis.exchanged_rows(problem)

@@ -20,11 +20,12 @@ from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.verdict import UNITS
 from rpim_opt.convex.formulation import tikhonov
 from rpim_opt.convex.select import reml
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.row_functions import measured_torques, repeatable
+from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 
 QUICK = 60
 """Configurations that are looked at before calibrating."""
@@ -48,8 +49,6 @@ PERMUTATIONS = 300
 """Permutations that an autocorrelation is compared with."""
 FEWEST_NEIGHBOURS = 8
 """Configurations below which there is no autocorrelation."""
-UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
-"""Unit in which residuals are said, and its size in SI."""
 
 
 class Extension(NamedTuple):
@@ -330,12 +329,11 @@ def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[fl
     freedom = 0
     for block, residual in by_block(problem, problem.residual(x)):
         r = residual[:, [d == dimension for d in block.measurement.components.values()]]
-        same = np.unique(repeatable(block).round(7), axis=0, return_inverse=True)[1].ravel()
-        count = np.bincount(same)
-        mean = np.array([np.bincount(same, column) / count for column in r.T]).reshape(-1, len(count)).T
-        squares += float(np.sum((r - mean[same]) ** 2))
-        rows += len(r) - len(count)
-        freedom += (len(r) - len(count)) * r.shape[1]
+        number = repeated(block)
+        again = len(r) - len(np.unique(number))
+        squares += float(np.sum(about_means(r, number) ** 2))
+        rows += again
+        freedom += again * r.shape[1]
     if freedom < FEWEST:
         return None, freedom
     return float(np.sqrt(squares / rows)), freedom

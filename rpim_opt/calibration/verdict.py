@@ -23,6 +23,8 @@ REACH = 0.003
 """Residual RMS over the length of the arm that a robot's own effects stay below."""
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
+UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
+"""Unit in which residuals are said, and its size in SI."""
 ANGULAR = 0.02
 """Residual RMS of orientations [rad] that a robot's own effects stay below."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
@@ -112,6 +114,12 @@ def kept_rows(result: Outcome) -> np.ndarray:
     return ~np.isin(result.problem.labels, list(labels))
 
 
+def residuals(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, float]]:
+    """Return the RMS residual [SI] of rows, kept (N,), and its ratio to the stated noise, by dimension."""
+    errors = {each: np.where(kept, result.errors(dimension=each), np.nan) for each in UNITS}
+    return {each: (rms(error), noise_ratio(result.problem, error, each)) for each, error in errors.items()}
+
+
 def noise_ratio(problem: Source, errors: Array, dimension: str = "length") -> float:
     """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 if the dimension was not measured."""
     variance = stated_variance(problem, dimension)
@@ -179,21 +187,19 @@ def worse_sentence(nominal: Array, identified: Array) -> str:
 
 def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
-    problem = result.problem
-    lengths, angles, pixels = (
-        np.where(kept, result.errors(dimension=each), np.nan) for each in ("length", "angle", "pixel")
-    )
-    ratio = max(noise_ratio(problem, lengths), noise_ratio(problem, pixels, "pixel"))
-    share = rms(lengths) / arm_length(problem)
+    sizes = residuals(result, kept)
+    size = sizes["length"][0]
+    ratio = max(sizes["length"][1], sizes["pixel"][1])
+    share = size / arm_length(result.problem)
     if ratio > NOISY and share > REACH:
         yield (
-            f"Residual RMS {three_digits(1e3 * rms(lengths))} mm: {three_digits(ratio)} times the stated noise and "
+            f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the stated noise and "
             f"{100 * share:.2g} % of the arm's length; a robot's own effects stay below {100 * REACH:g} %."
         )
-    ratio = noise_ratio(problem, angles, "angle")
-    if ratio > NOISY and rms(angles) > ANGULAR:
+    size, ratio = sizes["angle"]
+    if ratio > NOISY and size > ANGULAR:
         yield (
-            f"Residual RMS {three_digits(1e3 * rms(angles))} mrad: {three_digits(ratio)} times the stated noise; a "
+            f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the stated noise; a "
             f"robot's own effects stay below {1e3 * ANGULAR:g} mrad."
         )
 

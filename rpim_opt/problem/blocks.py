@@ -28,6 +28,7 @@ from rpim_opt.robot.parameters import Parameters, frame_of, of_session, session_
 ROWS = 4096  # rows that are evaluated, weighed and reduced together
 KEPT = 200_000  # equations up to which a calibration keeps its rows, wherever they stand; beyond, only their QR factor
 Part = Callable[[], Dataset]  # reads some of the measurements; whole configurations
+Numbered = tuple[int, Part]
 
 
 @one_blas_thread
@@ -101,9 +102,7 @@ class PartitionedProblem(RobotModel):
 
     @cached_property
     def _first(self) -> CalibrationProblem:
-        return CalibrationProblem(
-            self.robots, self.parameters, self.first, asked=self.asked, repeatability=self.repeatability
-        )
+        return CalibrationProblem(self.robots, self.parameters, self.first, **_beside(self))
 
     def on(self, data: Dataset) -> CalibrationProblem:
         """Return the same problem with other measurements, in memory."""
@@ -185,35 +184,28 @@ def in_parts(problem: Source) -> Source:
     if sum(index.size for index in equation_numbers(problem.data)) <= KEPT:
         return problem
     parts = [partial(Dataset.take, problem.data, rows) for rows in whole_configurations(problem.data, KEPT // 4)]
-    return PartitionedProblem(
-        problem.robots,
-        problem.parameters,
-        problem.data,
-        parts,
-        asked=problem.asked,
-        repeatability=problem.repeatability,
-    )
+    return PartitionedProblem(problem.robots, problem.parameters, problem.data, parts, **_beside(problem))
+
+
+def _beside(problem: RobotModel) -> dict[str, Any]:
+    """Return what a problem knows besides robots, parameters and data."""
+    return {"asked": problem.asked, "repeatability": problem.repeatability}
 
 
 def _on_part(
-    what: Callable[[CalibrationProblem], Any],
-    known: CalibrationProblem,
-    dropped: frozenset[str],
-    part: tuple[int, Part],
+    what: Callable[[CalibrationProblem], Any], known: CalibrationProblem, dropped: frozenset[str], part: Numbered
 ) -> Any:
     """Return what a function makes of a part, where a worker reads it; None for one without rows."""
     data = _read(known.parameters, dropped, part)
     return what(known.on(data)) if len(data) else None
 
 
-def _read(parameters: Parameters, dropped: frozenset[str], part: tuple[int, Part]) -> Dataset:
+def _read(parameters: Parameters, dropped: frozenset[str], part: Numbered) -> Dataset:
     """Return the measurements of a part; refuse a session that the parameters lack while they have others."""
     number, read = part
     mine = f"{number}:"
     out = {label.removeprefix(mine) for label in dropped if label.startswith(mine)}
-    data = read()
-    if out:
-        data = data.without(out)
+    data = read().without(out) if out else read()
     known = {frame_of(name) for name in parameters.names if of_session(name)}
     strange = [name for name in data.sessions if session_prefix(name) not in known]
     if known and strange:

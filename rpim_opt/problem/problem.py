@@ -411,8 +411,8 @@ class CalibrationProblem(RobotModel):
         norms = np.zeros(len(self.data))
         count = np.zeros(len(self.data), dtype=int)
         residual = self.residual(x)
-        for block, index, L in zip(self.data.blocks, equation_numbers(self.data), self._whitening, strict=True):
-            norms[block.row] = np.linalg.norm((L @ residual[index][:, :, None])[:, :, 0], axis=1)
+        for block, index, V in zip(self.data.blocks, equation_numbers(self.data), self.covariances(), strict=True):
+            norms[block.row] = np.linalg.norm((_inverse_root(V) @ residual[index][:, :, None])[:, :, 0], axis=1)
             count[block.row] = index.shape[1]
         return norms, count
 
@@ -496,13 +496,6 @@ class CalibrationProblem(RobotModel):
 
     # Noise
 
-    @cached_property
-    def _whitening(self) -> list[Array]:
-        """L^-1 with a row's covariance = L L', for every block."""
-        if not all(np.isfinite(block.covariance).all() for block in self.data.blocks):
-            raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
-        return [_inverse_root(covariance) for covariance in self.covariances()]
-
     def _whitened(self, values: Array) -> Array:
         """Return values (m, c) of the equations in units of their noise."""
         whitened = np.empty_like(values)
@@ -515,7 +508,7 @@ class CalibrationProblem(RobotModel):
         """The numbers (N, k) of equations that share noise, and L^-1 (N or 1, k, k) of its covariances L L'."""
         repeatability = self.repeatability or Repeatability()
         if self.repeatability is None and self.touches is None:  # every row by itself
-            return list(zip(equation_numbers(self.data), self._whitening, strict=True))
+            return list(zip(equation_numbers(self.data), map(_inverse_root, self.covariances()), strict=True))
         stacks = self.stacks(joints=repeatability.joint > 0, at=repeatability.at)
         return [(stack.index, _inverse_root(stack.covariance(repeatability))) for stack in stacks]
 
@@ -620,6 +613,8 @@ def error_dimensions(block: Block) -> list[str]:
 
 def _inverse_root(covariance: Array) -> Array:
     """Return L^-1 of covariances L L'."""
+    if not np.isfinite(covariance).all():
+        raise InputError("covariance", "values that are not finite", "variances in m^2 or rad^2")
     try:
         return np.asarray(np.linalg.inv(np.linalg.cholesky(covariance)), dtype=float)
     except np.linalg.LinAlgError:

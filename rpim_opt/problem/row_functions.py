@@ -307,7 +307,15 @@ def require_same_torques(robot: Robot, parameters: Parameters, before: bool, now
     raise InputError("compliances", "data without joint torques", "columns tau1_Nm, ..., as in the problem's data")
 
 
-def repeatable(block: Block) -> Array:
-    """Return what is the same (N, c) in rows that repeat a measurement: joint values and a model's own columns."""
+def repeated(block: Block) -> np.ndarray:
+    """Return the number (N,) of what rows measured: the same where joint values and a model's own columns are."""
     seen = [block.columns[name][:, None] for name in block.measurement.sees if name in block.columns]
-    return np.hstack([block.q.reshape(len(block.row), -1), *seen])
+    same = np.hstack([block.q.reshape(len(block.row), -1), *seen]).round(7)
+    return np.unique(same, axis=0, return_inverse=True)[1].ravel()  # a column in NumPy 2.0
+
+
+def about_means(values: Array, number: np.ndarray) -> Array:
+    """Return values (N, k) about the mean of those of the same number (N,)."""
+    sums = np.zeros((number.max(initial=-1) + 1, values.shape[1]))
+    np.add.at(sums, number, values)
+    return values - (sums / np.bincount(number)[:, None])[number]

@@ -9,7 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.problem.row_functions import loads_of, needed, repeatable
+from rpim_opt.problem.row_functions import loads_of, needed, repeated
 from tests.data.test_measurement import KINDS, random_problem
 from tests.robot.test_gravity import random_robot
 from tests.simulate import ARM, simulated
@@ -203,4 +203,10 @@ def test_rows_that_read_the_same_thing_again_have_the_same_joints() -> None:
     """Of measurements between two points those of both; nothing else where the model sees no column."""
     for name in ("position", "distance"):
         block = ro.load(name).problem.data.blocks[0]
-        assert np.array_equal(repeatable(block), block.q.reshape(len(block.q), -1))
+        again = block.take(np.array([0, 1, 0, 2, 1]), np.arange(5))
+        number = repeated(again)
+        assert (number[0], number[1]) == (number[2], number[4])
+        assert len(set(number)) == 3
+        one_joint = again.q.copy()
+        one_joint[2, -1, 0] += 0.1
+        assert len(set(repeated(replace(again, q=one_joint)))) == 4

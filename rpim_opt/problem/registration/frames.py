@@ -30,7 +30,7 @@ from rpim_opt.problem.registration.closed_forms import (
     transformed,
     transforms,
 )
-from rpim_opt.problem.registration.points import Candidates, fit_arms
+from rpim_opt.problem.registration.points import Candidates, Points, fit_arms
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm
@@ -51,15 +51,12 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
     for block in data.blocks:
         if block.measurement.name not in ("position", "pose"):
             continue
-        count = len(block.row)
-        rows = np.unique(np.linspace(0, count - 1, min(count, ENOUGH)).round().astype(int))
+        rows = np.unique(np.linspace(0, len(block.row) - 1, min(len(block.row), ENOUGH)).round().astype(int))
         some = block.take(rows, rows)
-        T = rigid(np.full((3, 3), np.nan), some.y[:, :3])
-        variance = np.zeros((len(rows), 2))
-        variance[:, 0] = np.trace(some.covariance[:, :3, :3], axis1=1, axis2=2) / 3
-        if block.measurement.name == "pose":
-            T = transforms(some.y)
-            variance[:, 1] = np.trace(some.covariance[:, 3:, 3:], axis1=1, axis2=2) / 3
+        T = transforms(some.y) if block.measurement.name == "pose" else rigid(np.full((3, 3), np.nan), some.y)
+        variance = np.zeros((len(rows), 2))  # of positions and orientations
+        for k, part in enumerate((slice(3), slice(3, None))):
+            variance[:, k] = np.trace(some.covariance[:, part, part], axis1=1, axis2=2) / 3
         parts.append((some.q[:, 0], T, np.full(len(rows), block.markers[0]), variance))
     if not parts:
         raise InputError("key base", '"auto" without positions or poses', "a table [base]")
@@ -73,10 +70,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
     first = count.most_common(1)[0][0]
     own = marker == first
     try:
-        deviations = (sigma[own, 0], sigma[own, 1])
-        start = certified_hand_eye(
-            flange[own], measured[own], sigma=deviations, expected=places[first], spread=TOOL_ERROR
-        )
+        certain: Any = {"sigma": tuple(sigma[own].T), "expected": places[first], "spread": TOOL_ERROR}
+        start = certified_hand_eye(flange[own], measured[own], **certain)
         if start.uncertainty > UNKNOWN or (len(count) > 1 and not start.certified):
             raise InputError("the data", start.reason, "rotations about two axes")
     except InputError as error:
@@ -86,12 +81,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         nominal = np.array([place[:3] for place in places.values()])
         # refuses points on a line
         register(transformed(flange, nominal[number]), y)
-        spread = np.full(len(nominal), TOOL_ERROR)
-        zero = np.zeros((1, len(robot.mdh)))
-        q = q @ robot.joint_map.T
-        fit = fit_arms(
-            robot, Candidates(q[None], y[None], number[None], zero, nominal[None], nominal, spread), steps=12
-        )
+        points = Points(q, y, number, nominal, None, np.arange(len(q)))
+        fit = fit_arms(robot, Candidates.of(robot, [points]), steps=12)
         base = fit.base[0]
         for place, fitted in zip(places.values(), fit.tools[0], strict=True):
             place[:3] = fitted
