@@ -73,7 +73,7 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     ax.set(xlabel=f"row{note}", ylabel="error [mm]")
     if few:
         _name(ax, "x", labels)
-    _logarithmic(ax, "y")
+    logarithmic(ax, "y")
     return _with_legend(ax)
 
 
@@ -222,8 +222,8 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     ax.set(
         xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior standard deviations]"
     )
-    _logarithmic(ax, "x")
-    _logarithmic(ax, "y")
+    logarithmic(ax, "x")
+    logarithmic(ax, "y")
     return _with_legend(ax)
 
 
@@ -315,6 +315,8 @@ def _times(found: Monitoring, ax: Axes) -> Array:
 COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
 """Colours by meaning, as in the page's style sheet, which has others in the dark."""
 SHAPES = "osD^v<>"
+CLOSE, VERY_CLOSE = 3.0, 1.6
+"""Ratios of a logarithmic axis's ends below which it has ticks between 1, 2 and 5, and at every tenth."""
 MANY_DOTS = 1000
 """Dots beyond which they are one picture in a vector graphic."""
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 4.0
@@ -337,15 +339,18 @@ def _dots(ax: Axes, x: Any, y: Any, role: str, label: str = "", ms: float = 5.0)
     ax.plot(x, y, "o", color=COLORS[role], label=label, ms=ms, rasterized=len(x) > MANY_DOTS)
 
 
-def _logarithmic(ax: Axes, which: str) -> None:
-    """Make an axis logarithmic, with ticks at 1, 2 and 5 where it has less than three powers of ten."""
+def logarithmic(ax: Axes, which: str) -> None:
+    """Make an axis logarithmic, with as many ticks a power of ten as it has room for."""
     from matplotlib.ticker import LogLocator
 
     ax.set(**{f"{which}scale": "log"})
     low, high = getattr(ax, f"get_{which}lim")()
     axis = getattr(ax, f"{which}axis")
     powers = np.floor(np.log10(high)) - np.ceil(np.log10(low)) + 1
-    axis.set_major_locator(LogLocator(subs=(1, 2, 5) if powers < 3 else (1,)))
+    ticks: Any = (1, 2, 5) if powers < 3 else (1,)
+    if high / low < CLOSE:
+        ticks = np.arange(10, 100) / 10 if high / low < VERY_CLOSE else (1, 1.2, 1.5, 2, 2.5, 3, 5, 6, 7, 8, 9)
+    axis.set_major_locator(LogLocator(subs=ticks))
     axis.set_major_formatter("{x:g}")
     axis.minorticks_off()
 

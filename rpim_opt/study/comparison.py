@@ -16,10 +16,11 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import csv_text, frame_of
 from rpim_opt.basics.text import counted, markdown, progress_bar
+from rpim_opt.store.instances import Instance
 from rpim_opt.study import replicates
-from rpim_opt.study.methods import FOLDER, METRICS, USUAL, methods_of, metrics_of, replicate, sources_of, splits_of
+from rpim_opt.study.methods import FOLDER, METRICS, USUAL, methods_of, metrics_of, problems_of, replicate, splits_of
 from rpim_opt.study.ranking import WITH_FIGURES, Summary, figures, number, summarize
-from rpim_opt.study.replicates import Row, content_hash, require_package, run_cases
+from rpim_opt.study.replicates import Row, run_cases
 from rpim_opt.study.studies import Report, write
 
 MOST_DRAWS = 100_000
@@ -112,9 +113,9 @@ def compare(
     >>> len(found.to_frame()), found.metric
     (8, 'rms_mm')
     """
-    sources = {source.label: source for source in sources_of(problems)}
-    compared = {method.label: method for method in methods_of(formulations, selectors, methods, options or {})}
-    ways = {split.label: split for split in splits_of(splits)}
+    asked = problems_of(problems)
+    compared = methods_of(formulations, selectors, methods, options or {})
+    ways = splits_of(splits)
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
     if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
@@ -125,36 +126,32 @@ def compare(
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
-        return partial(
-            replicate, sources[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case
-        )
+        method = compared[case["method"]]
+        return partial(replicate, asked[case["problem"]], ways[case["split"]], method, figured, case)
 
     made = replicates.provenance()
+    drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
     cases: list[Row] = []
-    for source, split, count, factor in product(sources.values(), ways.values(), sizes, factors):
-        drawn = source.drawn or split.label != FOLDER or factor > 1  # what no seed changes is there once
-        if count is not None and not drawn:
-            drawn = count < len(np.unique(source.instance(0).problem.data.configuration))
-        folds = range(1, split.folds + 1)
-        for seed, fold, method in product(numbered if drawn else numbered[:1], folds, compared.values()):
-            case = {"problem": source.label, "method": method.label, "formulation": method.formulation}
-            case |= {"selector": method.selector, "split": split.label, "fold": fold}
-            cases.append({**case, "count": count, "noise_factor": factor, "seed": seed})
+    for (label, problem), (split, size), count, factor in product(asked.items(), ways.items(), sizes, factors):
+        # what no seed changes is there once
+        seeded = label in drawn or split != FOLDER or factor > 1
+        if count is not None and isinstance(problem, Instance):
+            seeded = seeded or count < len(np.unique(problem.problem.data.configuration))
+        folds = range(1, max(int(size), 1) + 1)
+        for seed, fold, (name, method) in product(numbered if seeded else numbered[:1], folds, compared.items()):
+            case = {"problem": label, "method": name, "formulation": method.formulation, "selector": method.selector}
+            cases.append({**case, "split": split, "fold": fold, "count": count, "noise_factor": factor, "seed": seed})
     path = None if journal is None else Path(journal)
     code: dict[str, str] = {}
     if path is not None:
-        require_package("joblib", "journal")
-        inputs = {"problems given": tuple(sources.values()), "methods": tuple(compared.values())}
         own = {name: metric for name, metric in figured.items() if METRICS.get(name) is not metric}
-        inputs["metrics"] = tuple(figured), own
-        hashes = {f"set of {name}": content_hash(it, "journal") for name, it in inputs.items()}
-        code = replicates.package_code() | replicates.script_code() | hashes
+        code = replicates.code_of({"problems given": asked, "methods": compared, "metrics": (tuple(figured), own)})
         with refused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:
         rows = run_cases(cases, work, workers, say, path, code, resume)
     axes = {
-        "Problems": sources,
+        "Problems": asked,
         "Methods": compared,
         "Held out": ways,
         "Configurations": ["all" if count is None else str(count) for count in sizes],
@@ -164,17 +161,15 @@ def compare(
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
     }
     settings = {name: ", ".join(values) for name, values in axes.items() if values}
-    generated = frozenset(label for label, source in sources.items() if source.drawn)
-    return Comparison(tuple(rows), tuple(figured), generated, settings, made)
+    return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
     """Return numbers of a kind, ``int`` or ``float``, each once."""
     values = list(stated) if isinstance(stated, Iterable) else [stated]
     kinds = (int, np.integer) if kind is int else (int, float, np.number)
-    if not values or not all(
-        isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= LARGEST for v in values
-    ):
+    right = [isinstance(v, kinds) and not isinstance(v, bool) and least <= v <= LARGEST for v in values]
+    if not values or not all(right):
         raise InputError(where, f"{stated!r}", accepted)
     return list(dict.fromkeys(map(kind, values)))
 
@@ -233,7 +228,9 @@ class Comparison:
         The metric is a column of which less is better, by default the first; the reference a method's label, by default
         the first one that has figures. InputError for an unknown metric or method, or where nothing has figures.
         """
-        return summarize(self.rows, metric or self.metric, self.reference(metric, against), self.drawn)
+        if metric is not None and metric not in self.metrics:
+            raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
+        return summarize(self.rows, metric or self.metric, against, self.drawn)
 
     def plot(self, metric: str | None = None, against: str | None = None) -> Any:
         """Return a matplotlib figure: every method's errors over the reference's, in pairs.
@@ -273,23 +270,6 @@ class Comparison:
         write(Path(folder), title, report, made, {"replicates.csv": csv_text(names, cells).encode()})
         return Path(folder) / "README.md"
 
-    def reference(self, metric: str | None = None, against: str | None = None) -> str:
-        """Return the label of the method that others are compared with; arguments as for `summary`."""
-        if metric is not None and metric not in self.metrics:
-            raise InputError("metric", f"'{metric}'", choices(metric, self.metrics))
-        of = figures(self.rows, metric or self.metric)
-        if against is None:
-            known = [method for method, values in of.items() if values]
-            if not known:
-                reason = f"{self.rows[0]['status']}: {self.rows[0]['reason']}"
-                raise InputError("comparison", f"no replicate with results; {reason}", "one")
-            return known[0]
-        if against not in of:
-            raise InputError("against", f"'{against}'", choices(against, of))
-        if not of[against]:
-            raise InputError("against", f"'{against}', which has no results", "a method with results")
-        return against
-
     def __repr__(self) -> str:
         """Return one line."""
         counts = ", ".join(f"{count} {status}" for status, count in Counter(row["status"] for row in self.rows).items())
@@ -298,12 +278,12 @@ class Comparison:
 
     def __str__(self) -> str:
         """Return that line, and the summary where there is one."""
-        if any(row["status"] in WITH_FIGURES for row in self.rows):
-            return f"{self!r}\n\n{self.summary()}"
-        return repr(self)
+        return f"{self!r}\n\n{self.summary()}" if self._has_figures else repr(self)
 
     def _repr_html_(self) -> str | None:
         """Return the summary for a notebook."""
-        if any(row["status"] in WITH_FIGURES for row in self.rows):
-            return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}"
-        return None
+        return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}" if self._has_figures else None
+
+    @property
+    def _has_figures(self) -> bool:
+        return any(row["status"] in WITH_FIGURES for row in self.rows)

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
-from matplotlib.ticker import LogLocator, NullFormatter, NullLocator, ScalarFormatter, StrMethodFormatter
 
+from rpim_opt.report.plot import logarithmic
 from rpim_opt.study.ranking import Rows, Summary, figures
 
 ROW_INCHES = 0.25
@@ -40,20 +40,13 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     """
     figure = Figure(figsize=(7, 0.32 * len(values) + 0.9), layout="constrained")
     ax = figure.add_subplot()
-    for y, (name, known) in enumerate(reversed(list(values.items()))):
-        dots = ax.semilogx(known, [y] * len(known), "o", ms=3, alpha=min(1.0, 5 / len(known) ** 0.5), color="C0", mew=0)
+    for y, known in enumerate(values.values()):
+        dots = ax.plot(known, [y] * len(known), "o", ms=3, alpha=min(1.0, 5 / len(known) ** 0.5), color="C0", mew=0)
         dots[0].set_rasterized(len(known) > 50)  # thousands of dots would make megabytes of SVG
         middle = sorted(known)[len(known) // 2]
-        ax.semilogx([middle], [y], "|", ms=11, mew=2, color="C3")
+        ax.plot([middle], [y], "|", ms=11, mew=2, color="C3")
         ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
-        ax.annotate(name, (-0.01, y), xycoords=("axes fraction", "data"), ha="right", va="center", fontsize=8)
-    ax.set_yticks([])
-    ax.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-    ax.xaxis.set_major_formatter(ScalarFormatter())
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    ax.grid(axis="x", alpha=0.3)
-    ax.set_xlabel(label)
-    return figure
+    return _finished(ax, list(values), label)
 
 
 def comparison_figure(rows: Rows, summary: Summary) -> Any:
@@ -63,43 +56,40 @@ def comparison_figure(rows: Rows, summary: Summary) -> Any:
     ax = figure.add_subplot()
     of = figures(rows, summary.metric)
     other = of[summary.reference]
-    top = len(summary.standings) - 1
     ax.axvline(1, color="0.4", lw=1, zorder=1)
-    for k, each in enumerate(summary.standings):
+    for y, each in enumerate(summary.standings):
         own = of[each.method]
         ratios = np.array([own[pair] / other[pair] for pair in own if other.get(pair)])
         alpha = min(0.5, 3 / max(len(ratios), 1) ** 0.5)
-        ax.plot(_inside(ratios), np.full(len(ratios), top - k), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
-        if (ratios > LARGEST_RATIO).any():
-            ax.plot([LARGEST_RATIO], [top - k], ">", ms=6, color="C0", zorder=2)
-        if (ratios < 1 / LARGEST_RATIO).any():
-            ax.plot([1 / LARGEST_RATIO], [top - k], "<", ms=6, color="C0", zorder=2)
-        if each.ratio is not None:
-            colour = "0.3"
-            if each.different:
-                colour = "C2" if each.ratio < 1 else "C3"
-            if each.low is not None and each.method != summary.reference:
-                ends = _inside([each.low, each.high])
-                ax.plot(ends, [top - k] * 2, "-", lw=2, color=colour, zorder=3, solid_capstyle="butt")
-            ax.plot(_inside([each.ratio]), [top - k], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
-    ax.set_yticks(range(top + 1), [each.method for each in reversed(summary.standings)], fontsize=8)
-    ax.set_ylim(-0.7, top + 0.7)
-    ax.set_xscale("log")
-    ax.set_xlabel(f"{summary.metric} over that of {summary.reference}, same replicate")
+        ax.plot(_inside(ratios), np.full(len(ratios), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
+        for beyond, edge, arrow in (
+            (ratios > LARGEST_RATIO, LARGEST_RATIO, ">"),
+            (ratios < 1 / LARGEST_RATIO, 1 / LARGEST_RATIO, "<"),
+        ):
+            if beyond.any():
+                ax.plot([edge], [y], arrow, ms=6, color="C0", zorder=2)
+        if each.ratio is None:
+            continue
+        colour = "0.3"
+        if each.different:
+            colour = "C2" if each.ratio < 1 else "C3"
+        if each.low is not None and each.method != summary.reference:
+            ax.plot(_inside([each.low, each.high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
+        ax.plot(_inside([each.ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
-    ax.grid(axis="x", alpha=0.25)
-    low, high = ax.get_xlim()
-    subs: Any = [k / 10 for k in range(10, 100)]
-    if high / low > 3:
-        subs = (1, 2, 5)
-    elif high / low > 1.6:
-        subs = (1, 1.2, 1.5, 2, 2.5, 3, 5, 6, 7, 8, 9)
-    ax.xaxis.set_major_locator(LogLocator(subs=subs))
-    ax.xaxis.set_minor_locator(NullLocator())
-    ax.xaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
-    ax.xaxis.set_minor_formatter(NullFormatter())
-    return figure
+    label = f"{summary.metric} over that of {summary.reference}, same replicate"
+    return _finished(ax, [each.method for each in summary.standings], label)
 
 
 def _inside(ratios: Any) -> Any:
     return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
+
+
+def _finished(ax: Any, names: Sequence[str], label: str) -> Figure:
+    """Return the figure of axes with named rows from top to bottom, logarithmic along x."""
+    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.set_ylim(len(names) - 0.3, -0.7)
+    ax.set_xlabel(label)
+    ax.grid(axis="x", alpha=0.25)
+    logarithmic(ax, "x")
+    return ax.figure

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -26,6 +26,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance, load
+from rpim_opt.store.problem_file import find_problem
 from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED
 from rpim_opt.study.replicates import Row
 from rpim_opt.use.validation import validate
@@ -44,74 +45,79 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     **{name: getattr(baselines, name) for name in baselines.__all__},
 }
 """Methods without convex programming; ``nominal`` fits base and tools alone."""
-Labelled = TypeVar("Labelled", bound=Any)
+Thing = TypeVar("Thing")
+Problem = Instance | Callable[[int], Any]
+"""A problem, or a function of a seed with another problem for every seed."""
 
 
-def each_once(where: str, labelled: Sequence[Labelled], what: str) -> tuple[Labelled, ...]:
-    """Return things with labels as a tuple; InputError for a label that occurs twice."""
-    twice = [label for label, count in Counter(each.label for each in labelled).items() if count > 1]
-    if twice:
-        raise InputError(where, f"'{twice[0]}' twice", f"a unique name for each: {{'a name': {what}}}")
-    return tuple(labelled)
+# --- by names --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Source:
-    """A named problem, or a function of a seed with another problem for every seed."""
-
-    label: str
-    problem: Instance | Callable[[int], Any]
-
-    @property
-    def drawn(self) -> bool:
-        """Whether it depends on a seed."""
-        return not isinstance(self.problem, Instance)
-
-    def instance(self, seed: int) -> Instance:
-        """Return the instance of a seed."""
-        if isinstance(self.problem, Instance):
-            return self.problem
-        instance = _instance(self.problem(seed), self.label)
-        if instance is None:
-            raise InputError(f"problem {self.label}", f"a function of a seed that returns no problem ({seed})", RETURNS)
-        return instance
+def listed(stated: Any) -> list[tuple[str, Any]]:
+    """Return what stands alone, in a list or under names, with its name, which is empty without one."""
+    if isinstance(stated, Mapping):
+        return [(str(label), each) for label, each in stated.items()]
+    if isinstance(stated, str) or callable(stated) or not isinstance(stated, Iterable):
+        return [("", stated)]
+    return [("", each) for each in stated]
 
 
-def sources_of(problems: Any) -> tuple[Source, ...]:
-    """Return the problems of a comparison; InputError for anything else, and for duplicate names."""
-    sources = each_once("problems", list(_sources(problems)), "problem")
-    if not sources:
+def _by_name(where: str, named: Iterable[tuple[str, Thing]]) -> dict[str, Thing]:
+    pairs = list(named)
+    for name, count in Counter(name for name, _ in pairs).items():
+        if count > 1:
+            raise InputError(where, f"'{name}' twice", "a unique name for each: {'a name': ...}")
+    return dict(pairs)
+
+
+def _function(label: str, each: Any, ready: Mapping[str, Any], where: str, argument: str) -> tuple[str, Any]:
+    """Return name and function of what is stated as a function, or by the name of a ready one."""
+    if isinstance(each, str):
+        return label or each, pick(ready, each, where, also=f"a function of {argument}, ")
+    if not callable(each):
+        raise InputError(where, f"{each!r}", f"functions of {argument}, or {', '.join(ready)}")
+    return label or _name(each), each
+
+
+def _name(function: Any) -> str:
+    return getattr(function, "__name__", type(function).__name__)
+
+
+# --- problems --------------------------------------------------------------------------------------------------------
+
+
+def problems_of(stated: Any) -> dict[str, Problem]:
+    """Return the problems of a comparison by their names; InputError for anything else, and for duplicate names."""
+    problems = _by_name("problems", _problems(stated))
+    if not problems:
         raise InputError("problems", "none", ACCEPTED)
-    return sources
+    return problems
 
 
-def _sources(problems: Any, label: str = "") -> Iterator[Source]:
-    instance = _instance(problems, label)
-    if isinstance(problems, Mapping):
-        for name, problem in problems.items():
-            yield from _sources(problem, str(name))
-    elif isinstance(problems, str | Path):
-        place = Path(problems)
-        paths: list[str | Path] = [problems]
-        if not label and place.is_dir() and not (place / "problem.toml").is_file():
-            paths = [each.parent for each in sorted(place.glob("*/problem.toml"))]
+def _problems(stated: Any, label: str = "") -> Iterator[tuple[str, Problem]]:
+    instance = _instance(stated, label)
+    if instance is not None:
+        yield label or instance.record.title or instance.problem.robot.name, instance
+    elif isinstance(stated, Mapping):
+        for name, problem in stated.items():
+            yield from _problems(problem, str(name))
+    elif isinstance(stated, str | Path):
+        paths: list[str | Path] = [stated]
+        if not label and Path(stated).is_dir() and not Path(stated, "problem.toml").is_file():
+            paths = [each.parent for each in sorted(Path(stated).glob("*/problem.toml"))]
         if not paths:
-            raise InputError("problems", f"no problem.toml in '{place}' or a folder in it", ACCEPTED)
+            raise InputError("problems", f"no problem.toml in '{Path(stated)}' or a folder in it", ACCEPTED)
         for path in paths:
-            place = Path(path)
-            name = place.parent.name if place.name == "problem.toml" else place.name
-            yield Source(label or name or str(path), load(path))
-    elif instance is not None:
-        yield Source(label or instance.record.title or instance.problem.robot.name, instance)
-    elif isinstance(problems, Iterable) and not label:
-        for problem in problems:
-            yield from _sources(problem)
-    elif isinstance(problems, Program):
+            yield label or find_problem(path).name or str(path), load(path)
+    elif isinstance(stated, Iterable) and not label:
+        for problem in stated:
+            yield from _problems(problem)
+    elif isinstance(stated, Program):
         raise InputError("problems", "a program", f"{ACCEPTED}; ro.select.compare compares selectors on a program")
-    elif callable(problems):
-        yield Source(label or getattr(problems, "__name__", type(problems).__name__), problems)
+    elif callable(stated):
+        yield label or _name(stated), stated
     else:
-        raise InputError("problems", f"a {type(problems).__name__}", ACCEPTED)
+        raise InputError("problems", f"a {type(stated).__name__}", ACCEPTED)
 
 
 def _instance(given: Any, label: str) -> Instance | None:
@@ -126,70 +132,69 @@ def _instance(given: Any, label: str) -> Instance | None:
     return None
 
 
+def _drawn(problem: Problem, label: str, seed: int) -> Instance:
+    """Return a problem, or that of a seed."""
+    if isinstance(problem, Instance):
+        return problem
+    instance = _instance(problem(seed), label)
+    if instance is None:
+        raise InputError(f"problem {label}", f"a function of a seed that returns no problem ({seed})", RETURNS)
+    return instance
+
+
 # --- what is held out ------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class Split:
-    """A split of configurations: a random fraction held out, or folds."""
-
-    label: str
-    part: float = 0.0
-    folds: int = 1
-
-    def held_out(self, data: Dataset, fold: int, seed: int) -> np.ndarray:
-        """Return which rows (N,) are held out; all rows of a configuration are, or none."""
-        known = np.unique(data.configuration)
-        drawn = np.random.default_rng(seed).permutation(known)
-        if self.part:
-            count = min(max(round(self.part * len(known)), 1), len(known) - 1)
-            return np.isin(data.configuration, drawn[:count])
-        if len(known) < self.folds:
-            found = f"{len(known)} configurations"
-            raise InputError("splits", found, f"at least {self.folds} for {self.folds} folds")
-        return np.isin(data.configuration, np.array_split(drawn, self.folds)[fold - 1])
-
-
-def splits_of(stated: Any) -> tuple[Split, ...]:
-    """Return the splits: ``"folder"``, a fraction (0.25), a number of folds (5), or several of them."""
-    several = isinstance(stated, Sequence) and not isinstance(stated, str) and stated
-    parts: list[Any] = list(stated) if several else [stated]
-    splits = []
-    for each in parts:
-        number = isinstance(each, int | float) and not isinstance(each, bool)
+def splits_of(stated: Any) -> dict[str, float]:
+    """Return by name what is held out: ``"folder"`` 0, a fraction (0.25), or in how many folds (5)."""
+    splits: dict[str, float] = {}
+    for _, each in listed(stated) or [("", stated)]:
+        size = each if isinstance(each, int | float) and not isinstance(each, bool) else 0
         if each == FOLDER:
-            splits.append(Split(FOLDER))
-        elif number and 0 < each < 1:
-            splits.append(Split(f"{each:g} held out", part=float(each)))
-        elif number and 2 <= each <= MOST_FOLDS and each == int(each):
-            splits.append(Split(f"{int(each)} folds", folds=int(each)))
+            splits[FOLDER] = 0
+        elif 0 < size < 1:
+            splits[f"{size:g} held out"] = size
+        elif 2 <= size <= MOST_FOLDS and size == int(size):
+            splits[f"{int(size)} folds"] = int(size)
         else:
             accepted = f"'folder', a fraction of the configurations between 0 and 1, or folds, 2 to {MOST_FOLDS}"
             raise InputError("splits", f"{each!r}", accepted)
-    return tuple(dict.fromkeys(splits))
+    return splits
 
 
-def divide(instance: Instance, split: Split, fold: int, count: int | None, noise: float, seed: int) -> Instance:
-    """Return an instance with the data to fit, and the held-out data as its validation data.
+def _held_out(data: Dataset, split: float, fold: int, seed: int) -> np.ndarray:
+    """Return which rows (N,) a fraction or a fold (from 1) holds out; all rows of a configuration are, or none."""
+    known = np.unique(data.configuration)
+    drawn = np.random.default_rng(seed).permutation(known)
+    if split < 1:
+        count = min(max(round(split * len(known)), 1), len(known) - 1)
+        return np.isin(data.configuration, drawn[:count])
+    if len(known) < split:
+        raise InputError("splits", f"{len(known)} configurations", f"at least {split} for {split} folds")
+    return np.isin(data.configuration, np.array_split(drawn, int(split))[fold - 1])
 
-    Of the configurations that a split's fold (from 1) leaves, ``count`` are fitted, drawn at random, or all; their
-    noise is ``noise`` times what it was. InputError for fewer configurations, or nothing that is held out.
+
+def _divided(instance: Instance, split: float, case: Mapping[str, Any]) -> tuple[Instance, Dataset]:
+    """Return an instance with the data to fit, and the held-out data; InputError where nothing is held out.
+
+    Of the configurations that the split leaves, ``count`` are fitted, drawn at random, or all.
     """
+    seed = case["seed"]
     data = instance.problem.data
     held_out = instance.validation
-    if split.label != FOLDER:
-        held = split.held_out(data, fold, seed)
+    if split:
+        held = _held_out(data, split, case["fold"], seed)
         held_out = data.take(np.flatnonzero(held))
         data = data.take(np.flatnonzero(~held))
     if held_out is None:
-        raise InputError(
-            "splits", "no validation data", "a folder with validation data, a fraction (0.25), or folds (5)"
-        )
-    if count is not None:
-        data = data.configurations(count, seed)
-    if noise > 1:
-        data = add_noise(data, noise, seed)
-    return replace(instance, problem=instance.problem.on(data), record=replace(instance.record, validation=held_out))
+        accepted = "a folder with validation data, a fraction (0.25), or folds (5)"
+        raise InputError("splits", "no validation data", accepted)
+    if case["count"] is not None:
+        data = data.configurations(case["count"], seed)
+    if case["noise_factor"] > 1:
+        data = add_noise(data, case["noise_factor"], seed)
+    record = replace(instance.record, validation=held_out)
+    return replace(instance, problem=instance.problem.on(data), record=record), held_out
 
 
 def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
@@ -211,42 +216,90 @@ def add_noise(data: Dataset, factor: float, seed: int) -> Dataset:
 # --- methods ---------------------------------------------------------------------------------------------------------
 
 
-Answer = tuple[Callable[[Dataset, str], Array], Calibration | None]
-"""Errors (N,) of data by dimension [m or rad] that a method leaves, and its calibration, if any."""
-
-
 @dataclass(frozen=True, eq=False)
 class Method:
-    """A method: its names in the rows, and its function of an instance, whose result `answer_of` interprets."""
+    """A calibration with ``settings`` in place of the folder's, or a ``function`` of the problem (`errors_by`)."""
 
-    label: str
-    solve: Callable[[Instance], Any]
     formulation: str = NONE
     selector: str = NONE
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    function: Callable[[CalibrationProblem], Any] | None = None
 
 
-def answer_of(returned: Any, problem: CalibrationProblem, label: str) -> Answer:
-    """Interpret the result of a method: a calibration, a baseline, x (n,), or a function of q (N, dof).
+def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mapping[str, Any]) -> dict[str, Method]:
+    """Return every formulation with every selector, then the functions; InputError for unknown or repeated names.
 
-    Instead of x alone it may be a problem that identifies other parameters, and x; InputError for anything else.
+    A formulation without penalty has no weight: it is there once.
     """
-    where = f"method {label}"
+    methods: list[tuple[str, Method]] = []
+    weights = [_weight(label, each) for label, each in listed(selectors)]
+    for own_name, each in listed(formulations):
+        name = own_name or FOLDER
+        settings = dict(options)
+        choices = weights
+        if each != FOLDER:
+            formulation = formulation_of(each)
+            ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
+            name = own_name or (each if isinstance(each, str) else ready)
+            settings["formulation"] = formulation
+            if formulation.penalty is None:
+                choices = [(NONE, {"weight": 0.0})]
+        for selector, weight in choices:
+            label = name if selector == NONE else f"{name}, {selector}"
+            if name == selector == FOLDER:
+                label = "as in the folder"
+            methods.append((label, Method(name, selector, settings | weight)))
+    for label, each in listed(functions):
+        name, function = _function(label, each, BASELINES, "methods", "the problem")
+        methods.append((name, Method(function=function)))
+    if not methods:
+        raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
+    return _by_name("methods", methods)
+
+
+def _weight(label: str, each: Any) -> tuple[str, dict[str, Any]]:
+    """Return the name of a selector or weight, and the setting that it is; the folder's own is none."""
+    if each is None:
+        each = LEARNED
+    if each == FOLDER:
+        return label or FOLDER, {}
+    if isinstance(each, str):
+        return label or each, {"weight": weight_of(each)}
+    if callable(each):
+        ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
+        return label or ready, {"weight": each}
+    if isinstance(each, bool) or not isinstance(each, int | float | np.number):
+        accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}"
+        raise InputError("selectors", f"{each!r}", accepted)
+    if isinstance(each, int):
+        each = number(each, "selectors")
+    weight = require_weight(float(each), "selectors")
+    return label or f"{weight:g}", {"weight": weight}
+
+
+def errors_by(returned: Any, problem: CalibrationProblem, label: str) -> Callable[[Dataset, str], Array]:
+    """Return the errors (N,) of data by dimension [m or rad] that a method's result leaves.
+
+    That is a calibration, a baseline, x (n,), or a function of q (N, dof); instead of x alone it may be a problem that
+    identifies other parameters, and x. InputError for anything else.
+    """
     match returned:
         case (CalibrationProblem() as problem, returned):
             pass
+    if isinstance(returned, Calibration):
+        return returned.errors
+    if callable(returned):
+        return partial(_predicted, returned)
     n = len(problem.parameters.free)
     accepted = f"{n} finite deviations [SI], or a function from joint values (N, dof) to positions (N, 3) [m]"
-    if isinstance(returned, Calibration):
-        return returned.errors, returned
-    if callable(returned):
-        return partial(_predicted, returned), None
     try:
         x = np.asarray(getattr(returned, "x", returned), dtype=float)
     except (TypeError, ValueError):
-        raise InputError(where, f"a {type(returned).__name__}", accepted) from None
+        raise InputError(f"method {label}", f"a {type(returned).__name__}", accepted) from None
     if x.shape != (n,) or not np.isfinite(x).all():
-        raise InputError(where, f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}", accepted)
-    return lambda data, dimension: problem.on(data).errors(x, dimension), None
+        found = f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}"
+        raise InputError(f"method {label}", found, accepted)
+    return lambda data, dimension: problem.on(data).errors(x, dimension)
 
 
 def _predicted(predict: Callable[[Array], Any], data: Dataset, dimension: str) -> Array:
@@ -263,82 +316,6 @@ def _predicted(predict: Callable[[Array], Any], data: Dataset, dimension: str) -
     errors = np.empty(len(data))
     errors[block.row] = np.linalg.norm(block.y - predicted, axis=1)
     return errors
-
-
-def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mapping[str, Any]) -> tuple[Method, ...]:
-    """Return every formulation with every selector, then the functions; InputError for unknown or repeated names.
-
-    A formulation without penalty has no weight: it is there once.
-    """
-    methods: list[Method] = []
-    weights = [_selector(label, each) for label, each in _listed(selectors)]
-    for own_name, each in _listed(formulations):
-        name = own_name or FOLDER
-        settings = dict(options)
-        pairs = weights
-        if each != FOLDER:
-            formulation = formulation_of(each)
-            ready = next((name for name, known in FORMULATIONS.items() if known is formulation), formulation.name)
-            name = own_name or (each if isinstance(each, str) else ready)
-            settings["formulation"] = formulation
-            if formulation.penalty is None:
-                pairs = [(NONE, 0.0)]
-        for selector, weight in pairs:
-            label = name if selector == NONE else f"{name}, {selector}"
-            if name == selector == FOLDER:
-                label = "as in the folder"
-            own = settings if selector == FOLDER else {**settings, "weight": weight}
-            methods.append(Method(label, partial(Instance.calibrate, **own), name, selector))
-    for label, each in _listed(functions):
-        name, function = _named(label, each, BASELINES, "methods", "the problem")
-        methods.append(Method(name, partial(_of_problem, function)))
-    if not methods:
-        raise InputError("formulations", "none", f"names ({', '.join(FORMULATIONS)}), objects, or methods")
-    return each_once("methods", methods, "...")
-
-
-def _of_problem(function: Callable[[CalibrationProblem], Any], instance: Instance) -> Any:
-    return function(instance.problem)
-
-
-def _listed(stated: Any) -> list[tuple[str, Any]]:
-    """Return what stands alone, in a list or under names, with its name, which is empty without one."""
-    if isinstance(stated, Mapping):
-        return [(str(label), each) for label, each in stated.items()]
-    if isinstance(stated, str) or callable(stated) or not isinstance(stated, Iterable):
-        return [("", stated)]
-    return [("", each) for each in stated]
-
-
-def _named(label: str, each: Any, ready: Mapping[str, Any], where: str, argument: str) -> tuple[str, Any]:
-    """Return name and function of what is stated as a function, or by the name of a ready one."""
-    if isinstance(each, str):
-        return label or each, pick(ready, each, where, also=f"a function of {argument}, ")
-    if not callable(each):
-        raise InputError(where, f"{each!r}", f"functions of {argument}, or {', '.join(ready)}")
-    return label or _name(each), each
-
-
-def _name(function: Any) -> str:
-    return getattr(function, "__name__", type(function).__name__)
-
-
-def _selector(label: str, each: Any) -> tuple[str, Any]:
-    """Return the name of a selector or weight, and what it is."""
-    if each is None:
-        each = LEARNED
-    if isinstance(each, str):
-        return label or each, each if each == FOLDER else weight_of(each)
-    if callable(each):
-        ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
-        return label or ready, each
-    if isinstance(each, bool) or not isinstance(each, int | float | np.number):
-        accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}"
-        raise InputError("selectors", f"{each!r}", accepted)
-    if isinstance(each, int):
-        each = number(each, "selectors")
-    weight = require_weight(float(each), "selectors")
-    return label or f"{weight:g}", weight
 
 
 # --- metrics ---------------------------------------------------------------------------------------------------------
@@ -401,45 +378,40 @@ USUAL = ("rms_mm", "mean_mm", "max_mm", "seconds")
 
 def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
     """Return metrics by their names with units; InputError for anything else."""
-    metrics = dict(_named(label, each, METRICS, "metrics", "a fit") for label, each in _listed(stated))
+    metrics = dict(_function(label, each, METRICS, "metrics", "a fit") for label, each in listed(stated))
     if not metrics:
         raise InputError("metrics", "none", f"functions of a fit, or {', '.join(METRICS)}")
     return metrics
-
-
-def measure(instance: Instance, answer: Answer, seconds: float, metrics: Mapping[str, Any]) -> dict[str, float | None]:
-    """Return the metrics of a result; None for a metric that is not finite."""
-    if instance.validation is None:
-        raise InputError("splits", "nothing held out", "validation data")
-    fitted = Fitted(instance.problem, instance.validation, *answer, seconds)
-    values = {name: metric(fitted) for name, metric in metrics.items()}
-    return {name: float(v) if v is not None and np.isfinite(v) else None for name, v in values.items()}
 
 
 # --- a replicate -----------------------------------------------------------------------------------------------------
 
 
 def replicate(
-    source: Source, split: Split, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
+    problem: Problem, split: float, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
 ) -> Row:
-    """Return the metrics of a method on one split of a problem; a failure becomes a status and a reason."""
+    """Return the metrics of a method on one split of a problem; a failure becomes a status and a reason.
+
+    A metric that is not finite is None.
+    """
     row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
-    seed = case["seed"]
     try:
-        instance = divide(source.instance(seed), split, case["fold"], case["count"], case["noise_factor"], seed)
+        instance, held_out = _divided(_drawn(problem, case["problem"], case["seed"]), split, case)
         begun = time.perf_counter()
-        returned = method.solve(instance)
+        returned = method.function(instance.problem) if method.function else instance.calibrate(**method.settings)
         seconds = time.perf_counter() - begun
-        answer = answer_of(returned, instance.problem, method.label)
-        values = measure(instance, answer, seconds, metrics)
+        result = returned if isinstance(returned, Calibration) else None
+        errors = errors_by(returned, instance.problem, case["method"])
+        fitted = Fitted(instance.problem, held_out, errors, result, seconds)
+        values = {name: metric(fitted) for name, metric in metrics.items()}
+        values = {name: float(v) if v is not None and np.isfinite(v) else None for name, v in values.items()}
         row["configurations"] = len(np.unique(instance.problem.data.configuration))
         row["parameters"] = len(instance.problem.parameters.free)
-        result = answer[1]
         if result is not None:
             row["weight"] = float(result.weight)
             if not result.converged:
                 row |= {"status": UNCONVERGED, "reason": result.message}
-        return {**row, **values}
+        return row | values
     except InputError as error:
         row |= {"status": IMPOSSIBLE, "reason": str(error)}
     except Exception as error:  # somebody's function, a solver: the other replicates go on

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table, listed, table
 
@@ -134,15 +135,24 @@ def number(value: float | None) -> str:
     return f"{value:.3g}"
 
 
-def summarize(rows: Rows, metric: str, reference: str, drawn: AbstractSet[str]) -> Summary:
-    """Return the methods in order, each against a reference; ``drawn`` are problems that depend on a seed."""
+def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[str]) -> Summary:
+    """Return the methods in order, each against a reference, by default the first method that has figures.
+
+    ``drawn`` are problems that depend on a seed. InputError for a reference that is unknown or has no figures.
+    """
     of = figures(rows, metric)
-    other = of[reference]
+    with_figures = [method for method, values in of.items() if values]
+    if against is None and not with_figures:
+        found = f"no replicate with results; {rows[0]['status']}: {rows[0]['reason']}"
+        raise InputError("comparison", found, "one")
+    reference = with_figures[0] if against is None else against
+    other = pick(of, reference, "against")
+    if not other:
+        raise InputError("against", f"'{against}', which has no results", "a method with results")
     least = np.finfo(float).tiny  # figures that are zero are as good as a rounding error
     known = []
-    for method, own in of.items():
-        if not own:
-            continue
+    for method in with_figures:
+        own = of[method]
         mine = [row for row in rows if row["method"] == method]
         logs = {pair: math.log(max(own[pair], least) / max(other[pair], least)) for pair in own if pair in other}
         compared = {_pair(row) for row in mine} & (set(own) | set(other))
@@ -210,24 +220,21 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
 
 
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> tuple[str, ...]:
-    """Return the notes below the table."""
+    """Return the notes below the table: of what the ratios and intervals speak, and what has no results."""
     notes = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
     compared = sum(each.low is not None and each.method != reference for each in standings)
-    if compared:
-        problems = {row["problem"] for row in rows}
+    problems = {row["problem"] for row in rows}
+    if len(problems) >= ENOUGH:
         scope = f"other problems like these {len(problems)}"
-        if len(problems) < ENOUGH:
-            of_generator = problems <= drawn
-            scope = (
-                "other arms of the same generator"
-                if of_generator
-                else "these problems alone, with other seeds or folds"
-            )
+    elif problems <= drawn:
+        scope = "other arms of the same generator"
+    else:
+        scope = "these problems alone, with other seeds or folds"
+    if compared:
         text = f"Intervals refer to {scope} (bootstrap, {CONFIDENCE:.0%}); * excludes 1."
         if compared > 1:
-            chance = (1 - CONFIDENCE) * compared
             text += " No correction for multiple comparisons: without any difference, "
-            text += f"{chance:.2g} of {compared} would be marked by chance."
+            text += f"{(1 - CONFIDENCE) * compared:.2g} of {compared} would be marked by chance."
         notes.append(text)
     elif len(standings) > 1:
         few = f"fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one"
@@ -241,9 +248,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         if row["status"] not in WITH_FIGURES:
             without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
     for (method, status, reason), missing in without.items():
-        where = ""
-        if len(missing) < every[method]:
-            where = f" ({listed(list(dict.fromkeys(missing)), 4)})"
+        where = f" ({listed(list(dict.fromkeys(missing)), 4)})" if len(missing) < every[method] else ""
         count = f"{len(missing)} of {every[method]} replicates{where}"
         notes.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
     return tuple(notes)

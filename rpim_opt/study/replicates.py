@@ -146,17 +146,10 @@ def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[s
     """
     if workers == 0:
         raise InputError("workers", "0", "one or more, or -1 for all processors")
-    if workers != 1:
-        require_package("joblib", "workers")
-        return _in_processes(tasks, workers)
-    return (_computed(*task) for task in tasks)
-
-
-def _computed(key: str, work: Work) -> tuple[str, Row]:
-    return key, work()
-
-
-def _in_processes(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:
+    if workers == 1:
+        yield from (_computed(*task) for task in tasks)
+        return
+    require_package("joblib", "workers")
     from joblib import Parallel, delayed
 
     answer = None
@@ -173,6 +166,10 @@ def _in_processes(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[t
         raise RpimError(
             f"A process ended before its replicate was finished: {error} Finished replicates are kept."
         ) from None
+
+
+def _computed(key: str, work: Work) -> tuple[str, Row]:
+    return key, work()
 
 
 # --- what made them --------------------------------------------------------------------------------------------------
@@ -243,6 +240,13 @@ def provenance() -> dict[str, str]:
 
 
 # --- what a comparison's replicates follow from ---------------------------------------------------------------------
+
+
+def code_of(inputs: Mapping[str, Any]) -> dict[str, str]:
+    """Return digests of the package, of a script, and of what it compares, by what that is called."""
+    require_package("joblib", "journal")
+    hashes = {f"set of {name}": content_hash(value, "journal") for name, value in inputs.items()}
+    return package_code() | script_code() | hashes
 
 
 def script_code() -> dict[str, str]:

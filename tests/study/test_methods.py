@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.methods import METRICS, Fitted, answer_of, measure, methods_of
+from rpim_opt.study.methods import METRICS, methods_of
 
 POSITION = ro.load("position")
 OWN = ro.Formulation("squares", penalty=cp.sum_squares)
@@ -20,7 +20,7 @@ def by_hand(problem: ro.CalibrationProblem) -> float:
 
 
 def labels(formulations: Any, selectors: Any, functions: Any = ()) -> list[str]:
-    return [method.label for method in methods_of(formulations, selectors, functions, {})]
+    return list(methods_of(formulations, selectors, functions, {}))
 
 
 def test_methods_are_called_as_a_person_calls_them() -> None:
@@ -36,36 +36,37 @@ def test_methods_are_called_as_a_person_calls_them() -> None:
     assert labels((), (), [by_hand, "nominal"]) == ["by_hand", "nominal"]
 
 
+def predicting(problem: ro.CalibrationProblem) -> Any:
+    result = ro.calibrate(problem, ro.tikhonov, 1.0)
+    return lambda q: result.forward(q)[:, :3, 3]
+
+
 def test_what_a_method_predicts_is_measured_as_what_it_calibrates() -> None:
-    result = POSITION.calibrate(weight=1.0)
-    held_out = POSITION.validation
-    assert held_out is not None
-    predicts = answer_of(lambda q: result.forward(q)[:, :3, 3], result.problem, "")
-    of = {
-        name: measure(POSITION, answer, 2.0, METRICS)
-        for name, answer in {"calibrates": answer_of(result, result.problem, ""), "predicts": predicts}.items()
-    }
-    same = ("rms_mm", "mean_mm", "p95_mm", "max_mm", "fit_rms_mm", "seconds")
-    assert [of["predicts"][name] for name in same] == pytest.approx([of["calibrates"][name] for name in same], rel=1e-9)
-    assert of["calibrates"]["rms_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(result.errors(held_out) ** 2)))
-    assert of["calibrates"]["covered_percent"] > 80  # of rows without noise, in intervals of 95 %
-    assert of["predicts"]["covered_percent"] is None  # knows no intervals
-    assert of["predicts"]["rms_mrad"] is None  # of positions
+    found = ro.compare(
+        "position", selectors=1.0, methods={"predicts": predicting}, metrics=list(METRICS), progress=False
+    )
+    calibrates, predicts = found.rows
+    same = ("rms_mm", "mean_mm", "p95_mm", "max_mm", "fit_rms_mm")
+    assert [predicts[name] for name in same] == pytest.approx([calibrates[name] for name in same], rel=1e-9)
+    errors = POSITION.calibrate(weight=1.0).errors(POSITION.validation)
+    assert calibrates["rms_mm"] == pytest.approx(1e3 * np.sqrt(np.mean(errors**2)))
+    assert calibrates["covered_percent"] > 80  # of rows without noise, in intervals of 95 %
+    assert predicts["covered_percent"] is None  # knows no intervals
+    assert predicts["rms_mrad"] is None  # of positions
+    assert min(row["seconds"] for row in found.rows) > 0
 
 
 @pytest.mark.parametrize("returned", [np.zeros((3, 2)), np.full(34, np.nan), "text", None])
 def test_what_is_no_answer_is_refused(returned: Any) -> None:
-    with pytest.raises(ro.InputError, match="34 finite deviations"):
-        answer_of(returned, POSITION.problem, "mine")
+    found = ro.compare("position", (), methods={"mine": lambda problem: returned}, progress=False)
+    assert found.rows[0]["status"] == "impossible"
+    assert "34 finite deviations" in found.rows[0]["reason"]
 
 
 def test_predictions_have_the_shape_of_positions() -> None:
-    assert POSITION.validation is not None
-    wrong = Fitted(POSITION.problem, POSITION.validation, *answer_of(lambda q: q, POSITION.problem, ""), 0.0)
-    with pytest.raises(ro.InputError, match="predicted positions"):
-        wrong.errors()
-    pose = ro.load("pose")
-    assert pose.validation is not None
-    other = Fitted(pose.problem, pose.validation, *answer_of(lambda q: q[:, :3], pose.problem, ""), 0.0)
-    with pytest.raises(ro.InputError, match="one reflector"):
-        other.errors()
+    for name, returned, said in (
+        ("position", lambda q: q, "predicted positions: found shape"),
+        ("pose", lambda q: q[:, :3], "one reflector"),
+    ):
+        found = ro.compare(name, (), methods={"mine": lambda problem, returned=returned: returned}, progress=False)
+        assert said in found.rows[0]["reason"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.methods import sources_of, splits_of
+from rpim_opt.study.methods import problems_of
 from rpim_opt.study.ranking import UNCONVERGED, number
 from rpim_opt.study.studies import Report, load_study, write
 from tests import ROOT
@@ -95,24 +95,20 @@ def test_a_method_without_figures_is_not_drawn() -> None:
 
 def test_problems_come_as_a_pair_or_as_a_file() -> None:
     pair = (POSITION.problem, POSITION.validation)
-    (alone,) = sources_of(pair)
-    assert (alone.label, alone.instance(0).problem) == ("ABB IRB 120-3/0.58", POSITION.problem)
-    (file,) = sources_of(ROOT / "problems" / "position" / "problem.toml")
-    assert file.label == "position"
+    assert problems_of(pair)["ABB IRB 120-3/0.58"].problem == POSITION.problem
+    assert list(problems_of(ROOT / "problems" / "position" / "problem.toml")) == ["position"]
 
 
 def test_a_generator_returns_problems() -> None:
-    (generator,) = sources_of({"mine": lambda seed: seed})
-    with pytest.raises(ro.InputError, match=r"problem mine: found a function of a seed that returns no problem \(7\)"):
-        generator.instance(7)
+    found = ro.compare({"mine": lambda seed: seed}, selectors=1.0, seeds=[7], progress=False)
+    assert "problem mine: found a function of a seed that returns no problem (7)" in found.rows[0]["reason"]
 
 
 def test_folds_need_as_many_configurations() -> None:
-    (five,) = splits_of([5])
     data = POSITION.problem.data
-    few = data.take(np.flatnonzero(data.configuration < 4))
-    with pytest.raises(ro.InputError, match="splits: found 4 configurations, accepted: at least 5 for 5 folds"):
-        five.held_out(few, 1, 0)
+    few = POSITION.problem.on(data.take(np.flatnonzero(data.configuration < 4)))
+    found = ro.compare(few, selectors=1.0, splits=5, progress=False)
+    assert "splits: found 4 configurations, accepted: at least 5 for 5 folds" in found.rows[0]["reason"]
 
 
 def test_a_study_is_a_python_file(tmp_path: Path) -> None:
