@@ -1,10 +1,10 @@
 from .arms import SimulatedArm as SimulatedArm
 from .arms import simulated_arm as simulated_arm
 from .comparison import Comparison as Comparison
+from .comparison import Standing as Standing
+from .comparison import Summary as Summary
 from .comparison import compare as compare
 from .figures import distributions as distributions
 from .methods import Fitted as Fitted
-from .ranking import Standing as Standing
-from .ranking import Summary as Summary
 from .studies import Metric as Metric
 from .studies import Report as Report

@@ -10,8 +10,8 @@ import numpy as np
 from matplotlib import rc_context
 from matplotlib.figure import Figure
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.report.plot import logarithmic
-from rpim_opt.study.ranking import Rows, Summary, figures
 
 ROW_INCHES = 0.25
 """Height of a method."""
@@ -49,36 +49,30 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     return _finished(ax, list(values), label)
 
 
-def comparison_figure(rows: Rows, summary: Summary) -> Any:
-    """Return the figure: methods from best to worst, ratios of replicates as dots, the mean with its interval."""
-    height = max(ROW_INCHES * len(summary.standings) + 1.5, 3.5)
-    figure = Figure(figsize=(7, height), dpi=150, layout="constrained")
+def comparison_figure(ratios: Mapping[str, Array], means: Mapping[str, Sequence[float | None]], label: str) -> Any:
+    """Return the figure: methods from top to bottom, their ratios as dots, the mean with the ends of its interval."""
+    figure = Figure(figsize=(7, max(ROW_INCHES * len(ratios) + 1.5, 3.5)), dpi=150, layout="constrained")
     ax = figure.add_subplot()
-    of = figures(rows, summary.metric)
-    other = of[summary.reference]
     ax.axvline(1, color="0.4", lw=1, zorder=1)
-    for y, each in enumerate(summary.standings):
-        own = of[each.method]
-        ratios = np.array([own[pair] / other[pair] for pair in own if other.get(pair)])
-        alpha = min(0.5, 3 / max(len(ratios), 1) ** 0.5)
-        ax.plot(_inside(ratios), np.full(len(ratios), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
+    for y, (method, values) in enumerate(ratios.items()):
+        alpha = min(0.5, 3 / max(len(values), 1) ** 0.5)
+        ax.plot(_inside(values), np.full(len(values), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
         for beyond, edge, arrow in (
-            (ratios > LARGEST_RATIO, LARGEST_RATIO, ">"),
-            (ratios < 1 / LARGEST_RATIO, 1 / LARGEST_RATIO, "<"),
+            (values > LARGEST_RATIO, LARGEST_RATIO, ">"),
+            (values < 1 / LARGEST_RATIO, 1 / LARGEST_RATIO, "<"),
         ):
             if beyond.any():
                 ax.plot([edge], [y], arrow, ms=6, color="C0", zorder=2)
-        if each.ratio is None:
-            continue
+        mean, low, high = means[method]
         colour = "0.3"
-        if each.different:
-            colour = "C2" if each.ratio < 1 else "C3"
-        if each.low is not None and each.method != summary.reference:
-            ax.plot(_inside([each.low, each.high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
-        ax.plot(_inside([each.ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
+        if low is not None and high is not None:
+            if high < 1 or low > 1:
+                colour = "C2" if high < 1 else "C3"
+            ax.plot(_inside([low, high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
+        if mean is not None:
+            ax.plot(_inside([mean]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
-    label = f"{summary.metric} over that of {summary.reference}, same replicate"
-    return _finished(ax, [each.method for each in summary.standings], label)
+    return _finished(ax, list(ratios), label)
 
 
 def _inside(ratios: Any) -> Any:

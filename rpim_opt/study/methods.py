@@ -27,8 +27,6 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance, load
 from rpim_opt.store.problem_file import find_problem
-from rpim_opt.study.ranking import FAILED, IMPOSSIBLE, OK, UNCONVERGED
-from rpim_opt.study.replicates import Row
 from rpim_opt.use.validation import validate
 
 ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed that returns one"
@@ -45,6 +43,14 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     **{name: getattr(baselines, name) for name in baselines.__all__},
 }
 """Methods without convex programming; ``nominal`` fits base and tools alone."""
+OK = "ok"
+UNCONVERGED = "not converged"
+IMPOSSIBLE = "impossible"
+FAILED = "failed"
+WITH_FIGURES = (OK, UNCONVERGED)
+"""Statuses of replicates that have figures."""
+Row = dict[str, Any]
+"""A replicate: its case, status and figures."""
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]
 """A problem, or a function of a seed with another problem for every seed."""

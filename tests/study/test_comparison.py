@@ -295,12 +295,12 @@ def test_a_journal_of_other_arguments_is_not_resumed(tmp_path: Path, change: dic
 
 
 def test_a_journal_knows_the_package_that_computed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    from rpim_opt.study import replicates
+    from rpim_opt.study import studies
 
     journal = tmp_path / "journal.sqlite"
     ro.compare("position", selectors=1.0, journal=journal, progress=False)
-    other = {**replicates.package_code(), "package": "0" * 64}
-    monkeypatch.setattr(replicates, "package_code", lambda: other)
+    other = {**studies.package_code(), "package": "0" * 64}
+    monkeypatch.setattr(studies, "package_code", lambda: other)
     with pytest.raises(ro.InputError, match="replicates of another package"):
         ro.compare("position", selectors=1.0, journal=journal, progress=False)
 
@@ -363,7 +363,7 @@ def test_ratios_are_of_pairs_and_failures_lose() -> None:
 
 @pytest.mark.parametrize("count", [5, 8, 20])
 def test_intervals_of_other_problems_cover_as_they_say(count: int) -> None:
-    from rpim_opt.study.ranking import interval
+    from rpim_opt.study.comparison import interval
 
     covered = []
     for seed in range(400):

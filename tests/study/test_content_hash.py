@@ -18,7 +18,7 @@ import scipy.sparse
 from scipy.interpolate import CubicSpline
 
 import rpim_opt as ro
-from rpim_opt.study.replicates import content_hash
+from rpim_opt.study.studies import content_hash
 from tests import ROOT
 
 
@@ -96,7 +96,7 @@ def test_use_changes_no_hash() -> None:
 
 
 def test_the_code_of_a_script_is_that_of_its_files(tmp_path: Path) -> None:
-    script = "import helper\nfrom rpim_opt.study.replicates import script_code\nprint(sorted(script_code().items()))\n"
+    script = "import helper\nfrom rpim_opt.study.studies import script_code\nprint(sorted(script_code().items()))\n"
     (tmp_path / "mine.py").write_text(script)
     said = []
     for helper, arguments in (("", []), ("", []), ("K = 2", []), ("", ["3"])):

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.methods import problems_of
-from rpim_opt.study.ranking import UNCONVERGED, number
+from rpim_opt.study.comparison import number
+from rpim_opt.study.methods import UNCONVERGED, problems_of
 from rpim_opt.study.studies import Report, load_study, write
 from tests import ROOT
 from tests.study.test_comparison import POSITION, rows_of

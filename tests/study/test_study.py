@@ -16,9 +16,8 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RpimError
-from rpim_opt.study import replicates, studies
-from rpim_opt.study.replicates import compute
-from rpim_opt.study.studies import run_study
+from rpim_opt.study import studies
+from rpim_opt.study.studies import compute, run_study
 from tests.test_cli import run
 
 TOY = """
@@ -298,13 +297,13 @@ def test_a_byte_of_a_journal_that_changed_costs_no_result(toy, tmp_path: Path) -
 def test_a_full_disk_below_a_journal_is_a_sentence(toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """And what was finished before it is resumed."""
     toy()
-    real = replicates.SCHEMA
-    monkeypatch.setattr(replicates, "SCHEMA", f"{real}\nPRAGMA max_page_count = 5;")
+    real = studies.SCHEMA
+    monkeypatch.setattr(studies, "SCHEMA", f"{real}\nPRAGMA max_page_count = 5;")
     path = tmp_path / "studies" / "toy.py"
     path.write_text(path.read_text().replace('    return {"value"', '    return {"long": 3000 * "x", "value"'))
     with pytest.raises(RpimError, match=r"replicates.sqlite: the journal cannot be read or written: .* full"):
         run_study("toy", out=tmp_path / "out")
-    monkeypatch.setattr(replicates, "SCHEMA", real)
+    monkeypatch.setattr(studies, "SCHEMA", real)
     done = [json.loads(key)["seed"] for key, _, _ in entries(tmp_path / "out" / "replicates.sqlite")]
     assert done
     (tmp_path / "log.txt").unlink()
