@@ -246,8 +246,8 @@ def compensate(
     oriented = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
     if payload_centre is not None:
         arm = replace(arm, gravity=arm.gravity.carrying(arm.gravity.payload, list(payload_centre)))
-    tooled = _Tooled.of(result, robot, tool, marker)
-    cell = _Cell.of(result, tooled, arm, pose if oriented else position, base, targets.torque is not None, robot)
+    kind = pose if oriented else position
+    cell = _Cell.of(result, robot, arm, kind, tool, marker, base, targets.torque is not None)
     N = len(targets.label)
     mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
     if payload is not None or payload_centre is not None:
@@ -276,7 +276,7 @@ def compensate(
     status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
     return Compensation(
-        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=tooled.point, limit=limit
+        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
     )
 
 
@@ -335,61 +335,56 @@ def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> 
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
 
-class _Tooled(NamedTuple):
-    """A robot's parameters, its deviations (p,), the covariance of those identified, and which point is moved."""
+def _tooled(
+    result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str
+) -> tuple[Parameters, Array, Array | None, str, str]:
+    """Return a robot's parameters with the tool, deviations (p,), covariance, reflector, and which point is moved.
 
-    parameters: Parameters
-    x: Array
-    covariance: Array | None
-    marker: str
-    point: str
-    stated: bool = False
-
-    @classmethod
-    def of(cls, result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str) -> _Tooled:
-        """Take a stated tool in the place of the first reflector, or a reflector as identified."""
-        whole = result.problem.parameters
-        places = whole.places_of(robot)
-        p = whole.of_robot(robot)
-        every = np.zeros(len(whole))
-        every[whole.identified] = result.x
-        x = every[places]
-        C = known_covariance(result)
+    A stated tool takes the place of the first reflector; a reflector is as identified. The covariance is that of the
+    identified parameters.
+    """
+    whole = result.problem.parameters
+    places = whole.places_of(robot)
+    p = whole.of_robot(robot)
+    every = np.zeros(len(whole))
+    every[whole.identified] = result.x
+    x = every[places]
+    C = known_covariance(result)
+    if C is not None:
+        own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
+        C = C[np.ix_(own, own)]
+    known = reflectors(p.names)
+    if tool is not None:
+        marker = known[0]
+    elif marker not in known:
+        raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+    at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
+    identified = p.identified.copy()
+    frame = p.values(x)[at]
+    if tool is not None:
+        frame = np.asarray(tool, dtype=float)
+        if frame.shape != (6,) or not np.isfinite(frame).all():
+            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+        identified[at] = False
         if C is not None:
-            own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
-            C = C[np.ix_(own, own)]
-        known = reflectors(p.names)
-        if tool is not None:
-            marker = known[0]
-        elif marker not in known:
-            raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
-        at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
-        nominal = p.nominal.copy()
-        if tool is not None:
-            frame = np.asarray(tool, dtype=float)
-            if frame.shape != (6,) or not np.isfinite(frame).all():
-                raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
-            nominal[at] = frame
-            x[at] = 0.0
-            identified = p.identified.copy()
-            identified[at] = False
-            if C is not None:
-                still = identified[p.identified]
-                C = C[np.ix_(still, still)]
-            point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
-            return cls(replace(p, nominal=nominal, identified=identified), x, C, marker, point, True)
-        nominal[at] = p.values(x)[at]
-        x[at] = 0.0
-        where = f"{'as identified, ' if p.identified[at].any() else ''}at {placed(nominal[at])} in the flange frame"
+            still = identified[p.identified]
+            C = C[np.ix_(still, still)]
+    point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
+    if tool is None:
+        where = f"{'as identified, ' if identified[at].any() else ''}at {placed(frame)} in the flange frame"
         point = f"Target point: the reflector, {where}; for the controller's TCP state --tool."
-        return cls(replace(p, nominal=nominal), x, C, marker, point)
+    nominal = p.nominal.copy()
+    nominal[at] = frame
+    x[at] = 0.0
+    return replace(p, nominal=nominal, identified=identified), x, C, marker, point
 
 
 class _Cell(NamedTuple):
     """The controller's robot, the identified one, and the uncertainty of where that is.
 
     ``problem`` has the robot's data, ``x`` are the deviations (n,) of its identified parameters and ``covariance``
-    theirs; ``noise`` is the covariance (k, k) [SI] of a reading, and ``level`` the noise's variance over it.
+    theirs; ``noise`` is the covariance (k, k) [SI] of a reading, ``level`` the noise's variance over it, and ``point``
+    a sentence on the point that is moved.
     """
 
     robot: Robot
@@ -403,43 +398,35 @@ class _Cell(NamedTuple):
     marker: str
     noise: Array
     level: float
+    point: str
 
     @classmethod
     def of(
-        cls,
-        result: Calibration,
-        tooled: _Tooled,
-        robot: Robot,
-        kind: Measurement,
-        base: bool,
-        torques: bool,
-        which: str,
-    ) -> _Cell:
+        cls, result: Calibration, which: str, robot: Robot, kind: Measurement, tool: Sequence[float] | Array | None,
+        marker: str, base: bool, torques: bool,
+    ) -> _Cell:  # fmt: skip
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
-        p = tooled.parameters
-        values = p.values(tooled.x)
-        nominal = dict(zip(p.names, p.nominal.tolist(), strict=True))
-        identified = dict(zip(p.names, values.tolist(), strict=True))
+        p, x, covariance, marker, point = _tooled(result, which, tool, marker)
+        values = p.values(x)
+        nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
         moved = np.eye(4)
         if base:
-            nominal_base, identified_base = (
-                numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified)
-            )
-            moved = np.linalg.inv(nominal_base) @ identified_base
+            stated, located = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
+            moved = np.linalg.inv(stated) @ located
         measured = result.problem.sample().alone(which) if which else result.problem
         repeatability = measured.repeatability
-        if repeatability is not None and tooled.stated:
+        if repeatability is not None and tool is not None:
             repeatability = replace(repeatability, at=values)
         problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability)
         noise = np.eye(len(kind.components)) * NO_NOISE
         noise[:3, :3] += position_noise(measured)
         require_same_torques(robot, p, measured_torques(problem.data), torques)
         loads = loads_on(robot, p, problem.data, torques)
-        prefix = tool_prefix(tooled.marker)
+        prefix = tool_prefix(marker)
         return cls(
             robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
-            Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, tooled.x[p.identified],
-            tooled.covariance, tooled.marker, noise, result.variance_factor,
+            Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
+            covariance, marker, noise, result.variance_factor, point,
         )  # fmt: skip
 
     def compensated(self, targets: Targets, largest: float) -> dict[str, Array]:

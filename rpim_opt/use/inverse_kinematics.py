@@ -11,9 +11,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.problem.row_functions import Loads
-from rpim_opt.robot.kinematics import FRAME, call_rows, chain, placed, product, transforms
+from rpim_opt.robot.kinematics import FRAME, call_rows, chain, placed, product
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.terms import motion
 
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
 STEP_TOLERANCE = 1e-10
@@ -50,22 +49,11 @@ class Arm(NamedTuple):
             return values.get(name, 0.0)
 
         configuration = loads.configuration(robot.joint_types, nominal.__getitem__, command)
-        terms = robot.model.terms
-        after = [ca.DM(before) @ T for T in transforms(robot.joint_types, configuration, value, terms)]
-        flange = chain(robot.joint_types, configuration, value, terms)
+        flange = chain(robot.joint_types, configuration, value, robot.model.terms)
         T = product([ca.SX(ca.DM(before)), *flange, *placed([value(tool + c) for c in FRAME])])
-        joints = list(enumerate(robot.joint_types, start=1))
-        twists = []  # how point and orientation of T move with a joint
-        for (i, moves), link in zip(joints, after, strict=False):
-            beta = value(f"beta{i}")
-            axis = link[:3, :3] @ ca.vertcat(
-                -np.sin(beta), 0, np.cos(beta)
-            )  # z before Rot(y, beta), through the origin
-            turn = ca.vertcat(ca.cross(axis, T[:3, 3] - link[:3, 3]), axis)
-            twists.append(ca.vertcat(axis, 0, 0, 0) if moves == "prismatic" else turn)
-        moved = ca.vertcat(*(motion(robot.joint_types, i, configuration, value, terms) for i, _ in joints))
-        # gravity bends a joint by the values of all of them
-        J = (ca.horzcat(*twists) @ ca.jacobian(moved, command["q"]))[: len(kind.components), :]
+        # how point and orientation of T move with the joints; gravity bends a joint by the values of all of them
+        turn = sum(ca.skew(T[:3, k]) @ ca.jacobian(T[:3, k], command["q"]) for k in range(3)) / 2
+        J = ca.vertcat(ca.jacobian(T[:3, 3], command["q"]), turn)[: len(kind.components), :]
         modelled = kind.model(T)
         outputs = [ca.densify(v) for v in (modelled, kind.minus(y, modelled), J.T)]
         return cls(ca.Function("arm", [ca.vertcat(*command.values(), y)], outputs), robot.joint_map)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import scipy
 from scipy.special import fdtrc, fdtri, ndtr, ndtri
 
 from rpim_opt.basics.arrays import Array
@@ -268,22 +269,20 @@ def cusum(deviate: Array) -> Array:
 def cusum_limit(count: int, level: float) -> float:
     """Return the limit that sums of so many independent standard normal deviates exceed with probability ``level``.
 
-    By Brook and Evans' Markov chain (1972), bisected.
+    By Brook and Evans' Markov chain (1972).
     """
-    low, high = 0.0, HIGHEST_LIMIT
-    while high - low > 1e-3:
-        middle = (low + high) / 2
-        width = middle / CELLS
+
+    def alarms(limit: float) -> float:
+        """Return by how much the probability of an alarm exceeds the level."""
+        width = limit / CELLS
         centre = width * (np.arange(CELLS) + 0.5)
         # from sum i the next is in cell j where u - ALLOWANCE is within half a cell of their difference; zero is a cell
         states = np.concatenate([[0.0], centre])
         upper = ndtr(np.concatenate([[0.0], centre + width / 2])[None, :] - states[:, None] + ALLOWANCE)
         step = np.diff(upper, axis=1, prepend=0.0)
-        if 1.0 - np.linalg.matrix_power(step, count)[0].sum() > level:
-            low = middle
-        else:
-            high = middle
-    return high
+        return 1.0 - float(np.linalg.matrix_power(step, count)[0].sum()) - level
+
+    return float(scipy.optimize.bisect(alarms, 1e-3, HIGHEST_LIMIT, xtol=1e-4))
 
 
 def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Drift | None:
