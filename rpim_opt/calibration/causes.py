@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
@@ -90,9 +90,9 @@ def likely_causes(result: Outcome) -> list[str]:
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
-        causes = [*_found(result, problem), *(diagnosis.computed_columns(problem) if len(problem.arms) == 1 else ())]
+        causes = [*_found(result, problem), *diagnosis.computed_columns(problem)]
     elif not kept.all():
-        causes = list(_of_rows(problem))
+        causes = [*diagnosis.rows_without_values(problem), *diagnosis.exchanged_rows(problem)]
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     if max(ratio for _, ratio in sizes.values()) > HOPELESS:
@@ -103,13 +103,14 @@ def likely_causes(result: Outcome) -> list[str]:
 def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
     """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
-        return list(_of_rows(problem))
+        return list(diagnosis.rows_without_values(problem))
     ordered = _in_table_order(result, problem)
     better = better_reading(ordered)
     causes = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
     if causes:
         return [*diagnosis.rows_without_values(problem), *causes]
-    causes = [*_of_rows(problem), *(list(diagnosis.moved_far(problem)) or diagnosis.mixed_reflectors(problem))]
+    causes = [*diagnosis.rows_without_values(problem), *diagnosis.exchanged_rows(problem)]
+    causes += list(diagnosis.moved_far(problem)) or diagnosis.mixed_reflectors(problem)
     if not causes:
         error, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
         rows = own | (error <= np.nanmax(error[own]))  # held-out rows that are gross errors were not looked for
@@ -146,9 +147,7 @@ def better_fitting(result: Outcome, data: Dataset) -> Better | None:
     Asked where their errors are beyond `HOPELESS` times what the instrument is stated to have.
     """
     problem = result.problem.sample().on(data)
-    if len(problem.arms) > 1 or noise_ratio(problem, result.errors(data)) <= HOPELESS:
-        return None
-    return better_reading(problem)
+    return better_reading(problem) if noise_ratio(problem, result.errors(data)) > HOPELESS else None
 
 
 def refuse_misread(result: Outcome, data: Dataset) -> None:
@@ -168,10 +167,3 @@ def misread(result: Outcome, data: Dataset) -> str:
 def mistakes(causes: Sequence[str]) -> list[str]:
     """Return the input mistakes among `likely_causes`."""
     return [text for text in causes if text != NOTHING and not text.startswith(BAD)]
-
-
-def _of_rows(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which rows cannot be right, whatever the others are."""
-    yield from diagnosis.rows_without_values(problem)
-    if len(problem.arms) == 1:
-        yield from diagnosis.exchanged_rows(problem)

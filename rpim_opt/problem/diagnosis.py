@@ -20,12 +20,12 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import WRONG, better_reading, coupling, fit_points, misfit, signs
+from rpim_opt.problem.misreadings import WRONG, better_reading, coupling, signs
 from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
-from rpim_opt.problem.registration.points import Points, lengths_of, points_of
+from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, misfit, points_of
 from rpim_opt.problem.row_functions import about_means, repeated
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
@@ -480,7 +480,7 @@ def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None or points.seen or len(points.row) < 2 * LINEAR or len(points.tools) > 1:
         return
-    T = forward_kinematics(problem.robot, points.q)
+    T = forward_kinematics(points.robot, points.q)
     X = np.column_stack([T[:, :3, 3], T[:, :3, :3].reshape(len(T), 9), np.ones(len(T))])
     left = points.y - X @ np.linalg.lstsq(X, points.y, rcond=None)[0]
     exact = np.sqrt(np.sum(left**2, axis=0) / (len(X) - LINEAR)) < EXACT
@@ -494,7 +494,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None:
         return
-    fit = fit_points(problem.robot, points)
+    fit = fit_points(points)
     label = [problem.data.label[i] for i in points.row]
     far = np.flatnonzero(fit.error > FAR * np.median(fit.error))
     pairs = []
@@ -506,7 +506,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
         yield f"the measured values of rows {listed(pairs)} fit each other's joint values: exchange them."
     if len(points.tools) < 2 or not len(far):
         return
-    model = transformed((fit.base @ forward_kinematics(problem.robot, points.q[far]))[:, None], fit.tools)
+    model = transformed((fit.base @ forward_kinematics(points.robot, points.q[far]))[:, None], fit.tools)
     error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
     error[np.arange(len(far)), points.marker[far]] = np.inf
     markers = [label[i] for i in far[error.min(axis=1) < FITS * fit.error[far]]]
@@ -537,11 +537,10 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None or len(points.row) < 2 * FEWEST or points.turns is not None:
         return
-    robot = problem.robot
-    whole = misfit(robot, points)
-    turning = [i for i, kind in enumerate(robot.joint_types) if kind == "revolute"]
-    fitted = {i: replace(points, q=_values_that_fit(robot, points, i)) for i in turning}
-    left = {i: misfit(robot, each) for i, each in fitted.items()}
+    whole = misfit(points)
+    turning = [i for i, kind in enumerate(points.robot.joint_types) if kind == "revolute"]
+    fitted = {i: replace(points, q=_values_that_fit(points, i)) for i in turning}
+    left = {i: misfit(each) for i, each in fitted.items()}
     i = min(left, key=left.__getitem__)
     if left[i] >= min(FITS * whole, WRONG):  # free values take up much of any other mistake
         return
@@ -556,15 +555,15 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     )
 
 
-def _values_that_fit(robot: Robot, points: Points, joint: int) -> Array:
+def _values_that_fit(points: Points, joint: int) -> Array:
     """Return joint values (N, dof) in which one joint's are those that fit best."""
     q, width = points.q, np.pi
     around: Any = 0.0
     for _ in range(MOST_ROUNDS):
-        fit = fit_points(robot, replace(points, q=q))
+        fit = fit_points(replace(points, q=q))
         tries = np.repeat(q[:, None], GRID, axis=1)
         tries[..., joint] = around + width * np.linspace(-1, 1, GRID)
-        frames = fit.base @ forward_kinematics(robot, tries.reshape(-1, robot.dof))
+        frames = fit.base @ forward_kinematics(points.robot, tries.reshape(-1, q.shape[1]))
         modelled = transformed(frames, np.repeat(fit.tools[points.marker], GRID, axis=0))
         error = np.linalg.norm(points.y[:, None] - modelled.reshape(len(q), GRID, 3), axis=2)
         chosen = tries[np.arange(len(q)), error.argmin(axis=1)]
@@ -579,16 +578,16 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    robot, rows = problem.robot, np.arange(len(points.row))
-    whole = misfit(robot, points)
+    rows = np.arange(len(points.row))
+    whole = misfit(points)
     if whole < FAR_MOVED:
         return
     parted = {k: [points.take(part) for part in np.split(rows, [k])] for k in _places(len(rows))}
-    left = {k: max(misfit(robot, part) for part in parts) for k, parts in parted.items()}
+    left = {k: max(misfit(part) for part in parts) for k, parts in parted.items()}
     place = min(left, key=left.__getitem__)
     if left[place] >= FITS * whole:
         return
-    first, second = (fit_points(robot, part) for part in parted[place])
+    first, second = (fit_points(part) for part in parted[place])
     if points.lengths:
         far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
         other, what = "anchor", "the anchor or the robot's base moved"
@@ -611,11 +610,10 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None or len(points.row) < 4 * FEWEST or len(points.tools) > 1 or points.turns is not None:
         return
-    robot = problem.robot
-    flange = forward_kinematics(robot, points.q)
-    whole = misfit(robot, points)
+    flange = forward_kinematics(points.robot, points.q)
+    whole = misfit(points)
     for count in (2, 3) if whole >= FAR_MOVED else ():
-        named, fit = points, fit_points(robot, points)
+        named, fit = points, fit_points(points)
         for _ in range(MOST_ROUNDS):
             back: Any = np.linalg.inv(fit.base @ flange)
             seen = transformed(back, points.y)
@@ -627,9 +625,9 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
             if named is not points and (marker == named.marker).all():
                 break
             named = replace(points, marker=marker, tools=tools)
-            fit = fit_points(robot, named)
+            fit = fit_points(named)
         sizes = np.bincount(named.marker, minlength=count)
-        if sizes.min() >= FEWEST // 2 and misfit(robot, named) < FITS * whole:
+        if sizes.min() >= FEWEST // 2 and misfit(named) < FITS * whole:
             far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()
             others = [problem.data.label[i] for i in points.row[named.marker != sizes.argmax()]]
             yield (
@@ -644,13 +642,12 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    robot = problem.robot
-    whole = misfit(robot, points)
+    whole = misfit(points)
     first = {k: points.take(np.arange(k)) for k in _places(len(points.row))}
-    fitting = [k for k, part in first.items() if misfit(robot, part) < FITS * whole]
+    fitting = [k for k, part in first.items() if misfit(part) < FITS * whole]
     if not fitting:
         return
-    error = fit_points(robot, first[max(fitting)]).error
+    error = fit_points(first[max(fitting)]).error
     start = int(np.flatnonzero(error <= FAR * np.median(error)).max()) + 1
     better = better_reading(problem.on(problem.data.take(points.row[start:])))
     if better is not None:

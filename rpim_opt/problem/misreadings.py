@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from itertools import combinations, permutations, product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,69 +18,12 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
-from rpim_opt.problem.registration.global_start import described, explained, rms, search
-from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, lengths_of, mirrored, points_of
+from rpim_opt.problem.registration.global_start import described, explained, search
+from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
-
-STEPS, FIRST_STEPS, MANY = 20, 8, 40
-"""Steps of a fit of base and reflectors, joint zeros too if they are free."""
-
-
-def fit_points(robot: Robot, points: Points) -> Fit:
-    """Return where base and reflectors fit best; of poses their positions."""
-    fit = fit_arms(robot, Candidates.of(robot, [points]), STEPS, robust=True)
-    every = 1 if points.turns is None else 4
-    of_points = {name: getattr(fit, name)[0, ::every] for name in ("modelled", "error", "tools")}
-    return Fit(*(each[0] for each in fit))._replace(**of_points)
-
-
-def misfit(robot: Robot, points: Points) -> float:
-    """Return the RMS error of the best three quarters of the points over their extent, for the nominal robot."""
-    return float(misfits(robot, [points], zeros=False)[0])
-
-
-def misfits(robot: Robot, tries: Sequence[Points], zeros: bool = True) -> Array:
-    """Return the same (B,) of many readings of a table, joint zeros fitted by default.
-
-    Of more than `MANY` the quarter that fits best after `FIRST_STEPS` is fitted to the end: only the best one counts.
-    """
-    errors = np.full(len(tries), np.inf)
-    sizes = np.array([len(points.row) for points in tries])
-    for size in np.unique(sizes):
-        some = np.flatnonzero(sizes == size)
-        candidates = Candidates.of(robot, [tries[int(i)] for i in some])
-        extent = np.array([tries[int(i)].extent for i in some])
-        steps = STEPS
-        if len(some) > MANY:
-            fits = fit_arms(robot, candidates, FIRST_STEPS, zeros=zeros, robust=True)
-            errors[some] = rms(fits) / extent
-            best = np.argsort(errors[some])[: max(MANY, len(some) // 4)]
-            candidates = candidates._replace(zero=fits.zero, tools=fits.tools).take(best)
-            some, extent, steps = some[best], extent[best], STEPS - FIRST_STEPS
-        errors[some] = rms(fit_arms(robot, candidates, steps, zeros=zeros, robust=True)) / extent
-    return errors
-
-
-def pose_misfit(robot: Robot, data: Dataset) -> float:
-    """Return the RMS angle [rad] between measured and nominal orientations of the data's first block of poses.
-
-    Base and tool are fitted; pi where the poses do not determine them.
-    """
-    block = next(each for each in data.blocks if each.measurement.name == "pose")
-    measured = transforms(block.y)
-    flange = forward_kinematics(robot, block.q[:, 0])
-    try:
-        start = certified_hand_eye(flange, measured)
-    except InputError:  # two poses
-        return float(np.pi)
-    if start.uncertainty > UNKNOWN:
-        return float(np.pi)
-    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (start.base @ flange @ start.tool)[:, :3, :3]
-    return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
-
 
 BETTER = 0.2
 """Another reading of the data is reported when it leaves less than this part of the position error."""
@@ -130,13 +73,13 @@ DEGREES_PER_MM = np.radians(1) / 1e-3
 class Misreading(NamedTuple):
     """Another interpretation: the mistake, the remedy, the resulting points, and equally good interpretations.
 
-    ``robot`` is another nominal robot, on which joint zeros are not fitted.
+    ``zeros``: whether joint zeros are fitted, which on another nominal robot they are not.
     """
 
     what: str
     remedy: str
-    change: Callable[[Any], Any] = lambda points: points
-    robot: Robot | None = None
+    change: Callable[[Points], Points]
+    zeros: bool = True
     others: tuple[Misreading, ...] = ()
 
 
@@ -149,27 +92,40 @@ class Better(NamedTuple):
     left: float
 
     @property
-    def factor(self) -> float:
-        """How many times better it fits."""
-        return self.stated / max(self.left, 1e-9)
-
-    @property
     def sentence(self) -> str:
         """Return it as a sentence with both errors."""
         alike = ""
         if ", or " in self.what:
             alike = " These explain the data equally well: apply the one that matches the set-up."
         figures = f"{three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.stated)} mm"
-        times = three_digits(self.factor)
+        times = three_digits(self.stated / max(self.left, 1e-9))
         return f"the data fit {times} times better, {figures}, with {self.what}: {self.remedy}.{alike}"
+
+
+def pose_misfit(robot: Robot, data: Dataset) -> float:
+    """Return the RMS angle [rad] between measured and nominal orientations of the data's first block of poses.
+
+    Base and tool are fitted; pi where the poses do not determine them.
+    """
+    block = next(each for each in data.blocks if each.measurement.name == "pose")
+    measured = transforms(block.y)
+    flange = forward_kinematics(robot, block.q[:, 0])
+    try:
+        start = certified_hand_eye(flange, measured)
+    except InputError:  # two poses
+        return float(np.pi)
+    if start.uncertainty > UNKNOWN:
+        return float(np.pi)
+    error = np.swapaxes(measured[:, :3, :3], 1, 2) @ (start.base @ flange @ start.tool)[:, :3, :3]
+    return float(np.sqrt(np.mean(Rotation.from_matrix(error).magnitude() ** 2)))
 
 
 # What a table may be mistaken for
 
 
-def _readings(robot: Robot, points: Points) -> list[Misreading]:
+def _readings(points: Points) -> list[Misreading]:
     """Return all single mistakes that are looked for."""
-    readings = [*_of_joints(robot), *_of_rows(len(points.row), robot.dof)]
+    readings = [*_of_joints(points.robot), *_of_rows(len(points.row), points.robot.dof)]
     if points.seen:
         remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
         return [*readings, Misreading("the camera and the board exchanged", remedy, _inverted)]
@@ -178,10 +134,7 @@ def _readings(robot: Robot, points: Points) -> list[Misreading]:
             remedy = f"multiply column distance by {factor:g} or name its unit"
             readings.append(_scaled(f"measured lengths {unit}", remedy, factor))
         return [*readings, _scaled("measured lengths that count down", "change the sign of column distance", -1.0)]
-    readings += _of_positions()
-    if points.turns is not None:
-        readings += _of_poses(robot)
-    return readings
+    return [*readings, *_of_positions(), *(_of_poses() if points.turns is not None else ())]
 
 
 def _of_joints(robot: Robot) -> Iterator[Misreading]:
@@ -273,14 +226,11 @@ def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
     return Misreading(what, remedy, lambda points: replace(points, y=points.y * factors))
 
 
-def _of_poses(robot: Robot) -> Iterator[Misreading]:
+def _of_poses() -> Iterator[Misreading]:
     """Yield readings with other orientations."""
 
     def turned(what: str, remedy: str, change: Callable[[Array], Array]) -> Misreading:
-        def changed(points: Points) -> Points:
-            return points if points.turns is None else replace(points, turns=change(points.turns))
-
-        return Misreading(what, remedy, changed)
+        return Misreading(what, remedy, lambda of: of if of.turns is None else replace(of, turns=change(of.turns)))
 
     def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: float = 1.0) -> Callable[[Array], Array]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
@@ -299,7 +249,7 @@ def _of_poses(robot: Robot) -> Iterator[Misreading]:
         "transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted
     )
     remedy = "express both in one frame: multiply the rotations by that between the two"
-    yield Misreading("orientations in another frame than the positions", remedy, partial(_in_one_frame, robot))
+    yield Misreading("orientations in another frame than the positions", remedy, _in_one_frame)
     for order in map("".join, permutations("xyz")):
         for kind, axes in (("fixed", order), ("moving", order.upper())):
             what = f"Euler angles about {kind} axes in the order {', '.join(order)}"
@@ -312,11 +262,11 @@ def _of_poses(robot: Robot) -> Iterator[Misreading]:
         yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor=factor))
 
 
-def _in_one_frame(robot: Robot, points: Points) -> Points:
+def _in_one_frame(points: Points) -> Points:
     """Return poses whose orientations are turned into the frame of the positions, by their turns from row to row."""
     if points.turns is None:
         return points
-    flange = fit_points(robot, replace(points, turns=None)).base @ forward_kinematics(robot, points.q)
+    flange = fit_points(replace(points, turns=None)).base @ forward_kinematics(points.robot, points.q)
 
     def turns(R: Array) -> Array:
         return Rotation.from_matrix(R[1:] @ np.swapaxes(R[:-1], 1, 2)).as_rotvec()
@@ -360,37 +310,38 @@ def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
     yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
 
 
-def _factors(robot: Robot, points: Points) -> Iterator[Misreading]:
+def _factors(points: Points) -> Iterator[Misreading]:
     """Yield readings with a column, all angles or all lengths times a factor that fits: other units, counts, gears."""
+    robot = points.robot
     eye = np.eye(robot.dof)
-    turning = np.array(robot.joint_dimensions) == "angle"
     scaled = {f"column q{i + 1}": ("q", eye[i]) for i in range(robot.dof)}
+    turning = np.array(robot.joint_dimensions) == "angle"
     scaled |= {"all joint values": ("q", turning), "all measured lengths": ("y", np.ones(points.y.shape[1]))}
     if not points.lengths:
         scaled |= {f"column {axis}": ("y", of) for axis, of in zip("xyz", np.eye(3), strict=True)}
 
-    def times(what: str, factor: float, points: Points = points) -> Points:
+    def times(what: str, factor: float, points: Points) -> Points:
         name, of = scaled[what]
         return replace(points, **{name: getattr(points, name) * (1 + (factor - 1) * of)})
 
     few = points.evenly(FEW)
     factors = np.geomspace(1 / MOST_TIMES, MOST_TIMES, FACTORS)
-    tries = [times(what, factor, few) for what in scaled for factor in factors.tolist()]
-    size = misfits(robot, tries).reshape(len(scaled), FACTORS)
+    size = misfits([times(what, factor, few) for what in scaled for factor in factors.tolist()])
+    size = size.reshape(len(scaled), FACTORS)
     for k in np.argsort(size.min(axis=1))[:FINER]:
         what, factor = list(scaled)[k], float(factors[np.argmin(size[k])])
         ratio = factors[1] / factors[0]
         while ratio > 1 + 1e-5:
             near = (factor * ratio ** np.linspace(-1, 1, 9)).tolist()
-            factor = near[int(np.argmin(misfits(robot, [times(what, each, few) for each in near])))]
+            factor = near[int(np.argmin(misfits([times(what, each, few) for each in near])))]
             ratio **= 0.25
         remedy = f"multiply {what} by {factor:.5g}, or name the unit"
         yield Misreading(f"{what} in another unit or scale", remedy, partial(times, what, factor))
 
 
-def _orders(robot: Robot, points: Points) -> Iterator[Misreading]:
+def _orders(points: Points) -> Iterator[Misreading]:
     """Yield all orders of up to six turning joints."""
-    del points
+    robot = points.robot
     if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
         return
     for columns in permutations(range(robot.dof)):  # the columns that hold joints 1, 2, ...
@@ -402,9 +353,13 @@ def _orders(robot: Robot, points: Points) -> Iterator[Misreading]:
         yield Misreading(f"joints in the order {names}", f"name the columns {names}", change)
 
 
-def _other_robots(robot: Robot, points: Points) -> Iterator[Misreading]:
+def _other_robots(points: Points) -> Iterator[Misreading]:
     """Yield the table in the other Denavit-Hartenberg convention, and the ready robots with such joints."""
-    del points
+    robot = points.robot
+
+    def read_as(what: str, remedy: str, other: Robot) -> Misreading:
+        return Misreading(what, remedy, lambda points: replace(points, robot=other), zeros=False)
+
     for which, shift, end, remedy in (
         ("standard (distal)", 1, 0, "move alpha and a of every row to the next row (the first row's are 0)"),
         ("modified (proximal)", -1, -1, "move alpha and a of every row to the row before"),
@@ -413,16 +368,16 @@ def _other_robots(robot: Robot, points: Points) -> Iterator[Misreading]:
         mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
         mdh[end, :2] = 0.0
         what = f"a table in the {which} Denavit-Hartenberg convention"
-        yield Misreading(what, remedy, robot=replace(robot, mdh=mdh))
+        yield read_as(what, remedy, replace(robot, mdh=mdh))
     for (k, column), (by, low, back) in product(((0, "alpha"), (1, "a"), (3, "d")), SLIPPED):
         mdh = robot.mdh.copy()
         mdh[:, k] = np.roll(mdh[:, k], -by)
         remedy = f"move column {column} one row {back} in the DH table"
-        yield Misreading(f"column {column} one row too {low} in the DH table", remedy, robot=replace(robot, mdh=mdh))
+        yield read_as(f"column {column} one row too {low} in the DH table", remedy, replace(robot, mdh=mdh))
     for name in robots():
         ready = read_robot(READY / f"{name}.toml")
         if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
-            yield Misreading(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', robot=ready)
+            yield read_as(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready)
 
 
 # Which of these fits
@@ -438,10 +393,9 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     points = points_of(problem) or lengths_of(problem)
     if points is None:
         return None
-    robot = problem.robot
-    mapping = None if explained(robot, points) else search(robot, points)
+    mapping = None if explained(points) else search(points)
     if mapping is not None:
-        words = described(robot.joint_types, mapping.sign, mapping.zero)
+        words = described(mapping.joint_types, mapping.sign, mapping.zero)
         remedy = "write sign and theta_deg of these joints in robot.toml"
         if mapping.mirrored:
             words = f"the measured frame mirrored (left-handed), or {words}"
@@ -450,37 +404,31 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                 "instrument's frame, up for instance, tells which"
             )
         return Better(words, remedy, mapping.nominal, mapping.left)
-    present = float(misfits(robot, [points])[0])  # with zeros fitted, as of every other reading
+    present = float(misfits([points])[0])  # with zeros fitted, as of every other reading
     if not np.isfinite(present):
         return None
-    chain, left = _mistakes(robot, points, present)
+    chain, left = _mistakes(points, present)
     if present > WRONG and not points.seen:
         for readings in (_factors, _orders, _other_robots):
             if left < BETTER * present:
                 break
-            chain, left = _best(robot, points, list(readings(robot, points)))
+            chain, left = _best(points, list(readings(points)))
             if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
-                behind, changed = chain[0].robot or robot, chain[0].change(points)
-                second, size = _best(behind, changed, _readings(behind, changed))
+                changed = chain[0].change(points)
+                second, size = _best(changed, _readings(changed))
                 if size < BETTER * present:
                     chain, left = [*chain, *second], size
     if left < BETTER * present and (left <= LEFT or points.seen):
-        return _told(robot, points, chain, present, left)
-    return None if points.seen else _sibling(robot, points)
-
-
-def _sibling(robot: Robot, points: Points) -> Better | None:
-    """Return a ready robot of nearly the same nominal parameters that fits better, a UR10 for a UR10e."""
-    own = misfit(robot, points)
-    for each in _other_robots(robot, points):
-        if each.robot is not None and np.abs(each.robot.mdh - robot.mdh).max() < SIBLING:
-            left = misfit(each.robot, points)
-            if left < SIBLING_BETTER * own:
-                return Better(each.what, each.remedy, own * points.extent, left * points.extent)
+        return _told(points, chain, present, left)
+    own = np.inf if points.seen else misfit(points)
+    for each in () if points.seen else _other_robots(points):  # nearly the same parameters: a UR10 for a UR10e
+        other = each.change(points)
+        if np.abs(other.robot.mdh - points.robot.mdh).max() < SIBLING and misfit(other) < SIBLING_BETTER * own:
+            return Better(each.what, each.remedy, own * points.extent, misfit(other) * points.extent)
     return None
 
 
-def _told(robot: Robot, points: Points, chain: Sequence[Misreading], stated: float, left: float) -> Better:
+def _told(points: Points, chain: Sequence[Misreading], stated: float, left: float) -> Better:
     """Return a chain of mistakes in words, each with what fits as well in its place: some differ by base and tool."""
     same = []
     for i, each in enumerate(chain):
@@ -489,11 +437,11 @@ def _told(robot: Robot, points: Points, chain: Sequence[Misreading], stated: flo
         alike = [each]
         for other in each.others:
             tried = other.change(points)
-            as_well = len(tried.row) == len(changed.row)  # the mistakes behind it are of so many rows
-            if behind and as_well:
+            as_well = not behind
+            if behind and len(tried.row) == len(changed.row):  # the mistakes behind it are of so many rows
                 whole = reduce(lambda now, mistake: mistake.change(now), behind, tried)
-                as_well = bool(misfits(robot, [whole])[0] <= SAME * left)
-            if as_well or not behind:
+                as_well = bool(misfits([whole])[0] <= SAME * left)
+            if as_well:
                 alike.append(other)
         same.append(alike)
         points = changed
@@ -502,52 +450,51 @@ def _told(robot: Robot, points: Points, chain: Sequence[Misreading], stated: flo
     return Better(what, remedy, stated * points.extent, left * points.extent)
 
 
-def _mistakes(robot: Robot, points: Points, stated: float) -> tuple[list[Misreading], float]:
+def _mistakes(points: Points, stated: float) -> tuple[list[Misreading], float]:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
     chain: list[Misreading] = []
     best = stated
+    enough = min(BETTER * stated, WRONG)
     changed = points
-    while len(chain) < MISTAKES[points.seen] and best >= min(BETTER * stated, WRONG):
-        each, size = _best(robot, changed, _readings(robot, changed))
+    while len(chain) < MISTAKES[points.seen] and best >= enough:
+        each, size = _best(changed, _readings(changed))
         if not size < FURTHER * best:
             break
         chain += each
         changed = each[0].change(changed)
         best = size
-    if stated > WRONG and not points.seen and best >= min(BETTER * stated, WRONG):
-        readings = _readings(robot, points)
-        for i in np.argsort(_tried(robot, points, readings))[:12]:
+    if stated > WRONG and not points.seen and best >= enough:
+        readings = _readings(points)
+        for i in np.argsort(_tried(points, readings))[:12]:
             changed = readings[i].change(points)
-            others = [each for each in _readings(robot, changed) if each.what != readings[i].what]
-            second, left = _best(robot, changed, others)
+            others = [each for each in _readings(changed) if each.what != readings[i].what]
+            second, left = _best(changed, others)
             if left < min(best, BETTER * stated):
                 chain, best = [readings[i], *second], left
     if len(chain) > 1 and best > WRONG:  # of many pairs one always fits somewhat better
         chain = chain[:1]
-        best = float(_tried(robot, points, chain)[0])
+        best = float(_tried(points, chain)[0])
     return chain, best
 
 
-def _best(robot: Robot, points: Points, readings: list[Misreading]) -> tuple[list[Misreading], float]:
+def _best(points: Points, readings: list[Misreading]) -> tuple[list[Misreading], float]:
     """Return the reading that fits best, if any does, and how badly; few rows choose whom more rows compare."""
-    size = _tried(robot, points, readings, FEW)
+    size = _tried(points, readings)
     least = float(size.min(initial=np.inf))
     if not np.isfinite(least):
         return [], float("inf")
     near = [readings[i] for i in np.argsort(size) if size[i] <= 2 * least][:8]
-    whole = _tried(robot, points, near, len(points.row))
+    whole = _tried(points, near, len(points.row))
     k = int(np.argmin(whole))
     same = [each for each, left in zip(near, whole, strict=True) if left <= SAME * whole[k]]
     return [near[k]._replace(others=tuple(each for each in same if each is not near[k])[:3])], float(whole[k])
 
 
-def _tried(robot: Robot, points: Points, readings: Sequence[Misreading], most: int = FEW) -> Array:
+def _tried(points: Points, readings: Sequence[Misreading], most: int = FEW) -> Array:
     """Return how badly readings fit, from so many rows."""
     tries = [each.change(points).evenly(most) for each in readings]
+    zeros = np.array([each.zeros for each in readings], dtype=bool)
     errors = np.full(len(readings), np.inf)
-    own = [i for i, each in enumerate(readings) if each.robot is None]
-    errors[own] = misfits(robot, [tries[i] for i in own])
-    for i, each in enumerate(readings):
-        if each.robot is not None:
-            errors[i] = misfit(each.robot, tries[i])
+    for fitted in (True, False):
+        errors[zeros == fitted] = misfits([tries[i] for i in np.flatnonzero(zeros == fitted)], fitted)
     return errors

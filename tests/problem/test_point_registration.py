@@ -11,8 +11,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import fit_points, misfit
-from rpim_opt.problem.registration.points import FEWEST_ROWS, Points, points_of
+from rpim_opt.problem.registration.points import FEWEST_ROWS, Points, fit_points, misfit, points_of
 from tests.simulate import ARM
 
 TOOLS = np.array([[0.05, -0.02, 0.1], [-0.04, 0.06, 0.08]])
@@ -28,13 +27,13 @@ def measured(count: int = 24, moved: float = 0.0, seed: int = 0) -> Points:
     marker = np.arange(count) % 2
     flange = BASE @ ro.robot.forward_kinematics(ARM, q)
     y = np.einsum("nij,nj->ni", flange[:, :3, :3], TOOLS[marker]) + flange[:, :3, 3]
-    return Points(q, y, marker, TOOLS + moved * rng.uniform(-1, 1, (2, 3)), None, np.arange(count))
+    return Points(ARM, q, y, marker, TOOLS + moved * rng.uniform(-1, 1, (2, 3)), None, np.arange(count))
 
 
 @pytest.mark.parametrize("moved", [0.0, 0.003])
 def test_base_and_reflectors_come_back(moved: float) -> None:
     points = measured(moved=moved)
-    found = fit_points(ARM, points)
+    found = fit_points(points)
     assert found.error.max() < 1e-4 * (moved > 0) + 1e-7
     assert found.base == pytest.approx(BASE, abs=1e-4 * (moved > 0) + 1e-7)
     assert found.tools == pytest.approx(TOOLS, abs=1e-4 * (moved > 0) + 1e-7)
@@ -45,19 +44,19 @@ def test_blunders_stand_out_and_move_nothing() -> None:
     points = measured(40)
     y = points.y.copy()
     y[[4, 17, 30]] += [0.3, -0.4, 0.2]
-    found = fit_points(ARM, replace(points, y=y))
+    found = fit_points(replace(points, y=y))
     far = np.linalg.norm([0.3, -0.4, 0.2])
     assert found.error[[4, 17, 30]] == pytest.approx(far, abs=1e-3)
     assert np.delete(found.error, [4, 17, 30]).max() < 1e-3
-    assert misfit(ARM, replace(points, y=y)) < 1e-3
+    assert misfit(replace(points, y=y)) < 1e-3
 
 
 def test_the_misfit_is_of_the_best_three_quarters_over_the_extent() -> None:
     points = measured(30)
     noisy = replace(points, y=points.y + 1e-3 * np.random.default_rng(2).normal(size=(30, 3)))
-    error = np.sort(fit_points(ARM, noisy).error)[: int(np.ceil(0.75 * 30))]
+    error = np.sort(fit_points(noisy).error)[: int(np.ceil(0.75 * 30))]
     extent = np.linalg.norm(np.std(noisy.y, axis=0))
-    assert misfit(ARM, noisy) == pytest.approx(np.sqrt(np.mean(error**2)) / extent, rel=1e-9)
+    assert misfit(noisy) == pytest.approx(np.sqrt(np.mean(error**2)) / extent, rel=1e-9)
 
 
 def test_orientations_count_by_the_tips_of_their_axes() -> None:
@@ -65,9 +64,9 @@ def test_orientations_count_by_the_tips_of_their_axes() -> None:
     points = points_of(problem)
     assert points is not None
     assert points.turns is not None
-    assert misfit(problem.robot, points) < 0.01  # of a nominal robot
+    assert misfit(points) < 0.01  # of a nominal robot
     back = replace(points, turns=np.swapaxes(points.turns, 1, 2))
-    assert misfit(problem.robot, back) > 0.1
+    assert misfit(back) > 0.1
 
 
 def test_only_poses_of_one_reflector_have_orientations() -> None:

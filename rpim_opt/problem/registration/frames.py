@@ -81,8 +81,8 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         nominal = np.array([place[:3] for place in places.values()])
         # refuses points on a line
         register(transformed(flange, nominal[number]), y)
-        points = Points(q, y, number, nominal, None, np.arange(len(q)))
-        fit = fit_arms(robot, Candidates.of(robot, [points]), steps=12)
+        points = Points(robot, q, y, number, nominal, None, np.arange(len(q)))
+        fit = fit_arms(Candidates.of([points]), steps=12)
         base = fit.base[0]
         for place, fitted in zip(places.values(), fit.tools[0], strict=True):
             place[:3] = fitted

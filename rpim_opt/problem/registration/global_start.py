@@ -20,7 +20,17 @@ from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
-from rpim_opt.problem.registration.points import Candidates, Fit, Points, fit_arms, lengths_of, mirrored, points_of
+from rpim_opt.problem.registration.points import (
+    Candidates,
+    Fit,
+    Points,
+    fit_arms,
+    lengths_of,
+    mirrored,
+    points_of,
+    rms,
+    stacked,
+)
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
@@ -168,16 +178,16 @@ def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | N
     statements decide what joints are. None where nominal signs and small zeros explain the data, no mapping does, or a
     left-handed measured frame.
     """
-    if not isinstance(problem, CalibrationProblem) or len(problem.arms) > 1:
+    if not isinstance(problem, CalibrationProblem):
         return None
     points = points_of(problem) or lengths_of(problem)
     if points is None:
         return None
     needed = {tool_prefix(marker) + c for block in problem.data.blocks for marker in block.markers for c in FRAME[:3]}
     needed |= set(_anchor(problem)) if points.lengths else {f"base_{c}" for c in FRAME}
-    if not needed <= set(problem.parameters.free.names) or explained(problem.robot, points):
+    if not needed <= set(problem.parameters.free.names) or explained(points):
         return None
-    mapping = search(problem.robot, points)
+    mapping = search(points)
     if mapping is None or mapping.mirrored:
         return None
     return mapping, with_mapping(problem, points, mapping)
@@ -189,22 +199,20 @@ def _anchor(problem: CalibrationProblem) -> list[str]:
     return [of_fixture(name, block.fixture) for name in block.measurement.parameters]
 
 
-def explained(robot: Robot, points: Points) -> bool:
+def explained(points: Points) -> bool:
     """Whether the nominal robot explains the points, apart from gross errors."""
     few = points.evenly(FEW)
-    candidates = Candidates.of(robot, [few])
-
-    def left(steps: int) -> float:
-        return float(rms(fit_arms(robot, candidates, steps, robust=True))[0])
-
+    candidates = Candidates.of([few])
     # the registration alone tells it of most data, at a tenth of the cost
-    return any(left(steps) <= UNEXPLAINED * few.extent for steps in (0, SHORT))
+    return any(
+        float(rms(fit_arms(candidates, steps, robust=True))[0]) <= UNEXPLAINED * few.extent for steps in (0, SHORT)
+    )
 
 
 def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapping) -> CalibrationProblem:
     """Return the problem with the joints mapped, and base and reflectors where the points put them then."""
     robot = mapped(problem.robot, mapping.sign, mapping.zero)
-    fit = fit_arms(robot, Candidates.of(robot, [points]), LONG, robust=True)
+    fit = fit_arms(Candidates.of([replace(points, robot=robot)]), LONG, robust=True)
     p = problem.parameters
     values = {f"theta{i}": theta for i, theta in enumerate(robot.mdh[:, 2], start=1)}
     values |= {f"d{i}": d for i, d in enumerate(robot.mdh[:, 3], start=1)}
@@ -228,51 +236,40 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
     return replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
 
 
-def rms(fit: Fit) -> Array:
-    """Return the RMS errors (B,) [m] of the best three quarters of the points, of poses with their tips."""
-    error = np.sort(fit.error, axis=1)[:, : int(np.ceil(0.75 * fit.error.shape[1]))]
-    return np.sqrt(np.mean(error**2, axis=1))
-
-
-def search(robot: Robot, points: Points, seed: int = 0) -> JointMapping | None:
+def search(points: Points, seed: int = 0) -> JointMapping | None:
     """Return the mapping that explains the points; None if the nominal one does too, or if none does."""
     rng = np.random.default_rng(seed)
+    robot = points.robot
     n = robot.dof
     if n < len(robot.mdh):  # a sign or zero of a joint would not say what follows it
         return None
     turning = _turning(robot)
     few = points.evenly(FEW)
-    base = Candidates.of(robot, [few])
+    base = Candidates.of([few])
     free = few.y.size - max(n - 2, 0) - base.tools.size - 6
     if free < FEWEST_FREE or n > MOST_JOINTS:
         return None
-    near = fit_arms(robot, base, 2 * LONG, zeros=True, robust=True, noise=LEAST_NOISE)
+    near = fit_arms(base, 2 * LONG, zeros=True, robust=True, noise=LEAST_NOISE)
     small = np.abs(np.where(turning, near.zero[0], 0.0))[1:-1].max(initial=0.0) < NEAR_ZERO
     if small and rms(near)[0] <= UNEXPLAINED * few.extent:
         return None
     signs = np.array(list(product([1.0, -1.0], repeat=n)))
     count = max(600, 6 * len(signs))
-    pool = [_round(robot, few, *_plain_starts(n, signs, turning))]
+    sign, pool = _round(few, *_plain_starts(n, signs, turning))
     starts = 0
-    cost = np.zeros(0)
     for _ in range(ROUNDS):
-        sign = signs[np.resize(rng.permutation(len(signs)), count)]
-        zero = rng.uniform(-np.pi, np.pi, (count, n)) * turning
-        pool.append(_round(robot, few, sign, zero))
+        drawn = signs[np.resize(rng.permutation(len(signs)), count)]
+        begun, fits = _round(few, drawn, rng.uniform(-np.pi, np.pi, (count, n)) * turning)
+        sign, pool = np.concatenate([sign, begun]), stacked([pool, fits])
         starts += count
-        cost = np.concatenate([fit.cost for _, fit in pool])
-        if np.count_nonzero(cost < 1.05 * cost.min() + 1e-12) >= HITS:
+        if np.count_nonzero(pool.cost < 1.05 * pool.cost.min() + 1e-12) >= HITS:
             break
-    sign = np.concatenate([each for each, _ in pool])
-    zero = np.concatenate([fit.zero for _, fit in pool])
-    tools = np.concatenate([fit.tools for _, fit in pool])
-    best = np.argsort(cost)[:64]  # they are fitted to all rows
-    candidates = _signed(robot, points, np.vstack([np.ones((1, n)), sign[best]]))
-    candidates = candidates._replace(
-        zero=np.vstack([near.zero, zero[best]]), tools=np.concatenate([near.tools, tools[best]])
-    )
-    fits = fit_arms(robot, candidates, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
-    return _judged(robot, points, np.vstack([np.ones((1, n)), sign[best]]), fits, starts, small, rng)
+    best = np.argsort(pool.cost)[:64]  # they are fitted to all rows
+    sign = np.vstack([np.ones((1, n)), sign[best]])
+    zero, tools = np.vstack([near.zero, pool.zero[best]]), np.concatenate([near.tools, pool.tools[best]])
+    candidates = _signed(points, sign)._replace(zero=zero, tools=tools)
+    fits = fit_arms(candidates, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
+    return _judged(points, sign, fits, starts, small, rng)
 
 
 def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Array]:
@@ -285,25 +282,26 @@ def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Arr
     return sign, np.vstack([np.zeros_like(signs), np.tile(zero[1:], (len(one), 1))])
 
 
-def _signed(robot: Robot, points: Points, sign: Array) -> Candidates:
+def _signed(points: Points, sign: Array) -> Candidates:
     """Return candidates of the points with signs (B, dof) of their joints."""
-    candidates = Candidates.of(robot, [replace(points, q=each * points.q) for each in sign])
+    candidates = Candidates.of([replace(points, q=each * points.q) for each in sign])
     return candidates._replace(spread=np.full(len(candidates.stated), 3.0 * candidates.spread.max()))
 
 
-def _round(robot: Robot, points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
+def _round(points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
     """Return the best quarter of random starts, fitted: signs (B, dof) and fits."""
-    candidates = _signed(robot, points, sign)._replace(zero=zero)
-    first = fit_arms(robot, candidates, SHORT, zeros=True, noise=LEAST_NOISE)
+    candidates = _signed(points, sign)._replace(zero=zero)
+    first = fit_arms(candidates, SHORT, zeros=True, noise=LEAST_NOISE)
     best = np.argsort(first.cost)[: max(len(sign) // 4, 1)]
     begun = candidates.take(best)._replace(zero=first.zero[best], tools=first.tools[best])
-    return sign[best], fit_arms(robot, begun, LONG, zeros=True, noise=LEAST_NOISE)
+    return sign[best], fit_arms(begun, LONG, zeros=True, noise=LEAST_NOISE)
 
 
 def _judged(
-    robot: Robot, points: Points, sign: Array, fits: Fit, starts: int, small: bool, rng: np.random.Generator
+    points: Points, sign: Array, fits: Fit, starts: int, small: bool, rng: np.random.Generator
 ) -> JointMapping | None:
     """Return the plainest mapping of the best robot class, and others that fit as well; the first fit is nominal."""
+    robot = points.robot
     left = rms(fits)
     least = left.min()
     if not least <= ACCEPTED * points.extent or (small and EXPLAINED * least >= left[0]):
@@ -350,21 +348,15 @@ def _judged(
             told_by = elsewhere[int(np.argmax(far))]
             apart = _apart(predictions[k], predictions[first], points.lengths)
             others.append(Alternative(sign[i], zeros[i], apart, told_by, mirror[k]))
-    nominal = float(rms(fit_arms(robot, Candidates.of(robot, [points]), SHORT, robust=True))[0])
+    nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
     left_handed = False
     if not points.lengths:
-        other = fit_arms(robot, Candidates.of(robot, [mirrored(points)]), LONG, zeros=True, noise=LEAST_NOISE)
+        other = fit_arms(Candidates.of([mirrored(points)]), LONG, zeros=True, noise=LEAST_NOISE)
         small_zeros = np.abs(_gauged(robot, other.zero[0])).max() < NEAR_ZERO
         left_handed = bool(small_zeros and rms(other)[0] < MIRRORED * left[plainest[first]])
+    i = plainest[first]
     return JointMapping(
-        robot.joint_types,
-        sign[plainest[first]],
-        zeros[plainest[first]],
-        nominal,
-        float(left[plainest[first]]),
-        starts,
-        tuple(others),
-        left_handed,
+        robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others), left_handed
     )
 
 

@@ -22,6 +22,8 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 MOST_ROWS = 300  # rows that are tried, evenly spread where there are more
+STEPS, FIRST_STEPS, MANY = 20, 8, 40
+"""Steps of a fit of base and reflectors, joint zeros too if they are free; of many first ones choose a quarter."""
 FEWEST_ROWS = 6
 LONGEST = 3.0
 """A reflector farther from the flange [m] is none."""
@@ -35,6 +37,7 @@ LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 class Points:
     """N measured points of a robot, or N lengths from an anchor to them (K = 1) or between two of them (K = 2)."""
 
+    robot: Robot  # nominal
     q: Array  # (N, dof), of lengths (N, K, dof): joint values of the controller [rad or m]
     y: Array  # (N, 3) positions or (N, 1) lengths [m]
     marker: np.ndarray  # (N,), of lengths (N, K): numbers of the reflectors
@@ -68,9 +71,11 @@ class Points:
 
 @lru_cache(maxsize=2)  # poses of a camera's views take seconds
 def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
-    """Return the measured points of positions, poses and a camera's views; None where there are too few."""
+    """Return the measured points of positions, poses and a camera's views; None for few, and of several robots."""
     p = problem.parameters
     own = dict(zip(p.names, p.nominal.tolist(), strict=True))
+    if len(problem.arms) > 1:
+        return None
     try:
         data = posed(problem.data, own)
     except InputError:
@@ -86,7 +91,8 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
         turns = np.concatenate([transforms(block.y)[:, :3, :3] for block in blocks])
     number = {label: i for i, label in enumerate(problem.data.label)}
     whole = Points(
-        q=np.concatenate([block.q[:, 0] for block in blocks]), y=np.concatenate([block.y[:, :3] for block in blocks]),
+        problem.robot, np.concatenate([block.q[:, 0] for block in blocks]),
+        np.concatenate([block.y[:, :3] for block in blocks]),
         marker=np.concatenate([np.full(len(block.row), markers.index(block.markers[0])) for block in blocks]),
         tools=tools, turns=turns, row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
         seen=data is not problem.data, names=tuple(markers),
@@ -98,23 +104,17 @@ def lengths_of(problem: CalibrationProblem) -> Points | None:
     """Return the lengths of a cable or of distances, all by the same reflectors and anchor; None for others, or few."""
     blocks = problem.data.blocks
     kinds = {(block.measurement.name, block.markers, block.fixture) for block in blocks}
-    if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance"):
+    if len(kinds) > 1 or blocks[0].measurement.name not in ("cable", "distance") or len(problem.arms) > 1:
         return None
     p = problem.parameters
     own = dict(zip(p.names, p.nominal.tolist(), strict=True))
     names = list(dict.fromkeys(blocks[0].markers))
     if len(problem.data) < problem.robot.dof + 3 * len(names) + len(FRAME):
         return None
-    row = np.concatenate([block.row for block in blocks])
-    whole = Points(
-        q=np.concatenate([block.q for block in blocks]),
-        y=np.concatenate([block.y for block in blocks]),
-        marker=np.tile([names.index(marker) for marker in blocks[0].markers], (len(row), 1)),
-        tools=np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in names]),
-        turns=None,
-        row=row,
-        names=tuple(names),
-    )
+    q, y, row = (np.concatenate([getattr(block, name) for block in blocks]) for name in ("q", "y", "row"))
+    marker = np.tile([names.index(marker) for marker in blocks[0].markers], (len(row), 1))
+    tools = np.array([[own[tool_prefix(marker) + c] for c in FRAME[:3]] for marker in names])
+    whole = Points(problem.robot, q, y, marker, tools, None, row, names=tuple(names))
     return whole.take(np.argsort(row, kind="stable")).evenly(MOST_ROWS)
 
 
@@ -142,6 +142,7 @@ class Fit(NamedTuple):
 class Candidates(NamedTuple):
     """B sets of N points to be fitted at once."""
 
+    robot: Robot
     q: Array  # (B, NK, dof) joint values of the model
     y: Array  # (B, N, 3) positions or (B, N, 1) lengths [m]
     marker: np.ndarray  # (B, NK) reflectors
@@ -151,8 +152,8 @@ class Candidates(NamedTuple):
     spread: Array  # (M,) standard deviations of these [m]
 
     @classmethod
-    def of(cls, robot: Robot, tries: Sequence[Points]) -> Candidates:
-        """Return candidates of as many points each, joint zeros and reflectors as they are stated.
+    def of(cls, tries: Sequence[Points]) -> Candidates:
+        """Return candidates of one robot and as many points each, joint zeros and reflectors as they are stated.
 
         Of poses the tips of their axes are points of further reflectors.
         """
@@ -169,7 +170,8 @@ class Candidates(NamedTuple):
             y = np.concatenate([y[:, :, None], y[:, :, None] + axes], axis=2).reshape(B, -1, 3)
             marker = (4 * marker[:, :, None] + np.arange(4)).reshape(B, -1)
             spread = np.tile([TOOL_ERROR, *3 * [10 * TOOL_ERROR]], M)
-        return cls(q @ robot.joint_map.T, y, marker, np.zeros((B, len(robot.mdh))), tools, tools[0], spread)
+        robot = tries[0].robot
+        return cls(robot, q @ robot.joint_map.T, y, marker, np.zeros((B, len(robot.mdh))), tools, tools[0], spread)
 
     def take(self, index: np.ndarray) -> Candidates:
         """Return the candidates at ``index``."""
@@ -178,13 +180,7 @@ class Candidates(NamedTuple):
 
 
 def fit_arms(
-    robot: Robot,
-    candidates: Candidates,
-    steps: int,
-    *,
-    zeros: bool = False,
-    robust: bool = False,
-    noise: float = NOMINAL_ERROR,
+    candidates: Candidates, steps: int, *, zeros: bool = False, robust: bool = False, noise: float = NOMINAL_ERROR
 ) -> Fit:
     """Return the fits of many candidates at once, by Levenberg-Marquardt with the base eliminated.
 
@@ -200,10 +196,55 @@ def fit_arms(
     where ``robust``, otherwise they are one; ``noise`` is the error of a point [m].
     """
     B = len(candidates.y)
-    columns = 3 + 3 * len(candidates.stated) + zeros * len(robot.mdh)
+    columns = 3 + 3 * len(candidates.stated) + zeros * candidates.zero.shape[1]
     parts = np.array_split(np.arange(B), 1 + B * candidates.q.shape[1] * 3 * columns // LARGEST_BATCH)
-    fits = [_fitted(robot, candidates.take(some), steps, zeros, robust, noise) for some in parts]
+    return stacked([_fitted(candidates.take(some), steps, zeros, robust, noise) for some in parts])
+
+
+def stacked(fits: Sequence[Fit]) -> Fit:
+    """Return fits of sets of as many points one after the other."""
     return Fit(*(np.concatenate(each) for each in zip(*fits, strict=True)))
+
+
+def rms(fit: Fit) -> Array:
+    """Return the RMS errors (B,) [m] of the best three quarters of the points, of poses with their tips."""
+    error = np.sort(fit.error, axis=1)[:, : int(np.ceil(0.75 * fit.error.shape[1]))]
+    return np.sqrt(np.mean(error**2, axis=1))
+
+
+def fit_points(points: Points) -> Fit:
+    """Return where base and reflectors of the nominal robot fit best; of poses their positions."""
+    fit = fit_arms(Candidates.of([points]), STEPS, robust=True)
+    every = 1 if points.turns is None else 4
+    of_points = {name: getattr(fit, name)[0, ::every] for name in ("modelled", "error", "tools")}
+    return Fit(*(each[0] for each in fit))._replace(**of_points)
+
+
+def misfit(points: Points) -> float:
+    """Return the RMS error of the best three quarters of the points over their extent, for the nominal robot."""
+    return float(misfits([points], zeros=False)[0])
+
+
+def misfits(tries: Sequence[Points], zeros: bool = True) -> Array:
+    """Return the same (B,) of many readings of a table, joint zeros fitted by default.
+
+    Of more than `MANY` the quarter that fits best after `FIRST_STEPS` is fitted to the end: only the best one counts.
+    """
+    errors = np.full(len(tries), np.inf)
+    kinds = [(id(points.robot), len(points.row)) for points in tries]
+    for kind in dict.fromkeys(kinds):
+        some = np.flatnonzero([each == kind for each in kinds])
+        candidates = Candidates.of([tries[int(i)] for i in some])
+        extent = np.array([tries[int(i)].extent for i in some])
+        steps = STEPS
+        if len(some) > MANY:
+            fits = fit_arms(candidates, FIRST_STEPS, zeros=zeros, robust=True)
+            errors[some] = rms(fits) / extent
+            best = np.argsort(errors[some])[: max(MANY, len(some) // 4)]
+            candidates = candidates._replace(zero=fits.zero, tools=fits.tools).take(best)
+            some, extent, steps = some[best], extent[best], STEPS - FIRST_STEPS
+        errors[some] = rms(fit_arms(candidates, steps, zeros=zeros, robust=True)) / extent
+    return errors
 
 
 class _State(NamedTuple):
@@ -278,7 +319,7 @@ def _anchored(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Ar
     return base, offset + better * step[3], away, residual[None]
 
 
-def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
+def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
     B, N, coordinates = candidates.y.shape
     damping = np.full(B, 1e-2)
     weights = np.ones((B, N))
@@ -297,14 +338,14 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
 
     def at(weights: Array, zero: Array, tools: Array) -> _State:
         """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
-        turn, p, axes, origins = _flange(robot, candidates.q + zero[:, None])
+        turn, p, axes, origins = _flange(candidates.robot, candidates.q + zero[:, None])
         tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
         points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
         return weighted(weights, zero, tools, points, turn, axes, origins)
 
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
-    columns = size + zeros * len(robot.mdh)
+    columns = size + zeros * candidates.zero.shape[1]
     quiet = 0
     for k in range(steps):
         if robust and k % 2 == 0:
@@ -313,7 +354,7 @@ def _fitted(robot: Robot, candidates: Candidates, steps: int, zeros: bool, robus
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
             kinematics = state.points, state.turn, state.axes, state.origins
             state = weighted(weights, state.zero, state.tools, *kinematics)
-        step = _step(robot, candidates, pull, weights, state, damping, zeros)
+        step = _step(candidates, pull, weights, state, damping, zeros)
         tools = state.tools + step[:, :size].reshape(state.tools.shape)
         zero = state.zero
         if zeros:
@@ -372,9 +413,7 @@ def _cross(a: Array, b: Array) -> Array:
     return np.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
 
 
-def _step(
-    robot: Robot, candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool
-) -> Array:
+def _step(candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool) -> Array:
     """Return the damped Gauss-Newton steps (B, columns): reflectors, joint zeros, then what was eliminated."""
     B, N, coordinates = candidates.y.shape
     M = len(candidates.stated)
@@ -387,7 +426,7 @@ def _step(
             J[:, 3 * m + k] = np.moveaxis(state.turn[k] * seen, 0, 1)
     for j in range(dof):
         slope = state.axes[j]
-        if robot.joint_types[j] == "revolute":
+        if candidates.robot.joint_types[j] == "revolute":
             slope = _cross(slope, state.points - state.origins[j])
         J[:, 3 * M + j] = np.moveaxis(slope, 0, 1)
     for k in range(turning):  # about the base's axes
