@@ -136,6 +136,7 @@ TimeTolerance = Annotated[Number, Option(help="Join files by nearest time, with 
 Several = "several files are stacked, or joined as by new."
 Type = Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")]
 Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
+Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
 Largest = Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
@@ -258,7 +259,7 @@ def new(
     separator: Annotated[str, Option(help="comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
     measurement: Annotated[Text, Option(help="position, pose, cable, distance, ...; guessed from columns.")] = None,
-    validation: Annotated[File, Option(help="A table for validation.")] = None,
+    validation: Annotated[list[Path] | None, Option(help="A table for validation; several are joined.")] = None,
     hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead: 0.25.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
     urdf_base: UrdfBase = None,
@@ -300,6 +301,7 @@ def new(
 def inspect(problem: Problem, variant: Variant = None) -> Answer:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
+        from rpim_opt.basics.text import listed
         from rpim_opt.calibration.lack_of_fit import foreseen
         from rpim_opt.problem.design import observe
         from rpim_opt.problem.diagnosis import inspect
@@ -314,7 +316,7 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         parts = {name: inspect(whole.alone(name), validation.get(name)) for name in whole.arms}
         together = observe(whole) if len(parts) > 1 else None
         say("analysing the residuals of a quick fit")
-        lacking = foreseen(whole)
+        lacking, outliers = foreseen(whole)
     document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
     text = "\n".join(filter(None, [instance.record.title, instance.record.source]))
     for name, part in parts.items():
@@ -324,8 +326,10 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         text += f"\n\nAll together: {together}"
     document["lack_of_fit"] = None
     if lacking is not None:
-        document["lack_of_fit"] = lacking.content()
+        document["lack_of_fit"] = {**lacking.content(), "outliers": [row.label for row in outliers]}
         text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"
+        if outliers:
+            text += f"\nIt excludes as outliers: {listed([str(row) for row in outliers], 10)}."
     return Answer(text, document)
 
 
@@ -401,9 +405,10 @@ def report(
 @command
 def validate(
     result: Result,
-    data: Annotated[list[Path], Argument(help=f"New measurements, in the same instrument's frame; {Several}")],
+    data: Annotated[list[Path], Argument(help=f"New measurements; {Several}")],
     tables: Tables = TABLES,
     limit: Largest = None,
+    register: Register = False,
     out: Table = None,
 ) -> Answer:
     """Validate a result on new measurements; rows outside their prediction intervals are named.
@@ -420,7 +425,7 @@ def validate(
         from rpim_opt.use.validation import validate
 
         read = tables.read(loaded, data)
-        validation = validate(loaded, read.data)
+        validation = validate(loaded, read.data, register)
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
     failed = within is False or validation.mistake or validation.worse
@@ -435,6 +440,7 @@ def accept(
     box: Box = None,
     data: Annotated[list[Path] | None, Option(help=f"New measurements, instead of the result's; {Several}")] = None,
     tables: Tables = TABLES,
+    register: Register = False,
 ) -> Answer:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
 
@@ -442,11 +448,19 @@ def accept(
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.calibration.acceptance import accept
+        from rpim_opt.calibration.held_out import registered
 
-        read = tables.read(loaded, data) if data else None
+        left_out, notes, measured = (), (), None
+        if data:
+            read = tables.read(loaded, data)
+            left_out, notes, measured = read.left_out, read.notes, read.data
+            if register:
+                measured, motion = registered(loaded, measured)
+                notes = (*notes, f"Registered again: the measurements were {motion}.")
+        elif register:
+            raise InputError("--register", "no --data", "new measurements to register")
         say("searching for the maximum uncertainty")
-        acceptance = accept(loaded, console.required(limit, box, loaded.record.requirement), read and read.data)
-    left_out, notes = (read.left_out, read.notes) if read else ((), ())
+        acceptance = accept(loaded, console.required(limit, box, loaded.record.requirement), measured)
     return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], left_out=left_out, notes=notes)
 
 

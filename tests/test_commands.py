@@ -7,6 +7,7 @@ import hashlib
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
@@ -237,6 +238,44 @@ def test_held_out_rows_are_used_once_they_have_validated(monkeypatch, capsys, ma
         capsys.readouterr()
         assert run(monkeypatch, "validate", str(folder), str(made / "validation.csv")) == 0
         assert ("8 of 8 rows of the validation set are identification rows" in capsys.readouterr().out) == used
+
+
+def test_joints_and_points_in_two_files_with_a_point_missing(monkeypatch, capsys, cell, tmp_path) -> None:
+    """As instruments export them, for identification and for validation."""
+    files = []
+    for name in ("measured.csv", "later.csv"):
+        header, rows = table(cell / name)
+        for part, of in (("points", slice(0, 3)), ("joints", slice(3, 9))):
+            path = tmp_path / f"{part}_{name}"
+            lines = [",".join(["Point", *header[of]])]
+            lines += [",".join([f"P{i}", *(repr(float(v)) for v in row[of])]) for i, row in enumerate(rows)]
+            if path.name == "points_measured.csv":
+                lines[8] = lines[8].rpartition(",")[0] + ","  # a beam that broke
+            path.write_text("\n".join(lines) + "\n")
+            files += ["--data" if name == "measured.csv" else "--validation", str(path)]
+    folder = tmp_path / "arm"
+    assert run(monkeypatch, "new", str(folder), "--robot", str(cell / "arm.urdf"), *files, "--units", "rad,m") == 0
+    said = capsys.readouterr().out
+    assert "rows that lack one of their measured values are left out: P7." in said
+    made = ro.load(folder)
+    assert len(made.problem.data) == 39
+    assert made.record.validation is not None
+    assert len(made.record.validation) == 100
+    assert len([name for name in made.record.files if name.endswith("(raw data)")]) == 4
+
+
+def test_a_noise_that_nobody_stated_is_called_assumed(monkeypatch, capsys, made, tmp_path) -> None:
+    folder = tmp_path / "arm"
+    shutil.copytree(made, folder)
+    assert run(monkeypatch, "calibrate", str(folder), "--out", str(folder / "results")) == 0
+    assert "noise is assumed, not stated" in capsys.readouterr().out
+    assert run(monkeypatch, "report", str(folder / "results"), "--out", str(tmp_path / "report.html")) == 0
+    assert "noise is assumed, not stated" in (tmp_path / "report.html").read_text()
+    text = (folder / "problem.toml").read_text()
+    (folder / "problem.toml").write_text(re.sub(r"noise_assumed = true.*\n", "", text))
+    capsys.readouterr()
+    assert run(monkeypatch, "calibrate", str(folder)) == 0
+    assert "assumed" not in capsys.readouterr().out
 
 
 def test_the_file_that_was_handed_over_is_named_with_its_digest(cell, made) -> None:

@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
-from rpim_opt.bayes.outliers import beyond_noise, outlier_candidates, unexplained
+from rpim_opt.bayes.outliers import beyond_noise, error_vectors, outlier_candidates, unexplained
 from rpim_opt.bayes.prior_terms import Stated
 from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.blocks import Source
@@ -83,13 +83,18 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
     laid = problem.with_parameters(fit.laid.parameters).with_repeatability(fit.laid.repeatability)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
         outliers = beyond_noise(laid, fit.x)
+    left_out: list[LeftOut] = []
     if outliers:
+        vectors = np.concatenate([error_vectors(part, fit.x) for part in laid.rows()])
+        size = dict(zip(laid.labels, np.linalg.norm(vectors, axis=1).tolist(), strict=True))
+        for label, ratio in sorted(outliers.items(), key=lambda item: -item[1]):
+            left_out.append(LeftOut(label, ratio, size[label] if np.isfinite(size[label]) else None))
         laid = laid.without(outliers)
     hyperparameters = learned(
         fit,
         gain,
         trials=trials,
-        left_out=tuple(LeftOut(*item) for item in sorted(outliers.items(), key=lambda item: -item[1])),
+        left_out=tuple(left_out),
         added=tuple(name for name in fit.problem.parameters.free.names if name not in requested),
     )
     return Estimated(laid, replace(hyperparameters, notes=(*notes, *hyperparameters.notes)), fit.inside, fit.x)

@@ -66,10 +66,16 @@ class Trial(NamedTuple):
 
 
 class LeftOut(NamedTuple):
-    """A row that was excluded as an outlier: its error [m or rad] over the median of all rows' errors."""
+    """A row that was excluded as an outlier: its error over the median of all rows' errors, and the error [m]."""
 
     label: str
     ratio: float
+    error: float | None = None  # None where the row measures no position
+
+    def __str__(self) -> str:
+        """Return the row with its error."""
+        size = "" if self.error is None else f"{1e3 * self.error:.3g} mm, "
+        return f"{self.label} ({size}{self.ratio:.0f} times the median error)"
 
 
 class Transmitted(NamedTuple):

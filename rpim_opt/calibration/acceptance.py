@@ -375,6 +375,7 @@ def _held_out(
             f"{len(missing)} of {count} rows have errors above the limit plus the instrument's uncertainty: "
             f"{listed(missing, MOST)}."
         )
+        missed += [moved] if moved else []
     lacking: list[str] = []
     if rows < FEWEST:
         lacking.append(f"Lacking: at least {FEWEST} held-out rows; there are {rows}.")
@@ -397,7 +398,7 @@ def _held_out(
         if not any(region.rows(part.data).any() for part in result.problem.rows()):
             lacking.append("Lacking: measurements in the region. No identification row is in it either.")
     if excluded:
-        sentence += f". Not counted: {listed(excluded, MOST)}, excluded as outliers by the fit to all rows"
+        sentence += f". Not counted: {listed(excluded, MOST)}, excluded from the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
     document |= {"beyond": beyond, "excluded": excluded, "coverage95": coverage, "sentence": f"{sentence}."}
     return document, missed, lacking

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
@@ -21,6 +22,8 @@ from rpim_opt.problem.registration.closed_forms import register, transformed
 
 FEWEST = 5
 """Held-out rows below which they say too little."""
+GROSS = 6.0
+"""Factor on the median distance from which on a row does not count for a registration."""
 RARE = 0.01
 """Probability that data like those of the calibration have any row that is named."""
 
@@ -78,25 +81,53 @@ def displaced(result: Calibration, data: Dataset, intervals: Judged) -> str:
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
     if len(rows) < FEWEST or not (intervals.sigmas > intervals.allowed)[rows].any():
         return ""
-    measured = result.measured_positions(data)[rows]
-    predicted = measured - vectors[rows]
     try:
-        motion = register(predicted, measured)
+        again, motion = registered(result, data)
     except InputError:  # points on a line
         return ""
-    before = float(np.sqrt(np.mean(vectors[rows] ** 2)))
-    after = float(np.sqrt(np.sum((measured - transformed(motion, predicted)) ** 2) / (3 * len(rows) - 6)))
+    before = float(np.sqrt(3 * np.mean(vectors[rows] ** 2)))
+    after = float(np.sqrt(3 * np.sum(result.error_vectors(again)[rows] ** 2) / (3 * len(rows) - 6)))
     if after > before / 2:
         return ""
-    centre = predicted.mean(axis=0)
-    shift = 1e3 * np.linalg.norm(transformed(motion, centre) - centre)
-    turn = 1e3 * np.arccos(np.clip((np.trace(motion[:3, :3]) - 1) / 2, -1, 1))
     return (
-        f"Likely: the instrument or the base moved. The measurements are displaced together by {shift:.3g} mm and "
-        f"{turn:.3g} mrad; registered again, their RMS error is {1e3 * np.sqrt(3) * after:.3g} mm in place of "
-        f"{1e3 * np.sqrt(3) * before:.3g} mm. `update --reset 'base_*'` registers it again. If neither moved, "
-        "the robot errs alike at these configurations."
+        f"Likely: the instrument or the base moved. The measurements are {motion}; registered again, their RMS error "
+        f"is {1e3 * after:.3g} mm in place of {1e3 * before:.3g} mm. `validate` and `accept` do so with --register, "
+        "`update --reset 'base_*'` recalibrates. If neither moved, the robot errs alike at these configurations."
     )
+
+
+def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
+    """Return measurements after the motion of the instrument that registers them best, and that motion in words.
+
+    Positions, poses and their covariances turn, lengths stay. The motion takes six degrees of freedom; rows beyond
+    six times the median distance do not count for it. InputError for fewer than five positions, and points on a line.
+    """
+    vectors = result.error_vectors(data)
+    rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
+    if len(rows) < FEWEST:
+        raise InputError("register", f"{len(rows)} measured positions", f"at least {FEWEST}")
+    measured = result.measured_positions(data)[rows]
+    predicted = measured - vectors[rows]
+    first = register(measured, predicted)
+    left = np.linalg.norm(predicted - transformed(first, measured), axis=1)
+    kept = left <= GROSS * np.median(left)
+    motion = register(measured[kept], predicted[kept])
+    turn = Rotation.from_matrix(motion[:3, :3])
+    blocks = []
+    for block in data.blocks:
+        columns = list(block.measurement.columns)
+        y, covariance = block.y.copy(), block.covariance
+        if columns[:3] == ["x", "y", "z"]:
+            y[:, :3] = transformed(motion, y[:, :3])
+            parts = np.kron(np.eye(covariance.shape[-1] // 3), motion[:3, :3])
+            covariance = parts @ covariance @ parts.T
+        if columns[3:] == ["qw", "qx", "qy", "qz"]:
+            y[:, 3:] = (turn * Rotation.from_quat(y[:, [4, 5, 6, 3]])).as_quat()[:, [3, 0, 1, 2]]
+        blocks.append(replace(block, y=y, covariance=covariance))
+    centre = measured.mean(axis=0)
+    shift = 1e3 * np.linalg.norm(transformed(motion, centre) - centre)
+    text = f"displaced together by {shift:.3g} mm and {np.degrees(turn.magnitude()):.3g} degrees"
+    return replace(data, blocks=tuple(blocks)), text
 
 
 def excluded_by_fit(result: Calibration) -> list[str]:
@@ -130,10 +161,12 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
         raise InputError("refit_all", "data in blocks", "measurements in memory")
     used = len(original.data)
     whole = Dataset.together([original.data, apart], ["identification", "validation"])
-    errors = result.nominal_errors(apart), result.errors(apart)
-    held_out = HeldOut(whole.label[used:], used, *errors, *judged(result, apart))
-    record = replace(result.record, validation=None, held_out=held_out)
     refitted = result.asked(original.on(whole))
+    labels = whole.label[used:]
+    kept = np.flatnonzero(np.isin(labels, refitted.problem.labels))
+    errors = result.nominal_errors(apart), result.errors(apart)
+    judgement = judged(result, apart)._replace(coverage=judged(result, apart.take(kept)).coverage)
+    record = replace(result.record, validation=None, held_out=HeldOut(labels, used, *errors, *judgement))
     if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)
         refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))

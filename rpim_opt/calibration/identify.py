@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from itertools import count
@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.text import counted
+from rpim_opt.basics.text import counted, joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
 from rpim_opt.bayes.hyperparameters import Estimator
@@ -46,7 +46,6 @@ FAR = 1000.0
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
 ZERO = 0.1
 """Standard deviation [rad] of a joint's zero that was found from the data."""
-ELSEWHERE = "The stated frames are far from their registration; deviations refer to the registered frames."
 
 
 @one_blas_thread
@@ -158,6 +157,7 @@ def calibrate(
             zeros = [Statement((f"theta{i + 1}",), ("angle",), wide, (0.0,), whole=True) for i in own]
             prior = (prior or Prior()) & Prior(statements=tuple(zeros))
         elsewhere = relocated(problem)
+    notes = [] if elsewhere is None else _displaced_frames(problem, elsewhere)
     problem = elsewhere or problem
     again: Callable[[Source], Calibration] = partial(
         calibrate,
@@ -183,8 +183,8 @@ def calibrate(
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
-    sentences = [ending(ended, max_iterations), ELSEWHERE if elsewhere else "", mapping.sentence if mapping else ""]
-    message = " ".join(filter(None, sentences))
+    notes += [mapping.sentence] if mapping else []
+    message = " ".join([ending(ended, max_iterations), *notes])
     LOGGER.info(message)
     return Calibration(
         problem=problem,
@@ -197,7 +197,7 @@ def calibrate(
         history=ended.state.history,
         program=ended.state.program,
         certificate=ended.certificate,
-        asked=mapped_as(mapping, again),
+        asked=mapped_as(mapping, again, notes),
         learned=learned,
         mapping=mapping,
     )
@@ -244,13 +244,36 @@ def ending(ended: Ended, most: int) -> str:
     return " ".join(filter(None, [f"Not converged: {why}", state.choice.note]))
 
 
-def mapped_as(mapping: JointMapping | None, asked: Callable[[Source], Calibration]) -> Callable[[Source], Calibration]:
-    """Return a calibration of problems with estimated joint mappings, with notes on them."""
-    return asked if mapping is None else partial(_mapped, mapping, asked)
+def _displaced_frames(stated: Source, registered: Source) -> list[str]:
+    """Say how far stated frames are from their registration; nothing of those at the origin, which nobody stated."""
+    p, q = stated.parameters, registered.parameters
+    far = []
+    for prefix in (name[:-2] for name in p.names if name.endswith("_rx")):
+        at = [p.names.index(prefix + axis) for axis in "xyz"]
+        apart = 1e3 * float(np.linalg.norm(q.nominal[at] - p.nominal[at]))
+        if apart > 0 and p.nominal[at].any():
+            where = ", ".join(f"{1e3 * value:.0f}" for value in q.nominal[at])
+            far.append(f"{prefix[:-1]} by {apart:.0f} mm (registered at {where} mm)")
+    if not far:
+        return []
+    return [
+        f"Stated frames are far from their registration, to which deviations refer: {joined(far)}. The flange frame is "
+        "that of the DH table after the last joint; that of a data sheet may be turned."
+    ]
 
 
-def _mapped(mapping: JointMapping, asked: Callable[[Source], Calibration], problem: Source) -> Calibration:
-    return replace(asked(problem), mapping=mapping)
+def mapped_as(
+    mapping: JointMapping | None, asked: Callable[[Source], Calibration], notes: Sequence[str] = ()
+) -> Callable[[Source], Calibration]:
+    """Return a calibration of problems with estimated joint mappings or registered frames, with notes on them."""
+    return partial(_mapped, mapping, notes, asked) if mapping or notes else asked
+
+
+def _mapped(
+    mapping: JointMapping | None, notes: Sequence[str], asked: Callable[[Source], Calibration], problem: Source
+) -> Calibration:
+    result = asked(problem)
+    return replace(result, mapping=mapping, message=" ".join([result.message, *notes]))
 
 
 def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration], None]:

@@ -14,15 +14,13 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.bayes.hyperparameters import sampled
+from rpim_opt.bayes.hyperparameters import LeftOut, sampled
 from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Comparison, Judged
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import UNITS
-from rpim_opt.convex.formulation import tikhonov
-from rpim_opt.convex.select import reml
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
@@ -277,12 +275,16 @@ def judged(result: Outcome) -> LackOfFit | None:
         return None
 
 
-def foreseen(problem: Source) -> LackOfFit | None:
-    """Return the lack of fit of a quick fit of the geometry to at most 60 configurations; None if it fails."""
+def foreseen(problem: Source) -> tuple[LackOfFit | None, list[LeftOut]]:
+    """Return the lack of fit of a quick fit of the geometry to at most 60 configurations, and its outliers.
+
+    None if the fit fails.
+    """
     try:
-        return judged(calibrate(sampled(problem, QUICK), tikhonov, reml))
+        result = calibrate(sampled(problem, QUICK))
+        return judged(result), [] if result.learned is None else list(result.learned.left_out)
     except (InputError, NoSolutionFound, np.linalg.LinAlgError):
-        return None
+        return None, []
 
 
 # --- parts of the residuals -------------------------------------------------------------------------------------------

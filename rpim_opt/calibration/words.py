@@ -166,7 +166,7 @@ def weight_lines(result: Outcome) -> list[str]:
 
 
 def remarks(result: Outcome) -> list[str]:
-    """Return remarks on outliers, active bounds and convergence."""
+    """Return remarks on outliers, active bounds, an assumed noise and convergence."""
     lines = _outlying(result)
     for held in result.active_bounds[:MOST_BOUNDS]:
         unit, si = display(result.problem.parameters.dimension_of(held.name))
@@ -184,6 +184,11 @@ def remarks(result: Outcome) -> list[str]:
     lines += [price.sentence() for price in result.shadow_prices]
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result file cannot hold: it cannot be solved again.")
+    if result.record.noise_assumed:
+        lines.append(
+            "The measurement noise is assumed, not stated; uncertainties and verdict depend on it. State the "
+            "instrument's in [noise] of problem.toml and remove noise_assumed."
+        )
     return [*lines, result.message]
 
 
@@ -222,7 +227,7 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         if ratio[i] > UNUSUAL:
             cause = ": an error of assembly or of its zero" if is_joint_offset(names[i]) else ""
             unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
-    excluded = [f"{row.label} ({row.ratio:.0f} times the median error)" for row in learned.left_out]
+    excluded = [str(row) for row in learned.left_out]
     lines = [
         *_scale_lines(learned),
         *_noise_lines(learned),

@@ -76,8 +76,8 @@ class HeldOut:
 
     ``label`` are N held-out rows, ``used`` is how many rows the parameters that were judged came from; ``nominal`` and
     ``error`` (N,) are errors before and after [m], NaN for rows that measure no length. ``sigmas`` and ``allowed`` (N,)
-    are as of `Validation`; ``coverage`` is the share of the lengths in the 95 % interval of a reading; None without
-    covariance.
+    are as of `Validation`; ``coverage`` is the share of the lengths in the 95 % interval of a reading, without rows
+    that the final fit excludes; None without covariance.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibration.refit_all(ro.load("position").calibrate())
@@ -126,8 +126,9 @@ class Record:
 
     ``title`` and ``source`` say what was calibrated and where every figure comes from. ``validation`` are measurements
     that no step of the calibration saw, ``files`` the SHA-256 of the input files by name, ``excluded`` the rows that
-    were left out, label to reason; ``simulated`` is whether the measurements are. It was ``made`` then (UTC, ISO 8601),
-    by packages of these ``versions``. ``details`` say who measured, when, with which instrument, as somebody stated it.
+    were left out, label to reason; ``simulated`` is whether the measurements are, ``noise_assumed`` whether their noise
+    is a guess. It was ``made`` then (UTC, ISO 8601), by packages of these ``versions``. ``details`` say who measured,
+    when, with which instrument, as somebody stated it.
 
     The ``requirement`` is what the robot is accepted by, if anything is; ``held_out`` are rows that were judged before
     they were used, None where validation data are still unused; ``earlier`` the calibrations that this one carries on
@@ -147,6 +148,7 @@ class Record:
     files: Mapping[str, str] = field(default_factory=dict)
     excluded: Mapping[str, str] = field(default_factory=dict)
     simulated: bool = False
+    noise_assumed: bool = False
     made: str = ""
     versions: Mapping[str, str] = field(default_factory=dict)
     details: Mapping[str, str] = field(default_factory=dict)

@@ -161,7 +161,7 @@ class Inspection(Tabled):
             lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
         if self.standing_out:
             named = listed([f"{label} ({self._mm[label]:.2f} mm)" for label in self.standing_out], 10)
-            lines.append(f"Exceptionally large nominal error: {named}.")
+            lines.append(f"Exceptionally large error of the nominal robot, or an outlier: {named}.")
         notes = self._notes()
         parts = [
             table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),

@@ -210,7 +210,8 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     notes = [
         "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
         "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
-        "of the configurations that reach it, at any depth. Axes of the robot's base.",
+        "of the configurations that reach it, at any depth. Axes of the robot's base. Not included is what no reading "
+        "varied: the instrument's scale, temperature and loads other than those measured.",
     ]
     required = result.record.requirement is not None
     limit = 1e3 * map_.requirement.limit if required else None
@@ -226,7 +227,13 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         title = f"Largest expanded uncertainty of the position reached, {view}"
         drawn.append(figure(draw, title, f"{view.capitalize()}.{frame}", height))
     yield "figures", drawn
-    yield "table", _budget(map_, result)
+    units = joint_columns(map_.region.problem.robot.joint_dimensions)
+    ranges = [
+        [*name.split("_"), f"{low / si:.2f}", f"{high / si:.2f}"]
+        for (name, si), (low, high) in zip(units.items(), map_.region.limits, strict=True)
+    ]
+    ranges_table = ("table", Table("Joint ranges of the region", ["joint", "unit", "from", "to"], ranges))
+    yield "beside", [("table", _budget(map_, result)), ranges_table]
 
 
 def _budget(map_: Workspace, result: Calibration) -> Table:
@@ -259,7 +266,8 @@ def _parameters(content: Content) -> Iterator[Block]:
         half = uncertainty.coverage_factor * np.sqrt(np.diag(result.covariance))
         k = f"k = {uncertainty.coverage_factor:.2f}"
         head[4] = f"U ({k})"
-        note = f"U = k u is the expanded uncertainty ({k}, 95 %), from measurement noise and prior."
+        t = f"Student's t with {result.freedom:.0f} degrees of freedom"
+        note = f"U = k u is the expanded uncertainty ({k}, 95 %, {t}), from measurement noise and prior."
     tolerance = plot.active_tolerance(result)
     held = {each.name for each in result.active_bounds}
     rows = []
@@ -362,7 +370,8 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
             text += f" Unidentifiable (no measurement depends on them): {', '.join(observability.unidentifiable)}."
         text += (
             " Redundant combinations [mm, mrad], which change no measurement at the nominal parameters; the "
-            "penalty determines them, and predictions do not depend on them."
+            "penalty determines them. Predictions of what was measured do not depend on them; those of another point "
+            "on the flange or of its orientation may."
         )
     yield "text", [text]
     yield "bullets", redundant
@@ -382,7 +391,12 @@ def _flagged(result: Calibration) -> Block:
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
     if result.learned is not None:
         rows += [
-            [row.label, "", "", f"excluded outlier: {row.ratio:.0f} times the median error"]
+            [
+                row.label,
+                "",
+                "" if row.error is None else mm(1e3 * row.error),
+                f"excluded outlier, {row.ratio:.0f} x the median error",
+            ]
             for row in result.learned.left_out
             if row.label not in result.record.excluded
         ]

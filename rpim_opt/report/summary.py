@@ -66,8 +66,11 @@ def error_rows(result: Calibration) -> list[dict[str, Any]]:
             rows.append(_figures("identification, rows not flagged", others))
     held = result.record.held_out
     if held is not None:
-        what = f"held out, from {held.used} rows"
-        rows += [_figures(f"{what}, nominal", held.nominal), _figures(f"{what}, identified", held.error)]
+        name, nominal, identified = headline_errors(result)
+        what = f"{name}, from {held.used} rows"
+        rows += [_figures(f"{what}, nominal", nominal), _figures(f"{what}, identified", identified)]
+        if len(identified) < len(held.label):
+            rows.append(_figures("held out, excluded rows too, identified", held.error))
     return rows
 
 
@@ -169,10 +172,14 @@ def acceptance(result: Calibration) -> Acceptance | None:
 
 
 def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
-    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified."""
+    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified.
+
+    Of held-out rows those count that the final fit does not exclude as outliers.
+    """
     held = result.record.held_out
     if held is not None:
-        return "held out", held.nominal, held.error
+        kept = ~np.isin(held.label, excluded_by_fit(result))
+        return "held out", held.nominal[kept], held.error[kept]
     name, data = next(iter(sets(result).items()))
     return name, result.nominal_errors(data), result.errors(data)
 
@@ -210,11 +217,10 @@ def headline(result: Calibration) -> str:
             f"from all {len(result.problem.labels)}."
         )
         excluded = excluded_by_fit(result)
-        used = held.error[~np.isin(held.label, excluded)]
-        if excluded and np.isfinite(used).any():
+        if excluded and np.isfinite(held.error).any():
             sentence += (
-                f" Without {listed(excluded)}, excluded as outliers by that fit and not counted by an acceptance test, "
-                f"the mean error is {mm(1e3 * float(np.nanmean(used)))} mm."
+                f" Not counted: {listed(excluded)}, excluded from the fit to all rows; with all held-out rows the mean "
+                f"error is {mm(1e3 * float(np.nanmean(held.error)))} mm."
             )
     if result.record.earlier:
         last = result.record.earlier[-1]

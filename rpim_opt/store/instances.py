@@ -190,6 +190,7 @@ def load(
         },
         excluded=table.exclude,
         simulated=bool(table.simulation),
+        noise_assumed=table.noise_assumed,
         details=details,
         requirement=requirement,
         reading=table.reading,

@@ -83,7 +83,7 @@ def new_problem(
     *,
     measurement: str | None = None,
     options: TableOptions | None = None,
-    validation: str | Path | None = None,
+    validation: str | Path | Sequence[str | Path] | None = None,
     hold_out: float | None = None,
     seed: int = 0,
     urdf_base: str | None = None,
@@ -96,12 +96,12 @@ def new_problem(
     """Make a problem folder that `load` reads, completely or not at all.
 
     Arguments that are not named here are as for `understand_tables`. ``folder`` is a new one, or for one more chain
-    one whose problem file has chains of the same URDF. ``validation`` is a table, or ``hold_out`` the part of the
-    configurations that is drawn at random with ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem on the
-    origins of a URDF's joints; a chain that goes up the tree through joints that move and down again always is one.
-    ``target`` is what a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is called
-    with what was understood of the tables, before anything is computed. Raises InputError for a folder that is there
-    already, and whatever of the robot or the data cannot be used.
+    one whose problem file has chains of the same URDF. ``validation`` is a table or several, or ``hold_out`` the part
+    of the configurations that is drawn at random with ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem
+    on the origins of a URDF's joints; a chain that goes up the tree through joints that move and down again always is
+    one. ``target`` is what a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is
+    called with what was understood of the tables, before anything is computed. Raises InputError for a folder that is
+    there already, and whatever of the robot or the data cannot be used.
 
     Examples
     --------
@@ -119,10 +119,11 @@ def new_problem(
     before = _with_chains(folder, source, chain)
     chain = chain or branching_tip(source, urdf_base, urdf_tip)
     options = options or TableOptions()
-    if validation is not None and hold_out is not None:
+    if validation and hold_out is not None:
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
     arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
     paths = [data] if isinstance(data, str | Path) else data
+    later = [validation] if isinstance(validation, str | Path) else list(validation or ())
     understanding = understand_of(arm, paths, measurement, options)
     if understood is not None:
         understood(understanding)
@@ -143,16 +144,16 @@ def new_problem(
     if hold_out is not None:
         tables[names[VALIDATION]] = _rows(columns, held)
         rows = rows.take(np.flatnonzero(~held))
-    if validation is not None:
-        other = understand_of(arm, [validation], kind.name, understanding.options)
+    if later:
+        other = understand_of(arm, later, kind.name, understanding.options)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[names[VALIDATION]] = other.columns
         if understood is not None:
             understood(other)
-        validated_by = f'validation = "{names[VALIDATION]}"\n# from {Path(validation).name}; used for no choice'
+        validated_by = f'validation = "{names[VALIDATION]}"\n# from {Path(other.file).name}; used for no choice'
     if board.table:
         tables[names[TARGET]] = board.table
-    handed = [Path(file) for file in (*paths, validation) if file is not None]
+    handed = [Path(file) for file in (*paths, *later)]
     links = [("urdf_base", urdf_base), ("urdf_tip", urdf_tip)]
     followers = [f"{i}" for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading]
     context = {
@@ -170,6 +171,7 @@ def new_problem(
         "validation": validated_by,
         "raw": {toml(str(name)): sha256_of(file) for name, file in zip(_names(handed), handed, strict=True)},
         "fixture": kind.start is not None,
+        "assumed": not any(name.startswith(("sigma", "u95")) for name in columns),
         "reading": [
             (name, toml(text)) for name, text in replace(understanding.options, joints=arm.names).texts().items()
         ],
@@ -189,6 +191,11 @@ def new_problem(
         guessed,
         f"Assumed measurement noise (1 sigma) where no column states it: {assumed}, in [noise] of problem.toml.",
     ]
+    if source.suffix.lower() == ".csv" and arm.tool.any():  # a DH table in another convention than the modified one
+        notes.append(
+            "[tool] and --tool count in the flange frame after the last joint. In it the last frame of the DH table is "
+            f"at {placed(arm.tool)}: state points of the table's frame there."
+        )
     if before:
         notes.append(SHARED)
     elif chain:

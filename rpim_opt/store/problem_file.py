@@ -188,6 +188,8 @@ class ProblemTable(Table):
     """Table of the validation data."""
     held_out: bool = False
     """Validation data were drawn from the same table: once they have validated, all rows are used."""
+    noise_assumed: bool = False
+    """The measurement noise is a guess, which results and reports say."""
     raw: dict[str, str] = Field(default_factory=dict)
     """Files from which `new` made the tables: name = SHA-256."""
     observation: list[Observation] = Field(default_factory=list)

@@ -265,9 +265,12 @@ def update(
         {robot: ranges.tolist() for robot, ranges in result.ranges.items()}, prior_inflation, released, left_out,
     )  # fmt: skip
     excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
+    source = f"New measurements; of the earlier calibration: {record.source}" if record.source else ""
+    if record.earlier:
+        source = record.source
     record = Record(
-        record.title, record.source, excluded=excluded, simulated=record.simulated, earlier=(*record.earlier, last),
-        terms=record.terms,
+        record.title, source, excluded=excluded, simulated=record.simulated, requirement=record.requirement,
+        earlier=(*record.earlier, last), terms=record.terms,
     )  # fmt: skip
     return Update(replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data))
 
@@ -353,7 +356,9 @@ class Misfit:
         chi^2 = e' e        it falls by  g' G^-1 g,    g = D' e,    G = D' M D
     """
 
-    def __init__(self, result: Calibration, model: LinearModel, prior: Quadratic) -> None:
+    def __init__(
+        self, result: Calibration, model: LinearModel, prior: Quadratic, reset: np.ndarray | None = None
+    ) -> None:
         sigma = np.sqrt(result.variance_factor)
         self.freedom = max(result.freedom, 1.0)
         self.m = len(model.b)
@@ -365,8 +370,10 @@ class Misfit:
         self.Q = U[:, s > RANK_TOLERANCE * s[0]]
         self.e = y - self.Q @ (self.Q.T @ y)
         squares = float(self.e @ self.e)
-        # all of it has as many degrees of freedom as there are readings
-        self.fit = Fit(squares, self.m, self._p_value(squares, self.m))
+        # as many degrees of freedom as there are readings, less those that parameters without a prior take
+        taken = 0 if reset is None else int(np.linalg.matrix_rank(self.A[:, reset]))
+        freedom = max(self.m - taken, 1)
+        self.fit = Fit(squares, freedom, self._p_value(squares, freedom))
 
     def projected(self, rows: slice | np.ndarray, values: Array) -> tuple[Array, Array]:
         """Return g (p,) and G (p, p) of a change whose D has these values in some rows, and zeros in the others."""
@@ -408,8 +415,9 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
     Kinds of causes are as likely as each other before the readings, and so are the causes of a kind.
     """
     model = updated.program.model
-    misfit = Misfit(result, model, updated.program.penalty_form or identity(len(updated.x)))
     free = updated.problem.parameters.free
+    prior = updated.program.penalty_form or identity(len(updated.x))
+    misfit = Misfit(result, model, prior, np.isin(free.names, released))
     width = _widths(result, updated.problem) / free.scale
     causes: list[Cause] = []
     logs: list[float] = []

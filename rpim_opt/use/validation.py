@@ -13,7 +13,7 @@ from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import displaced, judged
+from rpim_opt.calibration.held_out import displaced, judged, registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import REACH, arm_length, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
@@ -130,10 +130,11 @@ class Validation:
         return {"label": self.label, **{name: values.tolist() for name, values in columns.items()}}
 
 
-def validate(result: Calibration, data: Dataset) -> Validation:
+def validate(result: Calibration, data: Dataset, register: bool = False) -> Validation:
     """Return the errors of a calibration on new measurements, compared with its predicted uncertainty.
 
-    ``data`` are in the same instrument's frame, by reflectors of the calibration, which may be one of `load_result`.
+    ``data`` are by reflectors of the calibration, which may be one of `load_result`, and in the same instrument's frame
+    or, if they ``register``, in any: then the motion that fits them best is applied before they are judged.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
@@ -141,11 +142,15 @@ def validate(result: Calibration, data: Dataset) -> Validation:
     >>> f"{1e3 * found.error.mean():.3f} mm", found.beyond  # no row that the uncertainty does not explain
     ('0.032 mm', ())
     """
+    remarks: list[str] = []
+    if register:
+        data, motion = registered(result, data)
+        remarks.append(f"Registered again, which takes 6 degrees of freedom: the measurements were {motion}.")
     problem = result.problem.sample()
     nominal = result.nominal_errors(data)
     error = result.errors(data)
     touched = touch_errors(data, nominal, error)
-    remarks = list(shared_rows(problem.data, data))
+    remarks += shared_rows(problem.data, data)
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
@@ -164,6 +169,6 @@ def _elsewhere(result: Calibration, error: Array) -> str:
         return ""
     return (
         f"Median error {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's own effects stay below "
-        f"{100 * REACH:g} % of the arm's length. The instrument or the base may have moved (`update --reset 'base_*'` "
-        "registers it again), or these are another robot's measurements."
+        f"{100 * REACH:g} % of the arm's length. The instrument or the base may have moved (--register registers it "
+        "again), or these are another robot's measurements."
     )

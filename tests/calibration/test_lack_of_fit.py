@@ -172,12 +172,25 @@ def test_paragraph_of_a_file_is_that_of_the_result(tmp_path):
 
 def test_quick_look_agrees_with_the_calibration():
     problem = arm(1, compliance=BENT)
-    quick = foreseen(problem)
+    quick, outliers = foreseen(problem)
     assert quick is not None
+    assert not outliers
     full = lack_of_fit(ro.calibrate(problem))
     assert quick.missing == full.missing
     assert quick.share == pytest.approx(full.share, abs=0.02)
-    assert "too few to separate" in str(foreseen(problem.on(problem.data.take([0, 1]))))
+    assert "too few to separate" in str(foreseen(problem.on(problem.data.take([0, 1])))[0])
+
+
+def test_the_quick_look_leaves_out_what_the_calibration_leaves_out():
+    problem = arm(1)
+    y = problem.data.blocks[0].y.copy()
+    y[5, 2] += 0.008
+    spoiled = problem.on(ro.Dataset.of(problem.data.q, y, NOISE))
+    quick, outliers = foreseen(spoiled)
+    assert [row.label for row in outliers] == [spoiled.labels[5]]
+    assert outliers[0].error == pytest.approx(0.008, rel=0.1)
+    assert quick is not None
+    assert quick.left < 2 * ROOT3 * NOISE
 
 
 def test_what_did_not_converge_is_not_judged():

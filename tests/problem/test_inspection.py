@@ -63,7 +63,7 @@ def test_rows_that_stand_out_are_named() -> None:
     y[[3, 17]] += [0.05, 0.0, 0.0]
     found = inspect(problem.on(replace(problem.data, blocks=(replace(block, y=y),))))
     assert set(found.standing_out) == {"c3", "c17"}
-    assert "Exceptionally large nominal error: " in str(found)
+    assert "Exceptionally large error of the nominal robot, or an outlier: " in str(found)
 
 
 def test_repeated_rows_tell_the_repeatability() -> None:

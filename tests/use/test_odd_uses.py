@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.problem.blocks import PartitionedProblem
@@ -204,7 +205,7 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     result = ro.calibrate(instance.problem)
     (block,) = instance.validation.blocks
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.5, -0.2, 0.1])),))
-    assert "registers it again" in ro.use.validate(result, moved).mistake
+    assert "--register" in ro.use.validate(result, moved).mistake
     # less than the nominal robot's errors, many times the prediction intervals
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.0005, -0.0006, 0.0002])),))
     assert "displaced together by 0.80" in ro.use.validate(result, moved).mistake
@@ -212,6 +213,34 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     assert accepted.verdict == "undecided"
     assert "the instrument or the base moved" in str(accepted)
     assert not ro.use.validate(result, instance.validation).mistake
+    rejected = ro.calibration.accept(result, ro.data.Requirement(limit=2e-4), moved)
+    assert rejected.verdict == "rejected"
+    assert "the instrument or the base moved" in str(rejected)  # a good robot is not rejected without a hint
+
+
+@pytest.mark.parametrize("name", ["position", "pose"])
+def test_measurements_of_an_instrument_that_moved_are_registered_again(name: str) -> None:
+    instance = ro.load(name)
+    result = ro.calibrate(instance.problem)
+    (block,) = instance.validation.blocks
+    y = block.y.copy()
+    y[3, :3] += 0.008  # a broken beam does not move the frame
+    stayed = replace(instance.validation, blocks=(replace(block, y=y.copy()),))
+    there = ro.use.validate(result, stayed, register=True)
+    turn = Rotation.from_rotvec([0.2, -1.0, 0.4])
+    y[:, :3] = turn.apply(y[:, :3]) + np.array([2.0, -1.0, 0.5])
+    if y.shape[1] == 7:
+        y[:, [4, 5, 6, 3]] = (turn * Rotation.from_quat(y[:, [4, 5, 6, 3]])).as_quat()
+    moved = replace(instance.validation, blocks=(replace(block, y=y),))
+    again = ro.use.validate(result, moved, register=True)
+    assert again.error == pytest.approx(there.error, abs=1e-9)
+    assert again.angle == pytest.approx(there.angle, abs=1e-7, nan_ok=True)
+    assert np.delete(again.error, 3).max() <= np.delete(ro.use.validate(result, stayed).error, 3).max()
+    assert again.beyond[0] == 3
+    assert not again.mistake
+    assert "Registered again, which takes 6 degrees of freedom" in str(again)
+    with pytest.raises(ro.InputError, match="register: found 3 measured positions"):
+        ro.use.validate(result, moved.take([0, 1, 2]), register=True)
 
 
 def test_a_urdf_that_is_not_there(tmp_path: Path) -> None:

@@ -28,6 +28,8 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 """In the name of a coordinate that is not the robot's own; actual may be either."""
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
 """Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
+INCOMPLETE = 0.25
+"""Share of the rows that may lack one of several values, and are left out then."""
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
@@ -481,10 +483,15 @@ def _rows_with_values(
     notes = []
     for what, stems in row_stems(robot, kind).items():
         own = [cells for name, cells in columns.items() if split_unit(name)[0] in stems]
-        rows = [i for i in range(count) if own and all(is_missing(str(cells[i])) for cells in own)]
-        if rows:
-            notes.append(f"rows without {what} values are left out: {listed([str(labels[i]) for i in rows])}.")
-        out.update(rows)
+        lacking = [sum(is_missing(str(cells[i])) for cells in own) for i in range(count)]
+        none = [i for i in range(count) if own and lacking[i] == len(own)]
+        some = [i for i in range(count) if 0 < lacking[i] < len(own)]
+        if len(some) > INCOMPLETE * count:  # then a column is wrong, which is named where its numbers are read
+            some = []
+        for rows, which in ((none, f"without {what} values"), (some, f"that lack one of their {what} values")):
+            if rows:
+                notes.append(f"rows {which} are left out: {listed([str(labels[i]) for i in rows])}.")
+            out.update(rows)
     usable = [i for i in range(count) if i not in out]
     if columns and not usable:
         raise InputError("the table", "no row with values", "at least one")
