@@ -10,7 +10,7 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.linalg import qr, solve_triangular
+from scipy.linalg import get_lapack_funcs, qr
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.quadratic import Quadratic
@@ -212,6 +212,8 @@ def _settings(attempt: Attempt) -> Any:
     settings.presolve_enable = False
     settings.chordal_decomposition_merge_method = "parent_child"  # the default takes longer than to solve
     settings.equilibrate_enable = False  # rows and columns are scaled already: a quarter fewer iterations
+    if attempt in ((), EQUILIBRATED):  # up to ten take half of the time; a point is judged by its true residuals
+        settings.iterative_refinement_max_iter = 1
     settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = ACCEPTED if attempt else SOUGHT
     settings.reduced_tol_gap_abs = settings.reduced_tol_gap_rel = settings.reduced_tol_feas = ACCEPTED
     for name, value in attempt:
@@ -224,7 +226,12 @@ class Clarabel:
 
     def __init__(self, cones: list[Any], attempts: Sequence[Attempt] = ATTEMPTS):
         self.cones, self.attempts = cones, attempts
+        self.renew()
+
+    def renew(self) -> None:
+        """Forget the solver: the next program has entries at other places."""
         self._solver: Any = None
+        self._numbers: dict[str, Array] = {}
 
     def solve(self, P: Any, q: Array, A: Any, b: Array) -> Any:
         """Return the solution of minimize 1/2 x'P x + q'x subject to b - A x in cones; Unsolved where none is found.
@@ -232,13 +239,14 @@ class Clarabel:
         P (its upper triangle) and A are `csc_matrix` with entries at the same places every time.
         """
         solver, solution = self._solver, SimpleNamespace(status="")
+        numbers = {"P": P.data.copy(), "q": q, "A": A.data.copy(), "b": b}
         for k, attempt in enumerate(self.attempts):
             if k == 0 and solver is not None:
-                solver.update(P=P.data, q=q, A=A.data, b=b)
+                solver.update(**{key: v for key, v in numbers.items() if not np.array_equal(v, self._numbers[key])})
             else:
                 solver = import_module("clarabel").DefaultSolver(P, q, A, b, self.cones, _settings(attempt))
             if k == 0 and solver.is_data_update_allowed():  # not where it decomposes a matrix
-                self._solver = solver
+                self._solver, self._numbers = solver, numbers
             solution = solver.solve()
             if str(solution.status) in SOLVED:
                 return solution
@@ -347,7 +355,8 @@ class Small:
                 return None
             x, multipliers = solution
             slack = p.b[inequalities] - A[inequalities] @ x
-            tight = np.isin(inequalities, face)
+            tight = np.zeros(len(inequalities), dtype=bool)
+            tight[face - p.zero] = True
             dual = multipliers[p.zero :]
             rounding = 1e-9 * max(weight * np.abs(p.q).max(initial=0.0), np.abs(dual).max(initial=0.0))
             met = slack[~tight] >= -1e-11 * (1 + np.abs(p.b[inequalities][~tight]))
@@ -385,11 +394,9 @@ class Small:
         q[0][p.at] += squares.g
         bounds, dense = [residual, p.b - p.A @ x0], [squares.R.ravel()]
         if self.loss is not None and A is not None and b is not None:
-            if self.sizes is None:
-                q[0][p.at] += A.T @ self.loss.q[self.loss.at]
-            q.append(self.loss.q[data.own])
-            bounds.append(data.linked(b - A @ z0))
-            dense.append((data.factors @ A).ravel())
+            q.append(self.loss.q)
+            bounds.append(data.linked(A @ z0 - b))
+            dense.append(-A.ravel())
         cost = np.concatenate(q)
         scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
         P, matrix = data.filled(weight, np.concatenate(dense))
@@ -399,57 +406,48 @@ class Small:
         x[: p.size] += x0
         self.near = x[: p.size]
         own = slice(k, k + len(p.b))
-        point = Point(x[: p.size], z[own], int(solution.iterations))
-        if self.loss is not None and A is not None and b is not None:
-            rest = np.zeros(self.loss.size)
-            if self.sizes is None:
-                rest[self.loss.at] = A @ x[p.at] - b
-            rest[data.own] = x[p.size + k :]
-            point = replace(point, rest=rest)
-        return point, s[own]
+        return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :]), s[own]
 
 
 class _Data:
-    """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those ``own`` to the loss.
+    """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
 
-    Rows: R z - s = y, those of the penalty and of the loss. Entries of the loss are A z - b in its rows; norms are
-    unknowns v, with (v_k, A_k z - b_k) in a second-order cone each. ``factors`` times A and b is what these rows have.
+    Rows: R z - s = y, those of the penalty and of the loss, and what the loss gets: v = A z - b, or for norms
+    (v_k, A_k z - b_k) in a second-order cone each.
     """
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
-        from scipy import sparse
 
         clarabel = import_module("clarabel")
         cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
         top, size = k + len(p.b), p.size + k
         squares = np.arange(k)
-        # entries as (rows, columns, numbers): first R, then A, which other programs have other numbers of
+        # entries as (rows, columns, numbers): R and A, which other programs have other numbers of, and the rest
         dense = [_block(squares, p.at)]
         entries = [(squares, p.size + squares, -np.ones(k)), _entries(p.A, k, 0)]
         curvature = [_entries(p.P, 0, 0, upper=True), (p.size + squares, p.size + squares, np.full(k, 2.0))]
         if loss is not None:
-            self._bounds = loss.b
             cones += loss.linear_cones
+            entries += [_entries(loss.A, top, size)]
+            curvature += [_entries(loss.P, size, size, upper=True)]
+            begin = top + len(loss.b)
             if sizes is None:
-                self.own = np.setdiff1d(np.arange(loss.size), loss.at)
-                by_entry = loss.A[:, loss.at]
-                self._equations = np.flatnonzero(np.diff(by_entry.indptr))
-                self.factors: Any = by_entry[self._equations]
+                links = begin + np.arange(len(loss.at))
+                cones += [clarabel.ZeroConeT(len(links))]
+                entries += [(links, size + loss.at, np.ones(len(links)))]
             else:
-                self.own = np.arange(loss.size)
-                first = len(loss.b) + np.cumsum(sizes + 1) - sizes - 1
-                self._bounds = np.pad(loss.b, (0, len(first) + int(sizes.sum())))
-                self._equations = np.setdiff1d(np.arange(len(loss.b), len(self._bounds)), first)
-                self.factors = -sparse.eye_array(len(self._equations), format="csr")
+                first = begin + np.cumsum(sizes + 1) - sizes - 1
+                links = np.setdiff1d(np.arange(begin, begin + int(np.sum(sizes + 1))), first)
                 cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
-                entries.append((top + first, size + loss.at, -np.ones(len(first))))
-            dense.append(_block(top + self._equations, p.at))
-            entries.append(_entries(loss.A[:, self.own], top, size))
-            curvature.append(_entries(loss.P[self.own][:, self.own], size, size, upper=True))
+                entries += [(first, size + loss.at, -np.ones(len(first)))]
+            dense += [_block(links, p.at)]
+            self._links = links - top
+            self._bounds = np.pad(loss.b, (0, int(links[-1]) + 1 - begin))
             top += len(self._bounds)
-            size += len(self.own)
-        self.matrix, place = _assembled([*dense, *entries], (top, size))
-        self._numbers = place[: sum(len(rows) for rows, _, _ in dense)]
+            size += loss.size
+        self._dense, self._entries, self._shape = dense, entries, (top, size)
+        self._nonzero = np.zeros(sum(len(rows) for rows, _, _ in dense), dtype=bool)
+        self.matrix: Any = None
         self.P, place = _assembled(curvature, (size, size))
         self._curvature = self.P.data.copy()
         self._weighted = np.zeros(len(place), dtype=bool)
@@ -457,15 +455,21 @@ class _Data:
         # a loss's rows come as the user scaled them
         self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
 
-    def linked(self, b: Array) -> Array:
-        """Return the bounds of the loss's rows, from those of the equations (m,)."""
+    def linked(self, r: Array) -> Array:
+        """Return the bounds of the loss's rows, for a residual r (m,) of the equations."""
         bounds = self._bounds.copy()
-        bounds[self._equations] += self.factors @ b
+        bounds[self._links] = r
         return bounds
 
     def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
         """Return P at a weight, and the matrix with the numbers of R (k, n) and of the loss's rows, row by row."""
-        self.matrix.data[self._numbers] = numbers
+        if self.matrix is None or numbers[~self._nonzero].any():  # zeros cost as much as other numbers
+            self._nonzero |= numbers != 0
+            rows, columns, ones = (np.concatenate(each)[self._nonzero] for each in zip(*self._dense, strict=True))
+            self.matrix, place = _assembled([(rows, columns, ones), *self._entries], self._shape)
+            self._numbers = place[: len(rows)]
+            self.clarabel.renew()
+        self.matrix.data[self._numbers] = numbers[self._nonzero]
         self.P.data = np.where(self._weighted, weight, 1.0) * self._curvature
         return self.P, self.matrix
 
@@ -516,6 +520,14 @@ def nearest(p: Canonical, z: Array) -> Array:
     return np.array(solution.x)[p.at]
 
 
+TRTRS: Any = get_lapack_funcs("trtrs", dtype=float)
+
+
+def by_triangle(T: Array, b: Array, transposed: bool = False) -> Array:
+    """Return T^-1 b, or T'^-1 b, of an upper triangle T: SciPy's `solve_triangular` takes five times as long."""
+    return TRTRS(T, b, trans=int(transposed))[0]
+
+
 def on_face(
     squares: Squares, weight: float, p: Canonical, active: np.ndarray, near: Array
 ) -> tuple[Array, Array] | None:
@@ -536,12 +548,12 @@ def on_face(
     order, rank = np.zeros(0, dtype=int), 0
     x = near.copy()
     if len(b):
-        factors: Any = qr(A.T, pivoting=True)
+        factors: Any = qr(A.T, pivoting=True, check_finite=False)
         Q, T, order = factors
         pivots = np.abs(np.diag(T))
         rank = int((pivots > 1e-11 * pivots.max(initial=0.0)).sum())
         Y, Z, T = Q[:, :rank], Q[:, rank:], T[:rank, :rank]
-        x = near + Y @ solve_triangular(T, (b - A @ near)[order[:rank]], trans=1)
+        x = near + Y @ by_triangle(T, (b - A @ near)[order[:rank]], transposed=True)
         if rank < len(b) and np.abs(A @ x - b).max() > 1e-9 * (1 + np.abs(b).max()):
             return None
     if Z.shape[1]:
@@ -550,7 +562,7 @@ def on_face(
         pivots = np.abs(np.diag(L))
         if len(L) == Z.shape[1] and pivots.min() > RANK_TOLERANCE * pivots.max():
             for _ in range(3):
-                x = x - Z @ solve_triangular(L, solve_triangular(L, Z.T @ gradient(x), trans=1))
+                x = x - Z @ by_triangle(L, by_triangle(L, Z.T @ gradient(x), transposed=True))
         else:  # some directions have no curvature: the minimum next to x, unless there is a slope along them
             largest = np.abs(squares.R).max()
             _, values, V = np.linalg.svd(reduced, full_matrices=False)
@@ -566,5 +578,5 @@ def on_face(
                 return None
     multipliers = np.zeros(len(b))
     if rank:
-        multipliers[order[:rank]] = solve_triangular(T, -Y.T @ gradient(x))
+        multipliers[order[:rank]] = by_triangle(T, -Y.T @ gradient(x))
     return x, multipliers

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.expressions import cp, substituted
+from rpim_opt.convex.expressions import cp
 from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
 
 DECREASE = 1e-12
@@ -381,13 +381,7 @@ class Loss:
     @cached_property
     def canonical(self) -> Canonical:
         """The loss in canonical form."""
-        return self._form(self.expression, self.variable)
-
-    def _form(self, expression: Any, variable: Any) -> Canonical:
-        """Return an expression in canonical form; unless it is of norms, P has no squares of the variable itself."""
-        if not self.positive:
-            expression = substituted(expression, {id(variable): cp.multiply(np.ones(variable.size), variable)})
-        return Canonical(expression, [], variable)
+        return Canonical(self.expression, [], self.variable)
 
     @cached_property
     def _evaluated(self) -> Evaluation:
@@ -475,7 +469,7 @@ class Loss:
         """Return the sum of some entries (k,) and the threshold in canonical form."""
         own = cp.Variable(len(which))
         total = cp.sum(_restricted(self.entries, self.variable, own, which))
-        return self._form(total if self.threshold is None else total + self.threshold, own)
+        return Canonical(total if self.threshold is None else total + self.threshold, [], own)
 
     def kink(self, rows: Rows) -> float:
         """Return the largest jump of the slope by residuals of usual size, or where norms are zero; 0 for none."""
