@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
+from functools import wraps
 from pathlib import Path
 from types import MappingProxyType
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple, ParamSpec, TypeVar
 
 Named = TypeVar("Named")
+Answer = TypeVar("Answer")
+Options = ParamSpec("Options")
 LONGEST = 1000
 """Characters of a part of a sentence."""
 MANY = 24
@@ -64,6 +67,17 @@ def in_file(source: object) -> Iterator[None]:
         yield
     except InputError as error:
         raise error.within(source if isinstance(source, str | Path) else None) from None
+
+
+def of_file(function: Callable[Options, Answer]) -> Callable[Options, Answer]:
+    """Let the InputErrors of a function name the file that is its first argument."""
+
+    @wraps(function)
+    def named(*arguments: Options.args, **options: Options.kwargs) -> Answer:
+        with in_file(next(iter((*arguments, *options.values())))):
+            return function(*arguments, **options)
+
+    return named
 
 
 def _one_line(text: str) -> str:

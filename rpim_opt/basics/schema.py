@@ -7,7 +7,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import UNITS, number, quantities
+from rpim_opt.basics.units import UNITS, quantities
 
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
@@ -47,7 +47,7 @@ class Table(BaseModel):
         plain = [field.alias or name for name, field in cls.model_fields.items() if name not in dimensions]
         others = {key: value for key, value in table.items() if key not in plain}
         try:
-            values = quantities(others, dimensions, convert=_scaled, also=plain)
+            values = quantities(others, dimensions, lists=True, also=plain)
         except InputError as error:
             key = error.where.removeprefix("key ") if error.where.startswith("key ") else ""
             raise Misfit(key, error.found, error.accepted) from None
@@ -59,20 +59,14 @@ class Table(BaseModel):
         return converted
 
 
-def _scaled(value: Any, where: str, si: float) -> Any:
-    if isinstance(value, list):
-        return [_scaled(v, where, si) for v in value]
-    return number(value, where) * si
-
-
-def validate(model: type[Model], content: dict[str, Any], file: object) -> Model:
-    """Return ``content`` as an instance of ``model``; InputError for the first invalid key."""
+def validate(model: type[Model], content: dict[str, Any], file: object, table: str = "") -> Model:
+    """Return ``content``, of a table of a file, as an instance of ``model``; InputError for the first invalid key."""
     try:
         return model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
         misfit = (first.get("ctx") or {}).get("error")
-        where = ""
+        where = table
         for part in first["loc"]:  # joint 3.a, as a person counts
             if isinstance(part, int):
                 where += f" {part + 1}"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Iterable, Mapping
 from fnmatch import fnmatchcase
 from functools import cache
 from typing import Any, NamedTuple
@@ -124,13 +124,13 @@ def quantities(
     table: Mapping[str, Any],
     dimensions: Mapping[str, tuple[str, ...]],
     where: str = "",
-    convert: Callable[[Any, str, float], Any] = lambda value, key, si: number(value, key) * si,
+    lists: bool = False,
     also: Iterable[str] = (),
 ) -> dict[tuple[str, str], Any]:
     """Return the values [SI] of a table of quantities, ``{"x_mm": 1.0, "rx_deg": 90}``, by (stem, dimension).
 
     ``dimensions`` are those that stems may have, ``{"x": ("length",), "rx": ("angle",)}``; ``where`` is what errors
-    call the table; ``convert`` gets a value, its key and the unit's size; ``also`` are further keys to list.
+    call the table; with ``lists`` a value may be numbers in lists; ``also`` are further keys to list.
     """
     result: dict[tuple[str, str], Any] = {}
     for key, value in table.items():
@@ -144,18 +144,18 @@ def quantities(
             raise InputError(place, "no unit of the right dimension", ", ".join(spelled(stem, dimensions[stem])))
         if (stem, unit.dimension) in result:
             raise InputError(place, "the same quantity twice", "one of them")
-        result[stem, unit.dimension] = convert(value, place, unit.si)
-        _require_size(result[stem, unit.dimension], place, unit)
+        result[stem, unit.dimension] = _in_si(value, place, unit, lists)
     return result
 
 
-def _require_size(value: Any, where: str, unit: Unit) -> None:
-    """Refuse a value [SI], or one in a list, too large for any robot or instrument."""
-    if isinstance(value, list):
-        for each in value:
-            _require_size(each, where, unit)
-    elif not abs(value) <= LARGEST:
-        raise InputError(where, f"{value / unit.si:g}", f"a magnitude of at most {LARGEST / unit.si:g}")
+def _in_si(value: Any, where: str, unit: Unit, lists: bool) -> Any:
+    """Return a number, or those in lists, in SI; refuse one too large for any robot or instrument."""
+    if lists and isinstance(value, list):
+        return [_in_si(each, where, unit, lists) for each in value]
+    scaled = number(value, where) * unit.si
+    if not abs(scaled) <= LARGEST:
+        raise InputError(where, f"{scaled / unit.si:g}", f"a magnitude of at most {LARGEST / unit.si:g}")
+    return scaled
 
 
 def fits(name: str, pattern: str) -> bool:

@@ -30,7 +30,7 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.robot.terms import Term
 from rpim_opt.store.own_code import is_own, own_object
-from rpim_opt.store.statements import Constraints, PriorTable, part
+from rpim_opt.store.statements import Constraints, PriorTable
 
 Model = Literal["geometry", "auto"]
 LEARNED_NOISE = ("robot", "free", "level", "declared")
@@ -337,7 +337,7 @@ def read_problem(
     if isinstance(table.target, str):
         board = read_board(inside(path.parent, table.target, "key target", path))
     elif table.target is not None:
-        pattern = part(GridTable, table.target, "key target", path)
+        pattern = validate(GridTable, table.target, path, "target")
         try:
             board = grid_board(pattern.columns, pattern.rows, pattern.spacing)
         except InputError as error:
@@ -382,7 +382,7 @@ def stated_repeatability(table: ProblemTable, path: Path) -> Repeatability | Non
             accepted = choices(table.repeatability, LEARNED_NOISE) + ", or a table"
             raise InputError("key repeatability", f"'{table.repeatability}'", accepted, path)
         return None
-    numbers = part(RepeatabilityTable, table.repeatability, "key repeatability", path)
+    numbers = validate(RepeatabilityTable, table.repeatability, path, "repeatability")
     return Repeatability(numbers.position, numbers.orientation, numbers.joint)
 
 
@@ -390,4 +390,4 @@ def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
     """Return the six numbers [m, rad] of a frame's table."""
     if not isinstance(table, dict):
         raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
-    return part(FrameTable, table, f"key {where}", path).numbers
+    return validate(FrameTable, table, path, where).numbers

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
@@ -38,13 +38,15 @@ DIGITS, EXACT_DIGITS, CAMERA_DIGITS = 4, 9, 5
 """Of joint values in degrees or millimetres; where the noise is in them none may come from rounding."""
 PREFIXES = ("", "to_")
 """What precedes the columns of the points of a row."""
+Place = Annotated[list[float], Field(min_length=3, max_length=3)]
+Pixels = Annotated[int, Field(gt=0)]
 
 
 class PlaneTable(Table):
     """A square plane to touch, in the robot's base frame."""
 
-    at_mm: list[float]
-    normal: list[float]
+    at_mm: Place
+    normal: Place
     size: Length
 
 
@@ -60,11 +62,11 @@ class Simulation(Table):
     blunder: Length = 0.0
     markers: dict[str, list[str]] = Field(default_factory=dict)
     torques: Literal["measured", "gravity"] = "measured"
-    points_mm: dict[str, list[float]] = Field(default_factory=dict)
-    validation_points_mm: dict[str, list[float]] = Field(default_factory=dict)
+    points_mm: dict[str, Place] = Field(default_factory=dict)
+    validation_points_mm: dict[str, Place] = Field(default_factory=dict)
     planes: dict[str, PlaneTable] = Field(default_factory=dict)
     validation_planes: dict[str, PlaneTable] = Field(default_factory=dict)
-    image_px: list[int] = Field(default=[1280, 960])
+    image_px: list[Pixels] = Field(default=[1280, 960], min_length=2, max_length=2)
     truth: dict[str, Any] = Field(default_factory=dict)
 
 
@@ -87,7 +89,7 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     definition = read_problem(name)
     if not definition.table.simulation:
         raise InputError("table simulation", "nothing", "seed, configurations, ...", definition.path)
-    plan = validate(Simulation, definition.table.simulation, definition.path)
+    plan = validate(Simulation, definition.table.simulation, definition.path, "simulation")
     rng = np.random.default_rng(plan.seed if seed is None else seed)
     if not np.isfinite(definition.robot.limits).all():
         raise InputError("key limits", "a joint without limits", "limits for every joint", definition.path)
@@ -300,8 +302,6 @@ class _Table:
         definition, plan = self.stated, self.plan
         if definition.board is None:
             raise InputError("key target", "nothing", "the points of the board that the camera sees", definition.path)
-        if len(plan.image_px) != 2 or min(plan.image_px) < 1:
-            raise InputError("key simulation.image_px", f"{plan.image_px}", "width and height", definition.path)
         board = definition.board
         names = list(board)
         joints = list(joint_columns(definition.robot.joint_dimensions))
@@ -321,10 +321,17 @@ class _Table:
 
     def _touched(self) -> Columns:
         """Return a table of touches, by tools that take turns."""
-        column, things = self._things()
-        robot, markers = self.stated.robot, self.markers
-        names = [name for name, places in things.items() for _ in places]
-        table = {"label": [f"{name}_{i}" for name, places in things.items() for i in range(len(places))], column: names}
+        plan, robot, markers = self.plan, self.stated.robot, self.markers
+        points, planes, each = plan.validation_points_mm, plan.validation_planes, plan.validation
+        if self.noisy:
+            points, planes, each = plan.points_mm, plan.planes, plan.configurations
+        if bool(points) == bool(planes):
+            raise InputError("table simulation", "points_mm and planes", "one of them, for both tables")
+        things = {name: np.tile(np.array(place, dtype=float) / 1e3, (each, 1)) for name, place in points.items()}
+        things |= {name: self._on(square, each) for name, square in planes.items()}
+        names = [name for name in things for _ in range(each)]
+        table = {"label": [f"{name}_{i}" for name in things for i in range(each)]}
+        table |= {"plane" if planes else "point": names}
         turn = np.arange(len(names)) % len(markers)
         if len(markers) > 1:
             table["marker"] = [markers[k] for k in turn.tolist()]
@@ -335,36 +342,18 @@ class _Table:
         problem = CalibrationProblem(robot, self.parameters, touches(q[:1], ["any"], 1.0))
         for k, marker in enumerate(markers):
             mine = turn == k
-            share = self.plan.joint_share
-            q[mine] = configurations_at(problem, targets[mine], self.rng, self.x, share, marker)
+            q[mine] = configurations_at(problem, targets[mine], self.rng, self.x, plan.joint_share, marker)
         return table | self._joints(q[:, None], EXACT_DIGITS)
 
-    def _things(self) -> tuple[str, dict[str, Array]]:
-        """Return the column that names what is touched, and by name where (K, 3) [m]."""
-        plan = self.plan
-        points, planes, each = plan.validation_points_mm, plan.validation_planes, plan.validation
-        if self.noisy:
-            points, planes, each = plan.points_mm, plan.planes, plan.configurations
-        if bool(points) == bool(planes):
-            raise InputError("table simulation", "points_mm and planes", "one of them, for both tables")
-        if planes:
-            things = {}
-            for name, square in planes.items():
-                normal = _unit(_vector(square.normal))
-                axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
-                first = _unit(axis - normal * np.sum(axis * normal))
-                second = np.cross(normal, first)
-                places = square.size * (self.rng.uniform(size=(each, 2)) - 0.5)  # uniform on the square
-                things[name] = _vector(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
-            return "plane", things
-        return "point", {name: np.tile(_vector(place) / 1e3, (each, 1)) for name, place in points.items()}
+    def _on(self, square: PlaneTable, count: int) -> Array:
+        """Return places (count, 3) [m] uniform on a square plane."""
+        normal = _unit(np.array(square.normal, dtype=float))
+        axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
+        first = _unit(axis - normal * np.sum(axis * normal))
+        second = np.cross(normal, first)
+        places = square.size * (self.rng.uniform(size=(count, 2)) - 0.5)
+        return np.array(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
 
 
 def _unit(vector: Array) -> Array:
     return np.asarray(vector / np.sqrt(np.sum(vector**2)), dtype=float)
-
-
-def _vector(values: Sequence[float]) -> Array:
-    if len(values) != 3:
-        raise InputError("table simulation", f"{list(values)}", "three numbers, x, y and z")
-    return np.array(values, dtype=float)

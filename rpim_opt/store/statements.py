@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from datetime import date, datetime
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import ConfigDict, Field, create_model
@@ -15,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside
 from rpim_opt.basics.schema import Length, Name, Table, validate
-from rpim_opt.basics.units import fits, number, quantities, split_unit
+from rpim_opt.basics.units import fits, quantities, split_unit
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
@@ -47,29 +48,8 @@ LONGEST_TEXT = 1000
 """Characters of a text that somebody may want to read."""
 
 
-Part = TypeVar("Part", bound=Table)
-
-
-def part(kind: type[Part], content: dict[str, Any], where: str, path: Path) -> Part:
-    """Return a table of the file as a model; errors say where it stands."""
-    try:
-        return validate(kind, content, path)
-    except InputError as error:
-        key = error.where.removeprefix("key ")
-        if key != "the top level":
-            where = f"{where}.{key}"
-        raise InputError(where, error.found, error.accepted, path) from None
-
-
 def _joints(robot: Robot) -> dict[str, tuple[str, ...]]:
     return {f"q{i}": (dimension,) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-
-
-def _numbers(value: Any, key: str, si: float) -> Any:
-    """Return a number, or numbers in lists, in SI."""
-    if isinstance(value, list):
-        return [_numbers(each, key, si) for each in value]
-    return number(value, key) * si
 
 
 # --- [constraints] -----------------------------------------------------------------------------------------------
@@ -112,7 +92,7 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     known = dict.fromkeys(BOX, ("length",)) | joints
     if len(set(robot.joint_dimensions)) == 1:
         known["q"] = (robot.joint_dimensions[0],)
-    values = {stem: value for (stem, _), value in quantities(table, known, where, _numbers).items()}
+    values = {stem: value for (stem, _), value in quantities(table, known, where, lists=True).items()}
     if set(values) == set(BOX):
         return values
     if set(values) not in ({"q"}, set(joints)):
@@ -211,28 +191,30 @@ def stated_prior(
     except InputError as error:
         raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
     files = table.files(path)
-    parts: list[tuple[str, Callable[[], Prior]]] = []
-    parts += [(f"known {i}", partial(Prior.known, text)) for i, text in enumerate(table.known, start=1)]
+    for i, text in enumerate(table.known, start=1):
+        with _of_prior(f"known {i}", path):
+            prior &= Prior.known(text)
     if files:
         from rpim_opt.store.result_file import load_result  # most folders name no earlier result
 
         load = partial(load_result, measurements=measurements)
-        results = {name: partial(load, file) for name, file in files.items()}
         if table.earlier:
-            earlier = results[table.earlier]
-            parts.append(("from", lambda: Prior.from_result(earlier(), table.inflate, table.without)))
+            with _of_prior("from", path):
+                prior &= Prior.from_result(load(files[table.earlier]), table.inflate, table.without)
         if table.population:
-            arms = {name: results[name] for name in table.population}
-            parts.append(("population", lambda: Prior.from_population({name: arm() for name, arm in arms.items()})))
-    for key, read in parts:
-        try:
-            prior &= read()
-        except InputError as error:
-            if error.file:
-                raise
-            raise InputError(f"key prior.{key}", error.found, error.accepted, path) from None
+            with _of_prior("population", path):
+                prior &= Prior.from_population({name: load(files[name]) for name in table.population})
     prior.stated(parameters)
     return prior
+
+
+@contextmanager
+def _of_prior(key: str, path: Path) -> Iterator[None]:
+    """Let an InputError that names no file name the key of ``[prior]``."""
+    try:
+        yield
+    except InputError as error:
+        raise error if error.file else InputError(f"key prior.{key}", error.found, error.accepted, path) from None
 
 
 # --- [record] and [acceptance] -----------------------------------------------------------------------------------
@@ -276,7 +258,7 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
         marker=(str, ""),
         **sides_of,
     )
-    keys = dict(part(schema, table, "key acceptance", path))
+    keys = dict(validate(schema, table, path, "acceptance"))
     sides = {name: (keys[name][0], keys[name][1]) for name in (*BOX, *joints) if keys[name] is not None}
     axes = [axis for axis in BOX if axis in sides]
     if axes and len(axes) < len(BOX):

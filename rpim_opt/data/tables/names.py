@@ -170,23 +170,7 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
     if {"qx", "qy", "qz"} <= stems and "qw" not in stems:
         zeroth = [name for name in read if re.fullmatch(r"q_?0", name.strip().lower())]
         read.update({name: read[name]._replace(stem="qw", why="beside qx, qy, qz") for name in zeroth})
-    # the columns of a matrix with their row and column from 0
-    pairs: dict[str, tuple[int, int]] = {}
-    single: dict[str, int] = {}
-    for name in read:
-        plain = re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower())
-        pair, alone = MATRIX.fullmatch(plain), ENTRIES.fullmatch(plain)
-        if pair:
-            pairs[name] = (int(pair[1]), int(pair[2]))
-        elif alone:
-            single[name] = int(alone[1])
-    first = min((i for i, _ in pairs.values()), default=0)
-    places = {name: (i - first, j - first) for name, (i, j) in pairs.items()}
-    if len(pairs) not in SHAPES or set(places.values()) != set(product(*map(range, SHAPES[len(pairs)]))):
-        single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
-        ordered = sorted(single, key=lambda name: single[name])
-        whole = len(ordered) in (12, 16) and single[ordered[-1]] - single[ordered[0]] == len(ordered) - 1
-        places = {name: divmod(k, 4) for k, name in enumerate(ordered)} if whole else {}
+    places = _entries(read)
     why = "a matrix, row by row"
     if len(places) == 16:
         matrices = np.empty((len(next(iter(table.values()))), 4, 4))
@@ -199,11 +183,33 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
         if not row:
             places = {name: (j, i) for name, (i, j) in places.items()}
             why = "a matrix, column by column: its last column is 0 0 0 1"
-    for name, (row, column) in places.items():
-        stem = "the last row of a matrix"
-        if row < 3:
-            stem = "xyz"[row] if column == 3 else f"r{row + 1}{column + 1}"
+    for name, (i, j) in places.items():
+        stem = "the last row of a matrix" if i == 3 else f"r{i + 1}{j + 1}"
+        if j == 3 and i < 3:
+            stem = "xyz"[i]
         read[name] = read[name]._replace(stem=stem, why=why)
+
+
+def _entries(read: Readings) -> dict[str, tuple[int, int]]:
+    """Return the columns of a matrix with their row and column from 0; empty if there is none."""
+    pairs: dict[str, tuple[int, int]] = {}
+    single: dict[str, int] = {}
+    for name in read:
+        plain = re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower())
+        pair, alone = MATRIX.fullmatch(plain), ENTRIES.fullmatch(plain)
+        if pair:
+            pairs[name] = (int(pair[1]), int(pair[2]))
+        elif alone:
+            single[name] = int(alone[1])
+    first = min((i for i, _ in pairs.values()), default=0)
+    places = {name: (i - first, j - first) for name, (i, j) in pairs.items()}
+    if len(pairs) in SHAPES and set(places.values()) == set(product(*map(range, SHAPES[len(pairs)]))):
+        return places
+    single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
+    ordered = sorted(single, key=lambda name: single[name])
+    if len(ordered) not in (12, 16) or single[ordered[-1]] - single[ordered[0]] != len(ordered) - 1:
+        return {}
+    return {name: divmod(k, 4) for k, name in enumerate(ordered)}
 
 
 def quaternion_columns(read: Readings, dof: int) -> list[str]:

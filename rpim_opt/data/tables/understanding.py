@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -109,14 +109,19 @@ def understand(
         if any(re.fullmatch(r"q\d+", interpreted[0][name].stem) for name in raw.columns):  # the file with the joints
             raw, (read, rotation) = more, interpreted
     rotation = options.rotation or rotation
-    columns, meant = _under_our_names(raw.columns, read, kind, known, options.units, units)
+    stated = {key: (unit, "--units" if key in units else "above the header") for key, unit in options.units.items()}
+    columns, meant = _under_our_names(raw.columns, read, kind, known, stated)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         columns, meant = _as_quaternions(columns, meant, rotation)
     rows, notes = range(len(next(iter(columns.values()), ()))), []
     if not targets:
         rows, columns, notes = _rows_with_values(columns, robot, kind)
     cells = {name: [cells[i] for i in rows] for name, cells in raw.columns.items()}
-    notes = [*raw.notes, *notes, *_unused_units(meant, units)]
+    notes = [*raw.notes, *notes]
+    for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
+        unit = units.get(dimension, each.unit)
+        if unit != each.unit:
+            notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
     return Understood(columns, cells, tuple(meant), tuple(notes), _doubt(read, robot, options, rotation))
 
 
@@ -132,16 +137,6 @@ def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> 
     new = {"meaning": meaning_of_turn, "name": "qw, qx, qy, qz", "unit": ""}
     meant = [each._replace(**new) if each.name in turned else each for each in meant]
     return others | known_names.quaternions(np.column_stack(angles), rotation), meant
-
-
-def _unused_units(meant: Sequence[Meant], stated: Mapping[str, str]) -> list[str]:
-    """Say which stated units a header contradicts."""
-    notes = []
-    for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
-        unit = stated.get(dimension, each.unit)
-        if unit != each.unit:
-            notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
-    return notes
 
 
 def _doubt(read: Readings, robot: Robot, options: TableOptions, rotation: str) -> str:
@@ -314,18 +309,28 @@ def _prefixed(read: Readings, joints: Sequence[str]) -> dict[str, Readings]:
     return by_prefix
 
 
+def _by_word(read: Readings, pattern: str, may_be: Callable[[Reading], bool]) -> dict[str, dict[str, str]]:
+    """Return the columns of unknown names that are a word with a number, by word and number."""
+    words: dict[str, dict[str, str]] = {}
+    for name, each in read.items():
+        match = re.fullmatch(pattern, each.stem)
+        if match and not each.why and may_be(each):
+            words.setdefault(match[1], {})[match[2]] = name
+    return words
+
+
 def _counted(read: Readings, robot: Robot) -> Readings:
     """Return the joints from numbered columns of any word with joint units, if no joints are known otherwise."""
     if any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
         return {}
-    by_stem: dict[str, Readings] = {}
-    for name, each in read.items():
-        match = re.fullmatch(r"(\D+?)_?([1-9]\d?)", each.stem)
-        if match and each.unit and not each.why:
-            why = f"'{match[1]}' counted from 1, in units of joints"
-            by_stem.setdefault(match[1], {})[name] = Reading(f"q{match[2]}", each.unit, why, each.kind)
-    wanted = {(f"q{i}", dimension) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    whole = [of for of in by_stem.values() if wanted <= {(each.stem, dimension_of(each.unit)) for each in of.values()}]
+    wanted = {(str(i), dimension) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
+    words = _by_word(read, r"(\D+?)_?([1-9]\d?)", lambda each: each.unit != "")
+    whole = [
+        {name: read[name]._replace(stem=f"q{i}", why=f"'{word}' counted from 1, in units of joints")
+         for i, name in names.items()}
+        for word, names in words.items()
+        if wanted <= {(i, dimension_of(read[name].unit)) for i, name in names.items()}
+    ]  # fmt: skip
     return whole[0] if len(whole) == 1 else {}
 
 
@@ -333,16 +338,12 @@ def _counted_coordinates(read: Readings) -> Readings:
     """Return x, y, z of three columns of one word that are counted, ``p_1, p_2, p_3``, if nothing else is measured."""
     if any(each.stem in (*COORDINATES, "distance", "q0") for each in read.values()):
         return {}
-    by_stem: dict[str, dict[str, str]] = {}
-    for name, each in read.items():
-        match = re.fullmatch(r"(\D*?)_?(\d)", each.stem)
-        if match and not each.why and (not each.unit or dimension_of(each.unit) == "length"):
-            by_stem.setdefault(match[1], {})[match[2]] = name
-    triples = [columns for columns in by_stem.values() if sorted(columns) in (list("123"), list("012"))]
+    words = _by_word(read, r"(\D*?)_?(\d)", lambda each: not each.unit or dimension_of(each.unit) == "length")
+    triples = [names for names in words.values() if sorted(names) in (list("123"), list("012"))]
     if len(triples) != 1:
         return {}
-    names = [triples[0][number] for number in sorted(triples[0])]
     why = "the only three columns that are counted, beside the joints"
+    names = [triples[0][number] for number in sorted(triples[0])]
     return {name: read[name]._replace(stem=axis, why=why) for name, axis in zip(names, "xyz", strict=True)}
 
 
@@ -383,12 +384,11 @@ def _under_our_names(
     read: Readings,
     kind: Measurement,
     known: Mapping[str, Sequence[str]],
-    units: Mapping[str, str],
-    stated: Mapping[str, str],
+    units: Mapping[str, tuple[str, str]],
 ) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
     """Return the columns with canonical names and units, and the meaning of every column.
 
-    ``units`` are those above the header and, in their place, the ``stated`` ones.
+    ``units`` are those of columns whose name has none, by stem or dimension, and where they are stated.
     """
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
@@ -402,7 +402,7 @@ def _under_our_names(
         dimensions = [dimension for dimension in known.get(reading.stem, []) if dimension]
         if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
             dimensions = ["length"]
-        unit, why = _unit(name, reading, dimensions, units, stated)
+        unit, why = _unit(name, reading, dimensions, units)
         if unit and dimension_of(unit) not in dimensions:
             accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"
             raise InputError("the header", f"column '{name}' ({meaning(reading.stem)}) in {unit}", accepted)
@@ -436,24 +436,19 @@ def meaning(stem: str) -> str:
     return next((match.expand(words) for match, words in matches if match), f"measured {stem}")
 
 
-def _unit(
-    name: str, found: Reading, dimensions: Sequence[str], units: Mapping[str, str], stated: Mapping[str, str]
-) -> tuple[str, str]:
+def _unit(name: str, read: Reading, dimensions: Sequence[str], units: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
     """Return a column's unit and why: its own, the given one, that of its dialect."""
-    if found.unit:
-        return found.unit, "in the header"
-    for key in (found.stem, found.stem.rstrip("0123456789")):
+    if read.unit:
+        return read.unit, "in the header"
+    # a sigma may be of lengths or of angles: no unit of one dimension is meant
+    only = dimensions[0] if len(dimensions) == 1 else ""
+    for key in (read.stem, read.stem.rstrip("0123456789"), only):
         if key in units:
-            return units[key], "--units" if key in stated else "above the header"
-    if len(dimensions) != 1:  # a sigma may be of lengths or of angles: no unit of one dimension is meant
-        return "", ""
-    (dimension,) = dimensions
-    if dimension in units:
-        return units[dimension], "--units" if dimension in stated else "above the header"
-    if dimension == "pixel":
+            return units[key]
+    if only == "pixel":
         return "px", "the only unit"
     why = next((why for pattern, why in known_names.IN_SI.items() if re.fullmatch(pattern, name)), "")
-    unit = {"angle": "rad", "length": "m"}.get(dimension, "")
+    unit = {"angle": "rad", "length": "m"}.get(only, "")
     return (unit, why) if unit and why else ("", "")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, of_file
 from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
 from rpim_opt.basics.layout import read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
@@ -124,19 +124,16 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     dof = len(table.joint)
     coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
     if len(coupling) != dof or {len(row) for row in coupling} - {len(coupling[0])} or not 0 < len(coupling[0]) <= dof:
-        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers, or fewer alike", path)
+        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers, or fewer alike")
     limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
     for number, pair in enumerate(limits, start=1):
         if len(pair) != 2 or not pair[0] < pair[1]:
-            raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]", path)
+            raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]")
     gravity = Gravity()
     if any(joint.mass is not None for joint in table.joint):  # then others weigh nothing
         masses = tuple(joint.mass or 0.0 for joint in table.joint)
         centres = tuple((joint.centre_x, joint.centre_y, joint.centre_z) for joint in table.joint)
-        try:
-            gravity = Gravity(masses=masses, centres=centres)
-        except InputError as error:
-            raise error.within(path) from None
+        gravity = Gravity(masses=masses, centres=centres)
     robot = Robot(
         name=table.name,
         mdh=np.array([[getattr(joint, column) for column in MDH] for joint in table.joint]),
@@ -151,13 +148,14 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
 def _ending(path: Path) -> str:
     ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(ENDINGS), path)
+        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(ENDINGS))
     return ending
 
 
 # Reading
 
 
+@of_file
 def read_robot(path: str | Path) -> Robot:
     """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
 
@@ -183,14 +181,15 @@ def read_robot(path: str | Path) -> Robot:
     if ending == ".csv":
         described = read_sheet(path)
         if described.tool.any() or described.base.any():
-            raise InputError("the table", "a link behind the last joint", "a script's read_arm, or rpim-opt new", path)
+            raise InputError("the table", "a link behind the last joint", "a script's read_arm, or rpim-opt new")
         return described.robot
     content = read_json(path) if ending == ".json" else read_toml(path)
     if not isinstance(content, dict):
-        raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml", path)
+        raise InputError("the JSON text", type(content).__name__, "an object with the keys of robot.toml")
     return _robot(content, path)
 
 
+@of_file
 def read_sheet(path: Path, convention: str = "") -> Described:
     """Return the robot of a table with one row per joint, in the convention stated there or by ``convention``.
 
@@ -203,7 +202,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     raw = read_table(path)
     lost = next((note for note in raw.notes if "is not a row of the table" in note), "")
     if lost:
-        raise InputError("the table", lost.rstrip("."), "one row per joint", path)
+        raise InputError("the table", lost.rstrip("."), "one row per joint")
     columns: dict[str, list[str]] = {}
     for name, cells in raw.columns.items():
         stem, unit = split(name.partition(" #")[0])
@@ -213,7 +212,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         stem = INDEX.sub("", stem)
         key = SHEET.get(stem, stem) + (f"_{unit}" if unit else "")
         if key in columns:
-            raise InputError("the header", ", ".join(raw.columns), "every column once", path)
+            raise InputError("the header", ", ".join(raw.columns), "every column once")
         columns[key] = [str(cell) for cell in cells]
     conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
@@ -224,13 +223,13 @@ def read_sheet(path: Path, convention: str = "") -> Described:
             "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "
             "or a column convention with one of the words"
         )
-        raise InputError("the convention of the table", " and ".join(sorted(known)) or "no word of it", accepted, path)
+        raise InputError("the convention of the table", " and ".join(sorted(known)) or "no word of it", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
     if known == {"modified"}:
         return Described(robot, np.zeros(6), np.zeros(6))
     if robot.gravity.masses:
-        raise InputError("the table", "masses of links in the frames of another convention", "--dh modified", path)
+        raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
     return _from_standard(robot)
 
 
@@ -267,6 +266,7 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
 # Writing
 
 
+@of_file
 def write_robot(robot: Robot, path: str | Path) -> None:
     """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_robot` gives back exactly the same numbers.
 
@@ -281,7 +281,7 @@ def write_robot(robot: Robot, path: str | Path) -> None:
     if ending == ".json":
         write_json(path, content)
     elif ending == ".csv":
-        write_text(path, _csv(content, _in_si(robot), path))
+        write_text(path, _csv(content, _in_si(robot)))
     else:
         joints = content.pop("joint")
         payload = content.pop("payload", None)
@@ -329,9 +329,6 @@ def _content(robot: Robot) -> dict[str, Any]:
         content["source"] = robot.source
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
-    joints = [_keys(robot, i, _in_si(robot)) for i in range(n)]
-    for joint, sign in zip(joints, signs if plain else (), strict=False):
-        joint |= {"sign": -1} if sign < 0 else {}
     gravity = robot.gravity
     if gravity.direction != MOUNTINGS["floor"]:
         words = {direction: word for word, direction in MOUNTINGS.items()}
@@ -340,31 +337,32 @@ def _content(robot: Robot) -> dict[str, Any]:
         content["payload"] = {"mass_kg": gravity.payload}
         for axis, value in zip("xyz", gravity.payload_centre, strict=True):
             content["payload"] |= _quantity(axis, "length", value)
-    return content | {"joint": joints}
+    in_si = _in_si(robot)
+    limits = dict(zip(robot.leading, robot.limits, strict=True))
+    content["joint"] = []
+    for i, (numbers, kind) in enumerate(zip(robot.mdh, robot.joint_types, strict=True)):
+        joint: dict[str, Any] = {}
+        for (column, dimension), value in zip(MDH_DIMENSION.items(), numbers, strict=True):
+            joint |= _quantity(column, dimension, value, in_si)
+        if kind != "revolute":
+            joint["type"] = kind
+        if i in limits and np.isfinite(limits[i]).any():
+            unit, pair = exact("angle" if kind == "revolute" else "length", limits[i], in_si)
+            joint[f"limits_{unit}"] = pair
+        if gravity.masses:
+            joint["mass_kg"] = gravity.masses[i]
+            for axis, value in zip("xyz", gravity.centres[i], strict=True):
+                joint |= _quantity(f"centre_{axis}", "length", value, in_si)
+        if plain and signs[i] < 0:
+            joint["sign"] = -1
+        content["joint"].append(joint)
+    return content
 
 
 def _in_si(robot: Robot) -> bool:
     """Whether the numbers of a table are written in m and rad, all of them: some would not read back the same."""
     columns = zip(MDH, robot.mdh.T, strict=True)
     return any(exact(MDH_DIMENSION[column], values)[0] == SI[MDH_DIMENSION[column]] for column, values in columns)
-
-
-def _keys(robot: Robot, i: int, in_si: bool) -> dict[str, Any]:
-    """Return the keys of a ``[[joint]]``, but for its sign; all in SI if wanted."""
-    joint: dict[str, Any] = {}
-    for (column, dimension), value in zip(MDH_DIMENSION.items(), robot.mdh[i], strict=True):
-        joint |= _quantity(column, dimension, value, in_si)
-    if robot.joint_types[i] != "revolute":
-        joint["type"] = robot.joint_types[i]
-    for j, limits in zip(robot.leading, robot.limits, strict=True):
-        if j == i and np.isfinite(limits).any():
-            unit, pair = exact("angle" if robot.joint_types[i] == "revolute" else "length", limits, in_si)
-            joint[f"limits_{unit}"] = pair
-    if robot.gravity.masses:
-        joint["mass_kg"] = robot.gravity.masses[i]
-        for axis, value in zip("xyz", robot.gravity.centres[i], strict=True):
-            joint |= _quantity(f"centre_{axis}", "length", value, in_si)
-    return joint
 
 
 def _quantity(stem: str, dimension: str, value: float, in_si: bool = False) -> dict[str, float]:
@@ -391,10 +389,10 @@ def toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _csv(content: dict[str, Any], in_si: bool, path: Path) -> str:
+def _csv(content: dict[str, Any], in_si: bool) -> str:
     for key, what in WITHOUT_COLUMN.items():
         if key in content:
-            raise InputError("robot", what, "a name ending in .toml or .json", path)
+            raise InputError("robot", what, "a name ending in .toml or .json")
     units = {column: SI[kind] if in_si else display(kind)[0] for column, kind in MDH_DIMENSION.items()}
     header = [f"{column}_{unit}" for column, unit in units.items()]
     rows = [dict.fromkeys(header, 0.0) | joint for joint in content["joint"]]

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, of_file
 from rpim_opt.basics.files import read_bytes, write_bytes
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
@@ -35,17 +35,18 @@ SIX = ("x", "y", "z", "roll", "pitch", "yaw")
 LINE = re.compile(rb"^( *)([A-Za-z_]\w*):[ \t]*([^\s#]*)[ \t]*(?:#.*)?\r?$")
 
 
-def _number(text: bytes, where: str, path: Path) -> float:
+def _number(text: bytes, where: str) -> float:
     value = numeral(text.decode(errors="replace"))
     if not abs(value) <= LARGEST:
         found = text.decode(errors="replace")[:40]
-        raise InputError(where, f"'{found}'", f"a finite number, at most {LARGEST:g}", path)
+        raise InputError(where, f"'{found}'", f"a finite number, at most {LARGEST:g}")
     return value
 
 
 # calibration.conf
 
 
+@of_file
 def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     """Return the robot that a controller's ``calibration.conf`` describes, in the controller's Base.
 
@@ -72,7 +73,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     array([ 0.66,  0.  ,  0.  , -0.83, -0.02,  0.02])
     """
     path = Path(path)
-    deltas, _ = _deltas(read_bytes(path), path)
+    deltas, _ = _deltas(read_bytes(path))
     require_same_arm(nominal, nominal.mdh, REVOLUTE, path)
     table = nominal.mdh.copy()
     table[:, 2:4] += np.column_stack([deltas["theta"], deltas["d"]])
@@ -83,6 +84,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
+@of_file
 def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> None:
     """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
 
@@ -94,12 +96,12 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     """
     path = Path(source)
     if not path.exists():
-        raise InputError("the file", "nothing", "the robot's own file, copied from its controller", path)
+        raise InputError("the file", "nothing", "the robot's own file, copied from its controller")
     data = read_bytes(path)
-    old, places = _deltas(data, path)
+    old, places = _deltas(data)
     require_same_arm(robot, nominal.mdh, REVOLUTE, path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
-        raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1", path)
+        raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1")
     change = without_beta(robot).mdh - nominal.mdh
     behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
     new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
@@ -111,11 +113,11 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     write_bytes(Path(target), spliced(data, edits))
 
 
-def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
+def _deltas(data: bytes) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
     """Return the four lists (6,), and by name where in the file their numbers stand."""
     section = re.search(rb"^\s*\[mounting\](.*?)(?=^\s*\[\w+\]|\Z)", data, re.MULTILINE | re.DOTALL)
     if section is None:
-        raise InputError("section [mounting]", "nothing", "a controller's calibration.conf", path)
+        raise InputError("section [mounting]", "nothing", "a controller's calibration.conf")
     values = {}
     places = {}
     for name, key in DELTAS.items():
@@ -124,8 +126,8 @@ def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[
         parts = lists[0][1].split(b",") if len(lists) == 1 else []
         if len(parts) != 6:
             found = f"{len(parts)} numbers" if len(lists) == 1 else f"{len(lists)} lists"
-            raise InputError(f"key {key}", found, "one list of six numbers", path)
-        values[name] = np.array([_number(part.strip(), f"key {key}", path) for part in parts])
+            raise InputError(f"key {key}", found, "one list of six numbers")
+        values[name] = np.array([_number(part.strip(), f"key {key}") for part in parts])
         places[name] = (section.start(1) + lists[0].start(1), section.start(1) + lists[0].end(1))
     return values, places
 
@@ -133,6 +135,7 @@ def _deltas(data: bytes, path: Path) -> tuple[dict[str, Array], dict[str, tuple[
 # kinematics.yaml
 
 
+@of_file
 def read_ur_kinematics(path: str | Path) -> Described:
     """Return the robot of a ``kinematics.yaml`` of ROS, in the controller's Base (``base_link`` turned half a turn).
 
@@ -153,12 +156,13 @@ def read_ur_kinematics(path: str | Path) -> Described:
     (('shoulder', 'upper_arm'), array([-0.425, -0.392]))
     """
     path = Path(path)
-    chain, _ = _yaml_chain(read_bytes(path), path)
+    chain, _ = _yaml_chain(read_bytes(path))
     table, base, tool, _ = describe(chain)
     robot = Robot("Universal Robots", table, source=path.name)
     return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
+@of_file
 def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> None:
     """Write a ``kinematics.yaml`` with an identified robot's origins, everything else (and the hash) as in ``source``.
 
@@ -169,12 +173,12 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     """
     path = Path(source)
     data = read_bytes(path)
-    chain, places = _yaml_chain(data, path)
+    chain, places = _yaml_chain(data)
     table, base, tool, G = describe(chain)
     require_same_arm(robot, table, REVOLUTE, path)
     origins, _ = corrected(G, robot.mdh, base, tool)
     if robot.mdh[-1, 4]:
-        raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0", path)
+        raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0")
     size = reach(robot.mdh, base, tool)
     edits = {}
     for name, T, old in zip(JOINTS, origins, chain.origins, strict=True):
@@ -184,7 +188,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     write_bytes(Path(target), spliced(data, edits))
 
 
-def _yaml_chain(data: bytes, path: Path) -> tuple[Chain, dict[tuple[str, str], tuple[int, int]]]:
+def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, int]]]:
     """Return the six joints, and by joint and key where its number stands."""
     values: dict[tuple[str, str], float] = {}
     places: dict[tuple[str, str], tuple[int, int]] = {}
@@ -198,19 +202,19 @@ def _yaml_chain(data: bytes, path: Path) -> tuple[Chain, dict[tuple[str, str], t
         match = LINE.match(line)
         if match is None:
             found = repr(line.decode(errors="replace").strip()[:40])
-            raise InputError(f"line {number}", found, "one 'key: value' per line", path)
+            raise InputError(f"line {number}", found, "one 'key: value' per line")
         key = match[2].decode()
         if not match[3]:
             joint = key
             if key not in ("kinematics", *JOINTS):
-                raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS), path)
+                raise InputError(f"line {number}", f"'{key}'", choices(key, JOINTS))
         elif key in SIX:
             if joint not in JOINTS or (joint, key) in values:
-                raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once", path)
-            values[joint, key] = _number(match[3], f"line {number}, {joint}.{key}", path)
+                raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once")
+            values[joint, key] = _number(match[3], f"line {number}, {joint}.{key}")
             places[joint, key] = (begin + match.start(3), begin + match.end(3))
     missing = [f"{joint}.{key}" for joint in JOINTS for key in SIX if (joint, key) not in values]
     if missing:
-        raise InputError(f"key {missing[0]}", "nothing", "a number [m or rad]", path)
+        raise InputError(f"key {missing[0]}", "nothing", "a number [m or rad]")
     origins = [numeric_frame([values[joint, key] for key in SIX]) for joint in JOINTS]
     return Chain.about_z(origins, np.eye(4)), places

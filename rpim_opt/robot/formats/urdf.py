@@ -14,14 +14,14 @@ from dataclasses import dataclass
 from functools import cached_property
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree
 from xml.parsers import expat
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, of_file
 from rpim_opt.basics.files import read_bytes, write_bytes
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
@@ -57,6 +57,7 @@ TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
 """A tag: quoted values may hold a '>'."""
 
 
+@of_file
 def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None, origins: bool = False) -> Described:
     """Return the chain between two links of a URDF file as a robot in modified DH with Hayati's beta.
 
@@ -88,9 +89,8 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     ('origin_j1_x', 'origin_j1_y')
     """
     urdf = _read(Path(path))
-    way = _Way(urdf, urdf.steps_between(base, tip))
-    chain = way.chain
-    joints, names, joint_map, offsets = way.followed
+    way = urdf.way(base, tip)
+    chain, joint_map, offsets = way.chain, way.joint_map, way.offsets
     if origins:  # a row that no joint moves stands before the others
         urdf.prefixes()
         chain = Chain(np.array([np.eye(4), *chain.origins]), np.array([[0.0, 0.0, 1.0], *chain.axes]), chain.tail)
@@ -100,21 +100,22 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     robot = Robot(
         name=urdf.name,
         mdh=table + offsets,
-        joint_types=(*["revolute"] * origins, *(joint.kind for joint in joints)),
+        joint_types=(*["revolute"] * origins, *(joint.kind for joint in way.joints)),
         joint_map=joint_map,
-        limits=np.array([urdf.joints[name].limits for name in names]),
-        source=f"{urdf.path.name}, {way.steps[0].start} to {way.steps[-1].end}",
-        gravity=_masses(way, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
-        model=Model(_displacements(way, table, G) if origins else ()),
+        limits=np.array([urdf.joints[name].limits for name in way.names]),
+        source=f"{Path(path).name}, {way.steps[0].start} to {way.steps[-1].end}",
+        gravity=_masses(urdf, way, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
+        model=Model(_displacements(urdf, way, table, G) if origins else ()),
     )
-    for name, i in zip(names, robot.leading, strict=True):
-        joint = joints[i - origins]
+    for name, i in zip(way.names, robot.leading, strict=True):
+        joint = way.joints[i - origins]
         if joint.kind != urdf.joints[name].kind:
             found = f"a mimic of joint '{name}' of another kind, which is not between base and tip"
             raise joint.error("mimic", found, "a joint of the same kind, or a joint between base and tip")
-    return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), names)
+    return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), way.names)
 
 
+@of_file
 def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
     """Return a name for the chain between two links that goes up through joints that move; nothing for another one."""
     if path.suffix != ".urdf":
@@ -124,6 +125,7 @@ def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
     return re.sub(r"\W", "_", f"to_{steps[-1].end}") if up else ""
 
 
+@of_file
 def write_urdf(
     source: str | Path,
     robot: Robot,
@@ -144,18 +146,19 @@ def write_urdf(
     are another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
     """
     urdf = _read(Path(source))
-    way = _Way(urdf, urdf.steps_between(base, tip))
+    way = urdf.way(base, tip)
     table, T_base, T_tool, G = describe(way.chain)
-    joints, _, joint_map, offsets = way.followed
     edits: dict[tuple[int, int], str] = {}
-    for joint, old, new in zip(joints, joint_map, robot.joint_map, strict=False):
-        if joint in urdf.followers().values() and not np.array_equal(old, new):
+    followers = urdf.followers().values()
+    for joint, old, new in zip(way.joints, way.joint_map, robot.joint_map, strict=False):
+        if joint in followers and not np.array_equal(old, new):
             old[old != 0] = new[old != 0]  # the multiplier, and zeros
             edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
-    require_same_arm(robot, table + offsets, tuple(joint.kind for joint in joints), urdf.path, joint_map)
+    kinds = tuple(joint.kind for joint in way.joints)
+    require_same_arm(robot, table + way.offsets, kinds, Path(source), way.joint_map)
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
-    origins, tail = corrected(G, robot.mdh - offsets, T_base, T_tool)
+    origins, tail = corrected(G, robot.mdh - way.offsets, T_base, T_tool)
     size = reach(robot.mdh, T_base, T_tool)
     before = [*way.chain.origins, way.chain.tail]
     for between, old, new in zip(way.parts, before, [*origins, tail], strict=True):
@@ -172,10 +175,11 @@ def write_urdf(
             what = f"a tool or beta{len(table)}" if at_tip else "a base"
             found = f"{what} that moves link '{step.end if at_tip else step.start}'"
             accepted = f"a link held by a fixed joint, since joint '{step.joint.name}' cannot express it"
-            raise InputError("robot", found, f"{accepted}, or no such correction", urdf.path)
+            raise InputError("robot", found, f"{accepted}, or no such correction")
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 
+@of_file
 def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
     """Write a URDF file with displaced origins and other multipliers, every other byte as in the original.
 
@@ -188,7 +192,7 @@ def write_origins(source: str | Path, deviations: Mapping[str, Array], target: s
     known = {**urdf.prefixes(), **urdf.followers()}
     for prefix, six in deviations.items():
         if prefix not in known:
-            raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known), urdf.path)
+            raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known))
         joint = known[prefix]
         if joint.mimic and prefix.startswith(MIMIC):
             values = np.array(joint.mimic[1:]) + six
@@ -203,73 +207,34 @@ def write_origins(source: str | Path, deviations: Mapping[str, Array], target: s
 # The way between two links
 
 
-@dataclass(frozen=True, eq=False)
-class _Step:
-    """A joint on the way between two links, passed down the tree or up, where its motion and origin are inverted."""
+class _Step(NamedTuple):
+    """A joint on the way between two links, passed down the tree or up, where its motion and origin are inverted.
+
+    ``constant`` is the transform (4, 4) of its origin: before its motion, or after it where it is passed up.
+    """
 
     joint: _Joint
     up: bool
-
-    @property
-    def constant(self) -> Array:
-        """Transform (4, 4) of the joint's origin: before its motion, or after it where it is passed up."""
-        return _inverse(self.joint.origin) if self.up else self.joint.origin
-
-    @property
-    def start(self) -> str:
-        return self.joint.child if self.up else self.joint.parent
-
-    @property
-    def end(self) -> str:
-        return self.joint.parent if self.up else self.joint.child
+    start: str
+    end: str
+    constant: Array
 
 
-@dataclass(frozen=True, eq=False)
-class _Way:
-    """The steps from one link to another."""
+class _Way(NamedTuple):
+    """The steps from one link to another, and the n joints that move.
 
-    urdf: _Urdf
+    ``parts`` are the steps whose origins stand before the first motion, between the motions and after the last one,
+    ``chain`` is the geometry; ``names`` are k joints that these follow, by the ``joint_map`` (n, k) and ``offsets``
+    (n, 5) of theta and d: a mimic joint is at multiplier times the followed joint's value plus offset.
+    """
+
     steps: Sequence[_Step]
-
-    @cached_property
-    def parts(self) -> list[list[_Step]]:
-        """The steps whose origins stand before the first motion, between the motions and after the last one."""
-        parts: list[list[_Step]] = [[]]
-        for step in self.steps:
-            if step.up and step.joint.kind:
-                parts.append([step])
-                continue
-            parts[-1].append(step)
-            if step.joint.kind:
-                parts.append([])
-        return parts
-
-    @cached_property
-    def chain(self) -> Chain:
-        """The geometry of the joints that move."""
-        moving = [step for step in self.steps if step.joint.kind]
-        if not moving:
-            accepted = "a revolute, continuous or prismatic joint"
-            raise InputError("the chain", "no joint that moves", accepted, self.urdf.path)
-        *origins, tail = [_product([step.constant for step in part]) for part in self.parts]
-        axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
-        return Chain(np.array(origins), np.array(axes), tail)
-
-    @cached_property
-    def followed(self) -> tuple[list[_Joint], tuple[str, ...], Array, Array]:
-        """The n joints, those that they follow by name, the joint map (n, k), and offsets (n, 5) of theta and d.
-
-        A mimic joint is at multiplier times the followed joint's value plus offset, which the table's row takes.
-        """
-        joints = [step.joint for step in self.steps if step.joint.kind]
-        motions = [self.urdf.followed(joint) for joint in joints]
-        names = tuple(dict.fromkeys(name for name, _, _ in motions))
-        joint_map = np.zeros((len(joints), len(names)))
-        offsets = np.zeros((len(joints), 5))
-        for i, (joint, (name, multiplier, offset)) in enumerate(zip(joints, motions, strict=True)):
-            joint_map[i, names.index(name)] = multiplier
-            offsets[i, 2 if joint.kind == "revolute" else 3] = offset
-        return joints, names, joint_map, offsets
+    parts: list[list[_Step]]
+    chain: Chain
+    joints: list[_Joint]
+    names: tuple[str, ...]
+    joint_map: Array
+    offsets: Array
 
 
 def _taker(part: Sequence[_Step]) -> int:
@@ -277,14 +242,14 @@ def _taker(part: Sequence[_Step]) -> int:
     return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
 
 
-def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
+def _displacements(urdf: _Urdf, way: _Way, table: Array, G: Array) -> list[Term]:
     """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
     terms = []
-    followers = {joint: prefix for prefix, joint in way.urdf.followers().items()}
+    followers = {joint: prefix for prefix, joint in urdf.followers().items()}
     for row, part in enumerate(way.parts, start=1):
         axis = numeric_link(beta=-table[row - 1, 4])
         F = axis @ G[row - 1]
-        joint = way.followed[0][row - 2] if row > 1 else None  # the first row has none
+        joint = way.joints[row - 2] if row > 1 else None  # the first row has none
         mimics = (
             [Mimic(followers[joint], joint.mimic[1], joint.kind, axis)] if joint in followers and joint.mimic else []
         )
@@ -322,10 +287,9 @@ _Element = Any  # _Placed: the stubs of ElementTree know its base alone
 class _Joint:
     """A joint element whose attributes are checked when they are needed: off the chain nothing has to be right."""
 
-    def __init__(self, element: _Element, name: str, path: Path):
+    def __init__(self, element: _Element, name: str):
         self.element = element
         self.name = name
-        self.path = path
         self.parent = self._link("parent")
         self.child = self._link("child")
 
@@ -338,7 +302,7 @@ class _Joint:
 
     def error(self, what: str, found: str, accepted: str) -> InputError:
         """Return the error that names the joint."""
-        return InputError(f"joint '{self.name}', {what}", found, accepted, self.path)
+        return InputError(f"joint '{self.name}', {what}", found, accepted)
 
     def _only(self, tag: str) -> _Element | None:
         elements = [*self.element.findall(tag), None]
@@ -457,7 +421,6 @@ def _tag_end(data: bytes, start: int) -> int:
 class _Urdf:
     """A file's robot: its links, its joints, and the joint above every link that has one."""
 
-    path: Path
     data: bytes
     name: str
     links: Mapping[str, _Element]
@@ -484,12 +447,12 @@ class _Urdf:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
         for link_name in (base, tip):
             if link_name is not None and link_name not in self.links:
-                raise InputError(f"link '{link_name}'", "nothing", choices(link_name, self.links), self.path)
+                raise InputError(f"link '{link_name}'", "nothing", choices(link_name, self.links))
         if base is None:
             roots = [link for link in self.links if link not in self.above]
             if len(roots) > 1:
                 accepted = "one of them: --urdf-base, urdf_base in problem.toml, or the argument base"
-                raise InputError("links without a parent", ", ".join(roots), accepted, self.path)
+                raise InputError("links without a parent", ", ".join(roots), accepted)
             base = roots[0]
         if tip is None:
             parents = {joint.parent for joint in self.above.values()}
@@ -497,15 +460,42 @@ class _Urdf:
             below = [link for link in leaves if any(joint.parent == base for joint in self._to_root(link))] or leaves
             if len(below) > 1:
                 accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
-                raise InputError(f"links at the end of chains from '{base}'", ", ".join(below), accepted, self.path)
+                raise InputError(f"links at the end of chains from '{base}'", ", ".join(below), accepted)
             tip = below[0]
         up, down = self._to_root(base), self._to_root(tip)
         while up and down and up[-1] is down[-1]:
             up.pop()
             down.pop()
         if (up[-1].parent if up else base) != (down[-1].parent if down else tip):
-            raise InputError(f"link '{tip}'", f"no chain from '{base}' to it", "links of one tree", self.path)
-        return [*(_Step(joint, True) for joint in up), *(_Step(joint, False) for joint in reversed(down))]
+            raise InputError(f"link '{tip}'", f"no chain from '{base}' to it", "links of one tree")
+        upwards = [_Step(joint, True, joint.child, joint.parent, _inverse(joint.origin)) for joint in up]
+        return upwards + [_Step(joint, False, joint.parent, joint.child, joint.origin) for joint in reversed(down)]
+
+    def way(self, base: str | None, tip: str | None) -> _Way:
+        """Return the way from link ``base`` to link ``tip``."""
+        steps = self.steps_between(base, tip)
+        moving = [step for step in steps if step.joint.kind]
+        if not moving:
+            raise InputError("the chain", "no joint that moves", "a revolute, continuous or prismatic joint")
+        parts: list[list[_Step]] = [[]]
+        for step in steps:
+            if step.up and step.joint.kind:
+                parts.append([step])
+                continue
+            parts[-1].append(step)
+            if step.joint.kind:
+                parts.append([])
+        *origins, tail = [_product([step.constant for step in part]) for part in parts]
+        axes = [-step.joint.axis if step.up else step.joint.axis for step in moving]
+        joints = [step.joint for step in moving]
+        motions = [self.followed(joint) for joint in joints]
+        names = tuple(dict.fromkeys(name for name, _, _ in motions))
+        joint_map = np.zeros((len(joints), len(names)))
+        offsets = np.zeros((len(joints), 5))
+        for i, (joint, (name, multiplier, offset)) in enumerate(zip(joints, motions, strict=True)):
+            joint_map[i, names.index(name)] = multiplier
+            offsets[i, 2 if joint.kind == "revolute" else 3] = offset
+        return _Way(steps, parts, Chain(np.array(origins), np.array(axes), tail), joints, names, joint_map, offsets)
 
     def _to_root(self, link: str) -> list[_Joint]:
         """Return the joints from a link up to its root."""
@@ -539,62 +529,62 @@ class _Urdf:
 def _read(path: Path) -> _Urdf:
     """Return the tree of links and joints of a file."""
     data = read_bytes(path)
-    root = _root_element(data, path)
+    root = _root_element(data)
     if root.tag != "robot":
-        raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF", path)
+        raise InputError("the root element", f"<{root.tag}>", "<robot>, as in URDF")
     for element in root:
         if element.tag.startswith("xacro:"):
-            raise InputError(f"element <{element.tag}>", "a xacro file", EXPANDED, path)
-    links = _named(root.findall("link"), path)
+            raise InputError(f"element <{element.tag}>", "a xacro file", EXPANDED)
+    links = _named(root.findall("link"))
     if not links:
-        raise InputError("the robot", "no links", "elements <link> and <joint>", path)
+        raise InputError("the robot", "no links", "elements <link> and <joint>")
     above: dict[str, _Joint] = {}
-    for name, element in _named(root.findall("joint"), path).items():
-        joint = _Joint(element, name, path)
+    for name, element in _named(root.findall("joint")).items():
+        joint = _Joint(element, name)
         for which, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
                 raise joint.error(which, f"no link '{link}'", choices(link, links))
         if joint.child in above:
             found = f"two parents, by joints '{above[joint.child].name}' and '{joint.name}'"
-            raise InputError(f"link '{joint.child}'", found, "one", path)
+            raise InputError(f"link '{joint.child}'", found, "one")
         above[joint.child] = joint
     try:
         TopologicalSorter({child: {joint.parent} for child, joint in above.items()}).prepare()
     except CycleError as error:
-        raise InputError(f"link '{error.args[1][0]}'", "a cycle of joints", "a tree", path) from None
-    return _Urdf(path, data, root.get("name") or path.stem, links, above)
+        raise InputError(f"link '{error.args[1][0]}'", "a cycle of joints", "a tree") from None
+    return _Urdf(data, root.get("name") or path.stem, links, above)
 
 
-def _named(elements: Sequence[_Element], path: Path) -> dict[str, _Element]:
+def _named(elements: Sequence[_Element]) -> dict[str, _Element]:
     """Return elements by their names."""
     known: dict[str, _Element] = {}
     for element in elements:
         name = element.get("name", "")
         if not name or name in known:
             found = f"'{name}' twice" if name else "one without a name"
-            raise InputError(f"element <{element.tag}>", found, "every one with a unique name", path)
+            raise InputError(f"element <{element.tag}>", found, "every one with a unique name")
         known[name] = element
     return known
 
 
-def _root_element(data: bytes, path: Path) -> _Element:
+def _root_element(data: bytes) -> _Element:
     """Return the root element."""
     top = _Placed("")
     stack = [top]
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         if len(stack) > DEEPEST:
-            raise InputError(f"element <{tag}>", f"more than {DEEPEST} levels", "a URDF", path)
+            raise InputError(f"element <{tag}>", f"more than {DEEPEST} levels", "a URDF")
         element = _Placed(tag, attributes)
         element.start = parser.CurrentByteIndex
         stack[-1].append(element)
         stack.append(element)
 
     def doctype(*_: Any) -> None:
-        raise InputError("the document type", "<!DOCTYPE ...>", "a URDF without a document type and entities", path)
+        raise InputError("the document type", "<!DOCTYPE ...>", "a URDF without a document type and entities")
 
     if b"\0" in data:
-        raise InputError("the file", "zero bytes, as in UTF-16", "UTF-8 text", path)
+        raise InputError("the file", "zero bytes, as in UTF-16", "UTF-8 text")
     parser = expat.ParserCreate()
     parser.StartElementHandler = start
     parser.EndElementHandler = lambda _: stack.pop()
@@ -603,16 +593,16 @@ def _root_element(data: bytes, path: Path) -> _Element:
         parser.Parse(data, True)
     except expat.ExpatError as error:
         where = f"line {error.lineno}, column {error.offset + 1}"
-        raise InputError(where, expat.errors.messages[error.code], "well-formed XML", path) from None
+        raise InputError(where, expat.errors.messages[error.code], "well-formed XML") from None
     except (LookupError, ValueError) as error:
-        raise InputError("the XML declaration", str(error), "UTF-8 text", path) from None
+        raise InputError("the XML declaration", str(error), "UTF-8 text") from None
     return top[0]
 
 
 # Masses
 
 
-def _masses(way: _Way, table: Array, G: Array) -> Gravity:
+def _masses(urdf: _Urdf, way: _Way, table: Array, G: Array) -> Gravity:
     """Return the mass that each row of the table carries up to the next, and its centre in the table's frames.
 
     Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
@@ -628,15 +618,15 @@ def _masses(way: _Way, table: Array, G: Array) -> Gravity:
         frames[step.end] = (i + 1, np.eye(4)) if step.joint.kind else (i, T @ step.constant)
     masses = np.zeros(len(table))
     moments = np.zeros((len(table), 3))
-    for name, body in way.urdf.links.items():
+    for name, body in urdf.links.items():
         place = np.eye(4)  # of the link in that of the chain that carries it
         carrier = name
         try:
-            while carrier not in frames and carrier in way.urdf.above:
-                joint = way.urdf.above[carrier]
+            while carrier not in frames and carrier in urdf.above:
+                joint = urdf.above[carrier]
                 place = joint.origin @ place
                 carrier = joint.parent
-            mass, centre = _inertial(way.urdf, name, body)
+            mass, centre = _inertial(name, body)
         except InputError:
             if name in frames:
                 raise
@@ -655,7 +645,7 @@ def _masses(way: _Way, table: Array, G: Array) -> Gravity:
     return Gravity(masses=tuple(masses.tolist()), centres=tuple(centres))
 
 
-def _inertial(urdf: _Urdf, name: str, body: _Element) -> tuple[float, Array]:
+def _inertial(name: str, body: _Element) -> tuple[float, Array]:
     """Return the mass [kg] of a link and its centre (3,) in the link's frame [m]; no mass where none is stated."""
     attributes = {each.tag: each.attrib for inertial in body.findall("inertial")[:1] for each in inertial}
     mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
@@ -663,5 +653,5 @@ def _inertial(urdf: _Urdf, name: str, body: _Element) -> tuple[float, Array]:
     if mass is None or centre is None or mass[0] < 0:
         shown = f"mass {attributes.get('mass')}, origin {attributes.get('origin')}"
         accepted = "a mass that is not negative, and three finite numbers"
-        raise InputError(f"link '{name}', inertial", shown[:80], accepted, urdf.path)
+        raise InputError(f"link '{name}', inertial", shown[:80], accepted)
     return float(mass[0]), centre
