@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import operator
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from functools import lru_cache, reduce
 from typing import Any
 
@@ -18,7 +18,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import SYMBOLS, Configuration, Place, Symbol, Term, displacement, motion
+from rpim_opt.robot.terms import SYMBOLS, Configuration, Place, Symbol, Term, motion, terms_of
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -128,7 +128,7 @@ def transforms(
     joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> list[ca.SX]:
     """Return the transforms from the robot's base to the frame after every joint; the last is the flange's."""
-    products = [product(factors) for factors in _by_joint(joint_types, configuration, value, terms)]
+    products = [product(factors) for factors in _by_joint(joint_types, configuration, value, terms)[:-1]]
     return list(itertools.accumulate(products, operator.matmul))
 
 
@@ -136,38 +136,34 @@ def chain(
     joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
 ) -> list[ca.SX]:
     """Return the factors of the transform from the robot's base to its flange; arguments as for `transforms`."""
-    factors = list(itertools.chain.from_iterable(_by_joint(joint_types, configuration, value, terms)))
-    return factors + _displaced("tool", len(joint_types), joint_types, configuration, value, terms)
+    return list(itertools.chain.from_iterable(_by_joint(joint_types, configuration, value, terms)))
 
 
 def _by_joint(
     joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term]
-) -> Iterator[list[ca.SX]]:
-    """Yield the factors up to every joint's frame from the one before."""
-    before = _displaced("base", 1, joint_types, configuration, value, terms)
+) -> list[list[ca.SX]]:
+    """Return the factors up to every joint's frame from the one before, and those by which the tool is displaced."""
+    dof = len(joint_types)
+    every = (*terms_of(dof), *terms)
+
+    def displaced(at: Place, i: int) -> list[ca.SX]:
+        by = motion(at, joint_types, i, configuration, value, terms)
+        return [] if by is None else placed((0,) * 6, ca.vertsplit(by))
+
+    steps = []
+    before = displaced("base", 1)
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
-        moved = motion(joint_types, i, configuration, value, terms)
+        q = configuration.q[i - 1]
+        more = motion("joint", joint_types, i, configuration, value, every)
+        moved = q if more is None else q + more
         if kind == "revolute":
             theta = theta + moved
         else:
             d = d + moved
-        after = _displaced("link", i, joint_types, configuration, value, terms)
-        yield [*before, *link(alpha, a, theta, d, beta), *after]
+        steps.append([*before, *link(alpha, a, theta, d, beta), *displaced("link", i)])
         before = []
-
-
-def _displaced(
-    at: Place,
-    i: int,
-    joint_types: Sequence[str],
-    configuration: Configuration,
-    value: Callable[[str], Symbol],
-    terms: Sequence[Term],
-) -> list[ca.SX]:
-    """Return the factors by which terms displace a frame; none where none does."""
-    by = displacement(at, joint_types, i, configuration, value, terms)
-    return [] if by is None else placed((0,) * 6, ca.vertsplit(by))
+    return [*steps, displaced("tool", dof)]
 
 
 def table_symbols(dof: int) -> tuple[ca.SX, dict[str, ca.SX]]:

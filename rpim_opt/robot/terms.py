@@ -456,21 +456,6 @@ def terms_of(dof: int) -> tuple[Term, ...]:
 
 
 def motion(
-    joint_types: Sequence[str],
-    i: int,
-    configuration: Configuration,
-    value: Callable[[str], Symbol],
-    terms: Sequence[Term] = (),
-) -> Symbol:
-    """Return the joint value of joint i with all its terms, q + ratio q + ecc_cos cos q + ... [rad or m].
-
-    ``value("ratio2")`` gives the parameters; ``terms`` are added besides those of every arm.
-    """
-    more = displacement("joint", joint_types, i, configuration, value, (*terms_of(len(configuration.q)), *terms))
-    return configuration.q[i - 1] if more is None else configuration.q[i - 1] + more
-
-
-def displacement(
     at: Place,
     joint_types: Sequence[str],
     i: int,
@@ -478,7 +463,7 @@ def displacement(
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> ca.SX | None:
-    """Return the sum of the motions of all terms of joint or link i; None without any."""
+    """Return the sum of the motions of all terms of joint or link i; None without any. ``value("ratio2")`` is a number."""
     own = [term for term in terms if term.at == at and i in term.places(joint_types)]
     parts = [term_motion(term, Joint(i, configuration), value) for term in own]
     parts = [part for part in parts if part is not None]

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.robot.kinematics import transforms
 from rpim_opt.robot.parameters import known_patterns, of_joint, of_term
-from rpim_opt.robot.terms import JOINT_TERMS, Configuration, Joint, Weight, motion, terms_of
+from rpim_opt.robot.terms import JOINT_TERMS, Configuration, Joint, Weight, terms_of
 from tests.simulate import ARM
 
 Q = np.random.default_rng(0).uniform(-2, 2, (7, 6))
@@ -109,8 +110,9 @@ def test_an_effect_that_is_not_needed_is_not_written_down() -> None:
             raise AssertionError(i, k, axis)
 
     values = {"ecc_cos1": 0.1, "compliance1": 0.0, "bend1_1x": ca.SX(0)}
-    moved = motion(("revolute",), 1, Configuration([0.5], weight=Never()), lambda name: values.get(name, 0.0))
-    assert float(moved) == pytest.approx(0.5 + 0.1 * np.cos(0.5))
+    [link] = transforms(("revolute",), Configuration([0.5], weight=Never()), lambda name: values.get(name, 0.0))
+    angle = 0.5 + 0.1 * np.cos(0.5)
+    assert ca.DM(link).full()[:2, 0] == pytest.approx([np.cos(angle), np.sin(angle)])
 
 
 def test_what_a_joint_sees_is_what_its_configuration_states() -> None:
