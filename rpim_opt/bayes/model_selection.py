@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from itertools import combinations
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -67,11 +67,12 @@ KNOWN = Prior(joint_offset=1.0, frames=1.0)
 
 
 class Candidate(NamedTuple):
-    """A candidate model: its price, its extensions, and its optimum."""
+    """A candidate model: its price, its extensions, its marginal likelihood, and the optimum."""
 
     price: float
     extensions: tuple[str, ...]
-    found: Any
+    evidence: Evidence
+    point: Point
 
 
 # --- which extensions there are ---------------------------------------------------------------------------------
@@ -196,14 +197,14 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
         point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
             known[conditions] = _hyperparameters(evidence, point)
-        return Candidate(point.value + GAIN * questions(candidate), candidate, point)
+        return Candidate(point.value + GAIN * questions(candidate), candidate, evidence, point)
 
     candidates = sorted(models.compared(price), key=lambda each: each.price)
-    trials = tuple(Trial(each.extensions, each.found.value) for each in candidates)
+    trials = tuple(Trial(each.extensions, each.point.value) for each in candidates)
     if not candidates[0].extensions:
         return fit, trials
     whole = extended(fit.problem, models.added(candidates[0].extensions))
-    return estimator.fit(whole, deviations(whole, deviation), candidates[0].found.logs, ROUNDS), trials
+    return estimator.fit(whole, deviations(whole, deviation), candidates[0].point.logs, ROUNDS), trials
 
 
 def questions(extensions: Sequence[str]) -> int:
@@ -228,16 +229,6 @@ def _starts(evidence: Evidence, known: Mapping[str, float]) -> list[Array]:
 
 
 # --- at a result ------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, eq=False)
-class Judged:
-    """A candidate model: its extensions beyond the result's parameters, all its parameters, and its optimum."""
-
-    extensions: tuple[str, ...]
-    names: tuple[str, ...]
-    evidence: Evidence
-    point: Point
 
 
 class Comparison(Models):
@@ -274,37 +265,33 @@ class Comparison(Models):
         return len(self.row) - float(np.sum(1 - np.diag(point.C) / point.v))
 
     @cached_property
-    def plain(self) -> Judged:
-        """The result's own model."""
+    def plain(self) -> Candidate:
+        """The result's own model, without extensions."""
         evidence = self.columns.restricted(self.members(()))
         starts = sides(self.problem, evidence)
         if self.result.learned is not None:
             noise = {name: np.log(size.value) for name, size in self.result.learned.noise.items() if name in CENTRES}
             starts = [np.array([noise.get(n, c) for n, c in zip(evidence.names, evidence.centre, strict=True)])]
-        return Judged((), self.own, evidence, evidence.optima(starts)[0])
+        point = evidence.optima(starts)[0]
+        return Candidate(point.value, (), evidence, point)
 
     @cached_property
-    def best(self) -> Judged:
+    def best(self) -> Candidate:
         """The selected model, at a price of `SPEAK` an extension."""
         learned = self.result.learned
         if learned is not None and learned.trials:  # it was selected then
             return self.plain
-        candidates = [self._price(()), *self.compared(self._price)]
-        return min(candidates, key=lambda each: each.price).found
-
-    def _price(self, extensions: tuple[str, ...]) -> Candidate:
-        model = self.plain
-        if extensions:
-            model = self._fitted(extensions, self.members(extensions))
-        return Candidate(model.point.value + SPEAK * len(extensions), extensions, model)
+        candidates = self.compared(lambda some: self._fitted(some, self.members(some)) if some else self.plain)
+        return min([self.plain, *candidates], key=lambda each: each.price)
 
     def rise_without(self, members: np.ndarray) -> float:
         """Return the increase of -2 ln L without a subset of the result's own parameters (n,)."""
         keep = np.isin(self.names, np.array(self.own)[~members])
         return self._fitted((), keep).point.value - self.plain.point.value
 
-    def _fitted(self, extensions: tuple[str, ...], keep: np.ndarray) -> Judged:
+    def _fitted(self, extensions: tuple[str, ...], keep: np.ndarray) -> Candidate:
         """Return a model at its hyperparameters, looked for from those of the result's."""
         evidence = self.columns.restricted(keep)
         start = _starts(evidence, _hyperparameters(self.plain.evidence, self.plain.point))[:1]
-        return Judged(extensions, tuple(self.names[keep].tolist()), evidence, evidence.optima(start)[0])
+        point = evidence.optima(start)[0]
+        return Candidate(point.value + SPEAK * len(extensions), extensions, evidence, point)

@@ -96,19 +96,19 @@ def admitted(
         price = EXTENSION_GAIN * questions(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
         if not kept.issubset(extensions):
             price = np.inf
-        return Candidate(best.value + price, extensions, best)
+        return Candidate(best.value + price, extensions, model, best)
 
     compared = sorted(models.compared(price), key=lambda each: each.price)
     best = compared[0]
     problem = extended(bare, models.added(best.extensions))
     prior = estimator.prior.stated(problem.parameters)
-    geometry = problem.parameters.free.scale * (prior.centre + prior.scale * best.found.z)
+    geometry = problem.parameters.free.scale * (prior.centre + prior.scale * best.point.z)
     x = np.append(geometry, point.z[len(point.z) - columns.shape[1] :])
-    logs = np.append(best.found.logs, point.logs)
+    logs = np.append(best.point.logs, point.logs)
     joint = replace(estimator, curves=curves).fit(problem.with_transmission(curves), x, logs, ROUNDS)
     gain = plain.value - point.value
-    shift = trials[0].value - gain - best.found.value
-    with_curves = [Trial((*each.extensions, TRANSMISSION), each.found.value + shift) for each in compared]
+    shift = trials[0].value - gain - best.point.value
+    with_curves = [Trial((*each.extensions, TRANSMISSION), each.point.value + shift) for each in compared]
     return joint, (*with_curves, *trials), gain
 
 

@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import LeftOut, sampled
-from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Comparison, Judged
+from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Candidate, Comparison
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
@@ -290,7 +290,7 @@ def foreseen(problem: Source) -> tuple[LackOfFit | None, list[LeftOut]]:
 # --- parts of the residuals -------------------------------------------------------------------------------------------
 
 
-def _parts(compared: Comparison, model: Judged) -> dict[str, float]:
+def _parts(compared: Comparison, model: Candidate) -> dict[str, float]:
     """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
     repeatability = model.evidence.repeatability(model.point.logs)
     only = replace(repeatability, instrument=0.0, joint=0.0)
@@ -319,7 +319,8 @@ def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ..
     z = model.point.z
     sd = np.sqrt(np.diag(model.point.C))
     moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
-    joint = {i: int(name[10:]) for i, name in enumerate(model.names) if kind_of(name) == "compliance"}
+    names = compared.names[compared.members(model.extensions)].tolist()
+    joint = {i: int(name[10:]) for i, name in enumerate(names) if kind_of(name) == "compliance"}
     largest = max((moves[i] for i in joint), default=0.0)
     return tuple(k for i, k in joint.items() if z[i] < -SURE * sd[i] and moves[i] > NOTABLE * largest)
 
@@ -341,7 +342,7 @@ def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[fl
     return float(np.sqrt(squares / rows)), freedom
 
 
-def _residual_autocorrelation(compared: Comparison, model: Judged) -> Autocorrelation | None:
+def _residual_autocorrelation(compared: Comparison, model: Candidate) -> Autocorrelation | None:
     """Return that of a model's residuals in units of their noise; None where points were touched."""
     if compared.problem.touches is not None:
         return None

@@ -192,6 +192,12 @@ class Ridge:
         s2 = self.s[self.seen] ** 2
         return self.fixed + float(np.sum(s2 / (s2 + weight)))
 
+    def misfits(self, weights: Array) -> tuple[Array, Array]:
+        """Return |A z - b|^2, without what the penalty's centre adds, and the degrees of freedom at weights (K,)."""
+        beta2, s2, perp = self.filters
+        g = weights[:, None] / (s2 + weights[:, None])
+        return g**2 @ beta2 + perp, self.fixed + np.sum(1 - g, axis=1)
+
     def noise(self, weight: float) -> Array:
         """Return the covariance (n, n) of the minimum for unit noise of b."""
         total = self.s**2 + weight

@@ -463,7 +463,7 @@ def motion(
     value: Callable[[str], Symbol],
     terms: Sequence[Term],
 ) -> ca.SX | None:
-    """Return the sum of the motions of all terms of joint or link i; None without any. ``value("ratio2")`` is a number."""
+    """Return the sum of the motions of all terms of joint or link i; None without any; parameters by ``value``."""
     own = [term for term in terms if term.at == at and i in term.places(joint_types)]
     parts = [term_motion(term, Joint(i, configuration), value) for term in own]
     parts = [part for part in parts if part is not None]

@@ -281,10 +281,7 @@ def test_a_linear_rule_says_an_edge_and_refines_between_neighbours(k: int) -> No
     step = np.log(weights[1] / weights[0])
     target = np.log(weights[k]) + (0.3 * step if 0 < k < 199 else 0.0)
 
-    def score_of(_: Any) -> Any:
-        return lambda w: (np.log(w) - target) ** 2
-
-    chosen = linear_rule(program, "mine", score_of, "found")
+    chosen = linear_rule(program, "mine", lambda w: (np.log(w) - target) ** 2, "found")
     assert np.log(chosen.weight) == pytest.approx(target, abs=1e-5)
     assert chosen.interior == (0 < k < 199)
     assert chosen.note == {0: EDGES["lower"], 199: EDGES["upper"]}.get(k, "found")
@@ -293,15 +290,12 @@ def test_a_linear_rule_says_an_edge_and_refines_between_neighbours(k: int) -> No
 def test_a_local_rule_prefers_a_valley_to_an_edge() -> None:
     program = ro.convex.pose(ro.tikhonov, MODEL)
 
-    def score_of(_: Any) -> Any:
-        def score(w: np.ndarray) -> np.ndarray:
-            t = np.log(w / 1e-3)
-            return np.minimum(t**2, 3.0) - 0.1 * np.abs(t) * (np.abs(t) > 3)
+    def score(w: np.ndarray) -> np.ndarray:
+        t = np.log(w / 1e-3)
+        return np.minimum(t**2, 3.0) - 0.1 * np.abs(t) * (np.abs(t) > 3)
 
-        return score
-
-    local = linear_rule(program, "mine", score_of, "found", local=True)
+    local = linear_rule(program, "mine", score, "found", local=True)
     assert local.interior
     assert local.weight == pytest.approx(1e-3, rel=1e-3)
     assert not replace(local, interior=False).interior
-    assert not linear_rule(program, "mine", lambda _: lambda w: -np.abs(np.log(w / 1e-3)), "f").interior
+    assert not linear_rule(program, "mine", lambda w: -np.abs(np.log(w / 1e-3)), "f").interior

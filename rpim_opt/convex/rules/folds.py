@@ -48,8 +48,7 @@ def leave_one_out(program: Program) -> Selection:
     form = program.loss_form
     mixed = form is not None and not form.diagonal  # a square then belongs to no configuration
     if program.closed_form and not mixed:
-        note = "smallest leave-one-out error"
-        return linear_rule(program, "leave_one_out", _of_squares, note)
+        return linear_rule(program, "leave_one_out", _of_squares(program), "smallest leave-one-out error")
     return _least(program, "leave_one_out", held_out_error(program, _singly(program)))
 
 

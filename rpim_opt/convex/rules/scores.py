@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -22,30 +21,32 @@ from rpim_opt.convex.rules.selection import (
 )
 
 
-def linear_rule(
-    program: Program, name: str, score_of: Callable[[Program], Score], note: str, local: bool = False
-) -> Selection:
-    """Minimize a score of the linear estimator over a grid, refined between its points.
-
-    With ``local`` an interior minimum goes before an edge.
-    """
+def require_linear(program: Program, name: str) -> None:
+    """Refuse a program whose solutions are not linear in the data."""
     if program.penalty_form is None:
         found = f"formulation '{program.formulation.name}'"
         accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
         raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
         program.inlier_model(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
+
+
+def linear_rule(program: Program, name: str, score: Score, note: str, local: bool = False) -> Selection:
+    """Minimize a score of the linear estimator over a grid, refined between its points.
+
+    With ``local`` an interior minimum goes before an edge.
+    """
+    require_linear(program, name)
     weights = grid_of(program.ridge)
-    score_at = score_of(program)
-    score = score_at(weights)
-    best = int(np.argmin(score))
-    valleys = np.flatnonzero((score[1:-1] <= score[:-2]) & (score[1:-1] < score[2:])) + 1
+    scores = score(weights)
+    best = int(np.argmin(scores))
+    valleys = np.flatnonzero((scores[1:-1] <= scores[:-2]) & (scores[1:-1] < scores[2:])) + 1
     if local and len(valleys):
-        best = int(valleys[np.argmin(score[valleys])])
+        best = int(valleys[np.argmin(scores[valleys])])
     if not 0 < best < len(weights) - 1:
-        return Selection(float(weights[best]), name, weights, score, False, edge(best))
-    weight, _ = least_between(score_at, weights, best)
-    return Selection(weight, name, weights, score, True, note)
+        return Selection(float(weights[best]), name, weights, scores, False, edge(best))
+    weight, _ = least_between(score, weights, best)
+    return Selection(weight, name, weights, scores, True, note)
 
 
 @on_squares
@@ -76,16 +77,8 @@ def reml(program: Program) -> Selection:
         weights = weight_grid(program)
         note = "points on a plane or sphere do not determine the weight: stated noise and scales are used"
         return Selection(1.0, "reml", weights, np.zeros(len(weights)), interior=False, note=note)
-    chosen = linear_rule(program, "reml", _restricted_likelihood, "largest restricted likelihood", local=True)
-    if chosen.interior or chosen.weight < 1.0:
-        return chosen
-    note = "the data do not determine the scale of the deviations: stated noise and scales are used"
-    return replace(chosen, weight=1.0, note=note)
 
-
-def _restricted_likelihood(program: Program) -> Score:
-    """Return the function from weights (K,) to -2 ln(restricted likelihood), up to a constant."""
-    tiny = np.finfo(float).tiny
+    require_linear(program, "reml")
     model, form = program.squared, program.ridge
     frames = model.parameters.placed
     if frames.any() and not frames.all():
@@ -93,11 +86,15 @@ def _restricted_likelihood(program: Program) -> Score:
     beta2, s2, perp = form.filters
     m = model.equations - form.fixed
 
-    def score(weights: Array) -> Array:
+    def score(weights: Array) -> Array:  # -2 ln(restricted likelihood), up to a constant
         g = weights[:, None] / (s2 + weights[:, None])
-        return m * np.log(np.maximum(g @ beta2 + perp, tiny)) - np.sum(np.log(g), axis=1)
+        return m * np.log(np.maximum(g @ beta2 + perp, np.finfo(float).tiny)) - np.sum(np.log(g), axis=1)
 
-    return score
+    chosen = linear_rule(program, "reml", score, "largest restricted likelihood", local=True)
+    if chosen.interior or chosen.weight < 1.0:
+        return chosen
+    note = "the data do not determine the scale of the deviations: stated noise and scales are used"
+    return replace(chosen, weight=1.0, note=note)
 
 
 @on_squares
@@ -111,19 +108,13 @@ def gcv(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1', True)
     """
-    return linear_rule(program, "gcv", _gcv, "smallest generalized cross-validation error")
-
-
-def _gcv(program: Program) -> Score:
-    """Return rho(w) / (m - dof(w))^2; no weight serves that leaves no equation."""
-    beta2, s2, perp = program.ridge.filters
 
     def score(weights: Array) -> Array:
-        g = weights[:, None] / (s2 + weights[:, None])
-        left = program.squared.equations - program.ridge.fixed - np.sum(1 - g, axis=1)
-        return np.where(left > 0, (g**2 @ beta2 + perp) / np.maximum(left, 1e-300) ** 2, np.inf)
+        rho, freedom = program.ridge.misfits(weights)
+        left = program.squared.equations - freedom
+        return np.where(left > 0, rho / np.maximum(left, 1e-300) ** 2, np.inf)  # no weight serves that leaves none
 
-    return score
+    return linear_rule(program, "gcv", score, "smallest generalized cross-validation error")
 
 
 @on_squares
@@ -138,8 +129,14 @@ def discrepancy(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.note
     ('28', 'misfit equal to the declared noise')
     """
+
+    def score(weights: Array) -> Array:  # ln(rho / (tau^2 (m - dof)))
+        rho, freedom = program.ridge.misfits(weights)
+        left = ROOM**2 * np.maximum(program.squared.equations - freedom, 1e-9)
+        return np.log(np.maximum(rho, np.finfo(float).tiny) / left)
+
     note = "misfit equal to the declared noise"
-    chosen = linear_rule(program, "discrepancy", _misfit, note)
+    chosen = linear_rule(program, "discrepancy", score, note)
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights
     if not len(fits):
@@ -162,19 +159,6 @@ ROOM = 1.1
 """Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
 
 
-def _misfit(program: Program) -> Score:
-    """Return the function from weights (K,) to ln(rho / (tau^2 (m - dof)))."""
-    beta2, s2, perp = program.ridge.filters
-    spare = program.squared.equations - program.ridge.fixed
-
-    def score(weights: Array) -> Array:
-        g = weights[:, None] / (s2 + weights[:, None])
-        left = ROOM**2 * np.maximum(spare - np.sum(1 - g, axis=1), 1e-9)
-        return np.log(np.maximum(g**2 @ beta2 + perp, np.finfo(float).tiny) / left)
-
-    return score
-
-
 @on_squares
 def quasi_optimality(program: Program) -> Selection:
     """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965).
@@ -187,8 +171,8 @@ def quasi_optimality(program: Program) -> Selection:
     ('5e-06', True)
     """
 
-    def score_of(program: Program) -> Score:
+    def score(weights: Array) -> Array:
         beta2, s2, _ = program.ridge.filters
-        return lambda weights: np.sum((weights[:, None] ** 2 * s2 * beta2) / (s2 + weights[:, None]) ** 4, axis=1)
+        return np.sum((weights[:, None] ** 2 * s2 * beta2) / (s2 + weights[:, None]) ** 4, axis=1)
 
-    return linear_rule(program, "quasi_optimality", score_of, "least change of the solution", local=True)
+    return linear_rule(program, "quasi_optimality", score, "least change of the solution", local=True)
