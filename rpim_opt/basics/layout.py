@@ -195,7 +195,8 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
         raise InputError("the table", found, "at least one row of numbers")
     numeric = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
     heads, above = _heads(grid, numeric, options)
-    full = [i for i in numeric if _letters(next(filter(None, grid.rows[i]))) not in SUMMARIES]
+    begins = {i: "".join(filter(str.isalpha, next(filter(None, grid.rows[i])))) for i in numeric}
+    full = [i for i in numeric if begins[i].lower() not in SUMMARIES]
     columns, groups, mark = _columns([grid.rows[i] for i in full], heads, options)
     full = full[: len(full) - _summaries(columns)]
     left = sorted(set(range(numeric[0], len(grid.rows))) - set(full))
@@ -227,10 +228,6 @@ def _summaries(columns: Columns) -> int:
         if shows[:, :2].any() and shows[0].any():
             return count
     return 0
-
-
-def _letters(cell: str) -> str:
-    return "".join(filter(str.isalpha, cell)).lower()
 
 
 def _count(row: Sequence[str]) -> int:

@@ -97,9 +97,6 @@ def read_columns(source: Any) -> Columns:
         columns = readers[kind](path)
     else:
         names = list(getattr(source, "column_names", getattr(source, "columns", source)))
-        for name in names:
-            if not isinstance(name, str):
-                raise InputError("the header", f"column {name!r}", "unique names that are texts")
         _require_names(names)
         columns = {name.strip(): source[name] for name in names}
     if not columns:
@@ -131,11 +128,13 @@ def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
     return {name: [row[i] for row in body] for i, name in enumerate(header)}
 
 
-def _require_names(header: Sequence[str]) -> None:
+def _require_names(header: Sequence[Any]) -> None:
     accepted = "a unique name for every column"
     if len(header) > WIDEST:
         raise InputError("the header", f"{len(header)} columns", f"at most {WIDEST}")
     for name in header:
+        if not isinstance(name, str):
+            raise InputError("the header", f"column {name!r}", "unique names that are texts")
         if not name:
             raise InputError("the header", "a column without a name", accepted)
         if header.count(name) > 1:

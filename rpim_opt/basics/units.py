@@ -90,14 +90,10 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     return (name[: match.start()], UNITS[match[1]]) if match else (name, None)
 
 
-def with_unit(stem: str, dimension: str, count: int = 9) -> list[str]:
-    """Return the names of a quantity with its units, ``d_m, d_mm, d_um``; the plain name if it has no unit."""
-    return [f"{stem}_{unit}" for unit in accepted_units(dimension)[:count]] or [stem]
-
-
-def spelled(stem: str, dimensions: Iterable[str], count: int = 9) -> list[str]:
-    """Return the names with units of a quantity that may have one of several dimensions."""
-    return [name for dimension in dimensions for name in with_unit(stem, dimension, count)]
+def with_unit(stem: str, *dimensions: str, count: int = 9) -> list[str]:
+    """Return the names of a quantity of one of these dimensions, ``d_m, d_mm, d_um``; plain where it has no unit."""
+    units = [accepted_units(dimension)[:count] for dimension in dimensions]
+    return [name for of in units for name in [f"{stem}_{unit}" for unit in of] or [stem]]
 
 
 def number(value: Any, where: str) -> float:
@@ -137,11 +133,11 @@ def quantities(
         place = f"{where}, key {key}" if where else f"key {key}"
         stem, unit = split_unit(key)
         if stem not in dimensions:
-            names = [name for each, of in dimensions.items() for name in spelled(each, of, 3)]
+            names = [name for each, of in dimensions.items() for name in with_unit(each, *of, count=3)]
             raise InputError(where or "the table", f"unknown key '{key}'", choices(key, [*also, *names]))
         unit = unit or Unit("", 1.0)
         if unit.dimension not in dimensions[stem]:
-            raise InputError(place, "no unit of the right dimension", ", ".join(spelled(stem, dimensions[stem])))
+            raise InputError(place, "no unit of the right dimension", ", ".join(with_unit(stem, *dimensions[stem])))
         if (stem, unit.dimension) in result:
             raise InputError(place, "the same quantity twice", "one of them")
         result[stem, unit.dimension] = _in_si(value, place, unit, lists)

@@ -317,13 +317,11 @@ def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files]:
 def _read(stated: ProblemFile, each: Observation, path: Path) -> Dataset:
     kind = stated.kinds[each.measurement]
     source: Any = path
-    try:
-        if stated.board is not None and kind.by_camera:
-            with in_file(path):
-                source = on_board(read_columns(path), stated.board)
+    if stated.board is not None and kind.by_camera:
+        with in_file(path):
+            source = on_board(read_columns(path), stated.board)
+    with in_file(stated.path):
         return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
-    except InputError as error:
-        raise error.within(stated.path) from None
 
 
 # --- [[known_distance]] and [[known_angle]] between touched points and planes ------------------------------------

@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
-from rpim_opt.basics.units import LARGEST, SMALLEST, quantities, spelled, split_unit, with_unit
+from rpim_opt.basics.units import LARGEST, SMALLEST, quantities, split_unit, with_unit
 from rpim_opt.data.dataset import Block, Dataset, named_sessions
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
@@ -235,10 +235,10 @@ def quantities_of(
         si = unit.si if unit else 1.0
         if stem not in known:
             others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
-            accepted = [each for key, dimensions in others.items() for each in spelled(key, dimensions, 1)]
+            accepted = [each for key, dimensions in others.items() for each in with_unit(key, *dimensions, count=1)]
             raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
         if dimension not in known[stem]:
-            accepted = ", ".join(spelled(stem, known[stem]))
+            accepted = ", ".join(with_unit(stem, *known[stem]))
             raise InputError("the header", f"column '{name}' without a unit of the right dimension", accepted)
         if (stem, dimension) in columns:
             raise InputError("the header", f"column '{stem}' in two units", "one of them")
@@ -385,8 +385,8 @@ def covariances(
             lacking[i] = True
         if own is None:
             if not instrument[:, i, i].any() and (f"cov_{name}_{name}", "") not in columns:
-                column = with_unit(f"sigma_{name}", dimension, 2)[-1]
-                accepted = f"{with_unit(common, dimension, 2)[-1]}, or a column {column}"
+                column = with_unit(f"sigma_{name}", dimension, count=2)[-1]
+                accepted = f"{with_unit(common, dimension, count=2)[-1]}, or a column {column}"
                 raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
             own = 0.0  # the tracker or a column has it all
         spread.append(own)

@@ -169,8 +169,8 @@ def _readings(
             rotation = turns
             break
     numbered(read, table, dof, options.quaternion or "wxyz")
-    read.update(_in_robots_order(read, table, dof, joints))
-    read.update(_from_one(read, dof))
+    _put_in_robots_order(read, table, dof, joints)
+    _count_from_one(read, dof)
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
         read.update(_without_prefix(read, stems, joints, options.prefix))
     read.update(_counted(read, robot))
@@ -221,48 +221,40 @@ def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joi
     return reading._replace(unit=unit)
 
 
-def _in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[str]) -> Readings:
-    """Return ROS' joints in the robot's order, where columns name0, ... name them."""
+def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Sequence[str]) -> None:
+    """Put ROS' joints in the robot's order, where columns name0, ... name them."""
     matches = {name: re.fullmatch(r"(?:field_)?name_?(\d{1,9})", reading.stem) for name, reading in read.items()}
     named = {int(match[1]): name for name, match in matches.items() if match}
     if not named or f"q{min(named)}" not in {reading.stem for reading in read.values()}:
-        return {}
-    places: dict[str, int] = {}  # 0 for a joint that the robot does not have
+        return
+    new: dict[str, str] = {}
     for i, column in named.items():
         called = {str(cell) for cell in table[column]}
         if len(called) > 1:
             raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
         (joint,) = called
-        places[f"q{i}"] = ur_joint(joint)
-        if joints:
-            places[f"q{i}"] = joints.index(joint) + 1 if joint in joints else 0
-        elif not places[f"q{i}"] or dof != len(known_names.UR_JOINTS):
-            accepted = "a robot from a URDF, which names its joints"
-            raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
-    why = "the joint that its column of names names"
-    return {
-        name: reading._replace(
-            stem=f"q{places[reading.stem]}" if places[reading.stem] else f"another {reading.stem}", why=why
-        )
-        for name, reading in read.items()
-        if reading.stem in places
-    }
+        place = joints.index(joint) + 1 if joint in joints else 0
+        if not joints:
+            place = ur_joint(joint) if dof == len(known_names.UR_JOINTS) else 0
+            if not place:
+                accepted = "a robot from a URDF, which names its joints"
+                raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
+        new[f"q{i}"] = f"q{place}" if place else f"another q{i}"
+    _rename(read, new, "the joint that its column of names names")
 
 
 def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
-    read.update({name: each._replace(stem=new[each.stem], why=why) for name, each in read.items() if each.stem in new})
+    """Change stems, for a reason that may follow ``{}``, the one so far."""
+    for name, each in read.items():
+        if each.stem in new:
+            read[name] = each._replace(stem=new[each.stem], why=why.format(each.why))
 
 
-def _from_one(read: Readings, dof: int) -> Readings:
-    """Return the joints counted from 1, where they are counted from 0."""
-    if all(reading.stem != "q0" for reading in read.values()):
-        return {}
-    count = {f"{stem}{i}": f"{stem}{i + 1}" for i in range(dof) for stem in ("q", "tau")}
-    return {
-        name: reading._replace(stem=count[reading.stem], why=f"{reading.why}, counted from 0")
-        for name, reading in read.items()
-        if reading.stem in count
-    }
+def _count_from_one(read: Readings, dof: int) -> None:
+    """Count the joints from 1, where they are counted from 0."""
+    if any(reading.stem == "q0" for reading in read.values()):
+        new = {f"{stem}{i}": f"{stem}{i + 1}" for i in range(dof) for stem in ("q", "tau")}
+        _rename(read, new, "{}, counted from 0")
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
@@ -278,10 +270,10 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     stated = stated.strip(" ._/:-")
     whole = {}
     for prefix, each in _prefixed(read, joints).items():
-        counted = each | _from_one(each, len(wanted))
-        missing = sorted(wanted - {reading.stem for reading in counted.values()})
+        _count_from_one(each, len(wanted))
+        missing = sorted(wanted - {reading.stem for reading in each.values()})
         if not missing:
-            whole[prefix] = counted
+            whole[prefix] = each
         elif len(missing) < len(wanted) / 2 and not known:  # is it one that did not move
             why = f"of {prefix}, which has no {', '.join(missing)}: --constants"
             read.update({name: Reading("", "", why) for name in each})

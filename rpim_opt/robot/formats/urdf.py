@@ -626,15 +626,21 @@ def _masses(urdf: _Urdf, way: _Way, table: Array, G: Array) -> Gravity:
                 joint = urdf.above[carrier]
                 place = joint.origin @ place
                 carrier = joint.parent
-            mass, centre = _inertial(name, body)
+            attributes = {each.tag: each.attrib for inertial in body.findall("inertial")[:1] for each in inertial}
+            mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
+            centre = _numbers(attributes.get("origin", {}).get("xyz", "0 0 0"), 3)
+            if mass is None or centre is None or mass[0] < 0:
+                shown = f"mass {attributes.get('mass')}, origin {attributes.get('origin')}"
+                accepted = "a mass that is not negative, and three finite numbers"
+                raise InputError(f"link '{name}', inertial", shown[:80], accepted)
         except InputError:
             if name in frames:
                 raise
             continue
         i, T = frames.get(carrier, (0, place))
         if i:
-            masses[i - 1] += mass
-            moments[i - 1] += mass * (T @ place @ [*centre, 1])[:3]
+            masses[i - 1] += mass[0]
+            moments[i - 1] += mass[0] * (T @ place @ [*centre, 1])[:3]
     if not masses.any():
         return Gravity()
     centres: list[Vector] = []
@@ -643,15 +649,3 @@ def _masses(urdf: _Urdf, way: _Way, table: Array, G: Array) -> Gravity:
         x, y, z = (T[:3, :3] @ (moment / (mass or 1.0)) + T[:3, 3]).tolist()
         centres.append((x, y, z))
     return Gravity(masses=tuple(masses.tolist()), centres=tuple(centres))
-
-
-def _inertial(name: str, body: _Element) -> tuple[float, Array]:
-    """Return the mass [kg] of a link and its centre (3,) in the link's frame [m]; no mass where none is stated."""
-    attributes = {each.tag: each.attrib for inertial in body.findall("inertial")[:1] for each in inertial}
-    mass = _numbers(attributes.get("mass", {}).get("value", "0"), 1)
-    centre = _numbers(attributes.get("origin", {}).get("xyz", "0 0 0"), 3)
-    if mass is None or centre is None or mass[0] < 0:
-        shown = f"mass {attributes.get('mass')}, origin {attributes.get('origin')}"
-        accepted = "a mass that is not negative, and three finite numbers"
-        raise InputError(f"link '{name}', inertial", shown[:80], accepted)
-    return float(mass[0]), centre
