@@ -248,7 +248,7 @@ def _displaced_frames(stated: Source, registered: Source) -> list[str]:
     """Say how far stated frames are from their registration; nothing of those at the origin, which nobody stated."""
     p, q = stated.parameters, registered.parameters
     far = []
-    for prefix in (name[:-2] for name in p.names if name.endswith("_rx")):
+    for prefix in (name[:-1] for name in p.names if name.endswith("_x") and f"{name[:-1]}z" in p.names):
         at = [p.names.index(prefix + axis) for axis in "xyz"]
         apart = 1e3 * float(np.linalg.norm(q.nominal[at] - p.nominal[at]))
         if apart > 0 and p.nominal[at].any():

@@ -27,8 +27,13 @@ from rpim_opt.robot.kinematics import (
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.terms import Joint, Symbol, Term
 
-NEAR_PARALLEL = 0.1
-"""Axes nearer to parallel than this [rad] get Hayati's beta, as `identified.near_parallel` proposes."""
+NEAR_PARALLEL = 0.35
+"""Axes nearer to parallel than this [rad] get Hayati's beta, as `problem.near_parallel` proposes.
+
+An error of an axis moves their common normal, and with it d and theta of both joints, by 1 / sin(angle) times as much:
+beyond three times, prior scales would be wrong (with axes 10 degrees apart errors fell from 0.18 to 0.53 mm to 0.14 to
+0.20 mm on five simulated sets).
+"""
 ANOTHER_ARM = 0.1
 """A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
 ORIGIN, MOUNT, MIMIC = OF_JOINTS = "origin_", "mount_", "mimic_"
