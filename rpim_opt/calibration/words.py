@@ -114,9 +114,13 @@ def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
 
 def sentences(result: Outcome, verdict: Verdict) -> list[str]:
     """Return the sentences below the table: errors, reasons of the verdict, weight, noise and remarks."""
-    before = 1e3 * np.nanmean(result.nominal_errors())
-    after = 1e3 * np.nanmean(result.errors())
-    errors = f"Identification error (mean): {before:.4f} mm before, {after:.4f} mm after."
+    errors = "No errors: the rows have neither lengths nor angles nor pixels."
+    for dimension, unit, si in (("length", "mm", 1e-3), ("angle", "mrad", 1e-3), ("pixel", "px", 1.0)):
+        before, after = result.nominal_errors(dimension=dimension), result.errors(dimension=dimension)
+        if np.isfinite(after).any():
+            means = f"{np.nanmean(before) / si:.4f} {unit} before, {np.nanmean(after) / si:.4f} {unit} after"
+            errors = f"Identification error (mean): {means}."
+            break
     reasons = [text for text in verdict.reasons if text != result.message]
     return [errors, *reasons, *weight_lines(result), *noise_sentence(result), *remarks(result)]
 

@@ -151,10 +151,10 @@ class Inspection(Tabled):
             of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
             measured.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
         data, errors = self.problem.data, 1e3 * self.residual
-        lines = [
-            f"{len(data)} rows in {len(np.unique(data.configuration))} configurations. Nominal error "
-            f"{np.nanmean(errors):.3f} mm mean, {np.nanmax(errors):.3f} mm max ({data.label[np.nanargmax(errors)]})."
-        ]
+        lines = [f"{len(data)} rows in {len(np.unique(data.configuration))} configurations."]
+        if np.isfinite(errors).any():
+            largest = f"{np.nanmax(errors):.3f} mm max ({data.label[np.nanargmax(errors)]})"
+            lines[0] += f" Nominal error {np.nanmean(errors):.3f} mm mean, {largest}."
         if self.repeated:
             groups = listed([", ".join(group) for group in self.repeated], 5, "; ")
             spread = f", repeatable to {1e3 * self.repeatability:.3g} mm" if self.repeatability else ""
@@ -794,8 +794,11 @@ def _changes(
     def say(when: str, share: Array, coefficients: Array) -> tuple[str, str]:
         rows = equations.length & (share > 0)
         change = problem.jacobian(x)[np.ix_(rows, some)] @ (free.scale[some] * coefficients) * share[rows]
-        far = 1e3 * float(np.sqrt(change @ change / len(np.unique(equations.row[rows]))))
-        moved = f"the points are {three_digits(far)} mm from where the others put them, and fit a {what} that moved"
+        far = 1e3 * float(np.sqrt(change @ change / max(len(np.unique(equations.row[rows])), 1)))
+        moved = f"the points are {three_digits(far)} mm from where the others put them"
+        if not rows.any():  # nothing but angles was measured
+            moved = "the measurements contradict the others"
+        moved = f"{moved}, and fit a {what} that moved"
         return f"{when} {moved}", f"{cause}? Calibrate the two parts separately"
 
     shares = {}
