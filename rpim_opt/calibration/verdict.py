@@ -19,6 +19,8 @@ BAD = "Larger than expected"
 """Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
 NOISY = 3.0
 """Residual RMS over the stated noise above which the fit is not that of the stated instrument."""
+OVERSTATED = 0.05
+"""Residual RMS over the stated noise below which the noise is not that of these data; of 20 um and more."""
 REACH = 0.003
 """Residual RMS over the length of the arm that a robot's own effects stay below."""
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
@@ -191,6 +193,9 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     size = sizes["length"][0]
     ratio = max(sizes["length"][1], sizes["pixel"][1])
     share = size / arm_length(result.problem)
+    for each, ratio_of in sizes.values():
+        if each > COMPUTED_RMS and ratio_of < OVERSTATED:
+            yield f"Residuals are {ratio_of:.2g} times the stated noise: it is in another unit, or far too large."
     if ratio > NOISY and share > REACH:
         yield (
             f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the stated noise and "

@@ -122,7 +122,8 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
             errors = f"Identification error (mean): {means}."
             break
     reasons = [text for text in verdict.reasons if text != result.message]
-    return [errors, *reasons, *weight_lines(result), *noise_sentence(result), *remarks(result)]
+    lines = [*turned_frames(result), errors, *reasons, *weight_lines(result), *noise_sentence(result)]
+    return [*lines, *remarks(result)]
 
 
 def noise_sentence(result: Outcome) -> list[str]:

@@ -141,7 +141,8 @@ class Box:
 def _tolerances(parameters: Parameters) -> tuple[Array, Array]:
     bound = parameters.tolerance / parameters.scale
     if not np.isfinite(bound).any():
-        raise InputError("table tolerance", "no tolerance for any identified parameter", "length_mm, angle_mrad, ...")
+        accepted = "length_mm, ... in [tolerance], or `parameters.toleranced({'length_mm': 5.0})` in a script"
+        raise InputError("tolerances", "none for any identified parameter", accepted)
     return -bound, bound
 
 

@@ -99,7 +99,8 @@ def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: 
     if len(loss.expression.variables()) == 1:  # else there are own ones, on whose values the slope depends
         slope = loss.slope(np.concatenate([v, np.full(loss.variable.size - len(v), SMALL)]))
     found = f"formulation '{formulation.name}'"
-    accepted = "a loss with slopes, which covariances and most rules need; monte_carlo, l_curve, k_fold do not"
+    accepted = "a loss without own variables and with slopes, which covariances, predictions and most rules need; "
+    accepted += "`forward`, monte_carlo, l_curve and k_fold do not"
     if slope is None:
         raise InputError(found, "a loss without slope", accepted)
     factor = float(np.median(np.abs(slope[: len(v)]) / (2 * v))) if len(v) else 0.0

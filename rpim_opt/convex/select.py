@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Callable
+from inspect import signature
 from typing import Any
 
 import numpy as np
@@ -76,5 +77,11 @@ def weight_of(stated: Any) -> Any:
     InputError for a name that no selector has.
     """
     if not isinstance(stated, str):
+        if callable(stated):
+            with contextlib.suppress(ValueError):  # what has no signature is called as it is
+                try:
+                    signature(stated).bind(None)
+                except TypeError as error:
+                    raise InputError("weight", f"a selector with {error}", "one argument, the `Program`") from None
         return stated
     return None if stated == LEARNED else pick(SELECTORS, stated, "weight", also=f"a number, a selector, {LEARNED}, ")

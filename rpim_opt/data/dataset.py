@@ -270,8 +270,9 @@ class Dataset(Tabled):
         y
             (N, c) measured values [SI]; poses also as transforms (N, 4, 4).
         sigma
-            Standard deviation [SI] of all k components of the residual, or of each, (k,), or their covariance, (k, k)
-            or (N, k, k). A position has the components x, y, z, a pose x, y, z [m], rx, ry, rz [rad].
+            Standard deviation [SI] of all k components of the residual, of each, (k,), of every row, (N,), or both,
+            (N, k); or their covariance, (k, k) or (N, k, k). Of k rows they are those of the components. A position has
+            the components x, y, z, a pose x, y, z [m], rx, ry, rz [rad].
         label
             N row labels; numbers from 1 by default.
         measurement
@@ -328,16 +329,19 @@ class Dataset(Tabled):
         k = len(measurement.components)
         rows = np.arange(N)
         covariance = np.array(sigma, dtype=float)
-        positive = covariance.ndim > 1 or bool((covariance > 0).all())
-        if covariance.shape in ((), (k,)):
+        by_row = covariance.shape in ((N,), (N, k)) and covariance.shape not in ((k,), (k, k))
+        positive = (covariance.ndim > 1 and not by_row) or bool((covariance > 0).all())
+        if by_row:
+            covariance = covariance.reshape(N, 1, -1) ** 2 * np.eye(k)
+        elif covariance.shape in ((), (k,)):
             covariance = covariance**2 * np.eye(k)
         if covariance.ndim == 2:
             covariance = covariance[None]
         if not positive or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
             found = f"{sigma}" if covariance.size == 1 or not positive else f"shape {np.shape(sigma)}"
             accepted = (
-                f"a standard deviation above zero, ({k},) of them for the components, or covariances ({k}, {k}) or "
-                f"({N}, {k}, {k}); of (N, {k}) standard deviations s: s[:, :, None] ** 2 * np.eye({k})"
+                f"a standard deviation above zero, ({k},) of them for the components, ({N},) or ({N}, {k}) for the "
+                f"rows, or covariances ({k}, {k}) or ({N}, {k}, {k})"
             )
             raise InputError("sigma", found, accepted)
         block = Block(

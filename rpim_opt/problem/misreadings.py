@@ -240,11 +240,17 @@ def _of_poses() -> Iterator[Misreading]:
 
         return change
 
+    def reordered(order: list[int]) -> Callable[[Array], Array]:
+        return lambda turns: Rotation.from_quat(Rotation.from_matrix(turns).as_quat()[:, order]).as_matrix()
+
     yield turned(
         "orientations the other way round (of the instrument in the tool)",
-        "invert the rotations, or the order of the quaternion is the other one (wxyz, xyzw)",
+        "invert the rotations",
         lambda turns: np.swapaxes(turns, 1, 2),
     )
+    for where, order in (("last", [3, 0, 1, 2]), ("first", [1, 2, 3, 0])):
+        remedy = "state the order of the quaternion's components (--quaternion); arrays have w first"
+        yield turned(f"quaternions with w {where}", remedy, reordered(order))
     yield Misreading(
         "transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted
     )

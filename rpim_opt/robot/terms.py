@@ -252,6 +252,10 @@ class Term:
         if self.at in ENDS:
             return (1 if self.at == "base" else len(joint_types),)
         wanted = tuple(self.joints) or (("revolute",) if self.at == "joint" else ("revolute", "prismatic"))
+        unknown = [i for i in wanted if i not in (*range(1, len(joint_types) + 1), "revolute", "prismatic")]
+        if unknown:
+            accepted = f"numbers from 1 to {len(joint_types)}, 'revolute' or 'prismatic'"
+            raise InputError(f"term '{self.name}', joints", f"{unknown[0]!r}", accepted)
         return tuple(i for i, kind in enumerate(joint_types, start=1) if i in wanted or kind in wanted)
 
 

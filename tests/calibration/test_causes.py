@@ -288,6 +288,9 @@ def test_misread_orientations_are_named() -> None:
     conjugate = values(lambda y: y * [1, 1, 1, 1, -1, -1, -1])(problem)
     causes = likely_causes(ro.calibrate(conjugate))
     assert any("the other way round" in text for text in causes), causes
+    scalar_last = values(lambda y: y[:, [0, 1, 2, 4, 5, 6, 3]])(problem)
+    causes = likely_causes(ro.calibrate(scalar_last))
+    assert "quaternions with w last" in causes[0]
 
 
 def test_an_arm_of_poor_repeatability_with_a_joint_on_one_side_is_not_flagged() -> None:

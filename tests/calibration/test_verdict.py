@@ -146,3 +146,12 @@ def test_a_weight_that_makes_a_robot_worse_than_nominal_is_no_delivery() -> None
     off = problem.with_parameters(replace(problem.parameters, nominal=nominal))
     result = ro.calibrate(off, ro.tikhonov, weight=1e9)
     assert any("larger than those of the nominal robot" in reason for reason in result.verdict.reasons)
+
+
+def test_a_noise_in_another_unit_is_not_delivered() -> None:
+    problem = ro.load("position").problem
+    (block,) = problem.data.blocks
+    wrong = problem.on(replace(problem.data, blocks=(replace(block, covariance=1e6 * block.covariance),)))
+    verdict = ro.calibrate(wrong).verdict
+    assert not verdict.delivered
+    assert "in another unit" in str(verdict)

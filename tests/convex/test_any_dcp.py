@@ -140,7 +140,8 @@ def test_is_refused_in_a_sentence(name: str) -> None:
 def test_a_covariance_that_needs_slopes_says_so() -> None:
     result = ro.calibrate(ro.load("position").problem, ro.Formulation("level", penalty=SQUARES, **level()), 1.0)
     with pytest.raises(
-        ro.InputError, match="found a loss without slope, accepted: a loss with slopes, which covariances"
+        ro.InputError,
+        match="found a loss without slope, accepted: a loss without own variables and with slopes, which covariances",
     ):
         _ = result.covariance
 

@@ -47,7 +47,7 @@ def test_tolerances_are_bounds_in_scales() -> None:
     assert upper == pytest.approx([np.inf, 2.0, 0.5, np.inf, np.inf, np.inf, np.inf, 2.0])
     assert (lower == -upper).all()
     none = Parameters(NAMES, KINDS, NOMINAL, SCALE, np.full(8, np.inf), np.ones(8, dtype=bool))
-    with pytest.raises(ro.InputError, match="no tolerance for any identified parameter"):
+    with pytest.raises(ro.InputError, match="tolerances: found none for any identified parameter"):
         ro.within_tolerance.bounds(none)
 
 

@@ -118,7 +118,9 @@ def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
 )
 def test_a_loss_that_has_no_factor_is_named(loss: Any, said: str) -> None:
     mine = ro.Formulation("mine", loss=loss)
-    with pytest.raises(ro.InputError, match=f"formulation 'mine': found {said}, accepted: a loss with slopes"):
+    with pytest.raises(
+        ro.InputError, match=f"formulation 'mine': found {said}, accepted: a loss without own variables and with slopes"
+    ):
         inliers_of(mine, np.full(5, 2.0), np.full(5, 3))
 
 

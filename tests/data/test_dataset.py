@@ -112,10 +112,25 @@ def test_sigmas_of_components_and_poses_as_transforms() -> None:
             1e-5,
             r"shapes \(2, 6\) and \(3, 3\), accepted: \(N, dof\) joint values and \(N, 3\)",
         ),
-        (np.zeros((2, 6)), np.zeros((2, 3)), np.full((2, 3), 1e-5), r"s\[:, :, None\] \*\* 2 \* np.eye\(3\)"),
+        (np.zeros((2, 6)), np.zeros((2, 3)), np.full((3, 2), 1e-5), r"\(2,\) or \(2, 3\) for the rows"),
         (np.zeros((2, 6)), np.zeros((2, 3)), [1e-5, 0.0, 1e-5], r"sigma: found \[1e-05, 0.0, 1e-05\]"),
     ],
 )
 def test_arrays_that_do_not_fit(q: np.ndarray, y: np.ndarray, sigma: object, sentence: str) -> None:
     with pytest.raises(ro.InputError, match=sentence):
         ro.Dataset.of(q, y, sigma)  # type: ignore[arg-type]
+
+
+def test_standard_deviations_of_rows() -> None:
+    """Laser trackers state them by row, and by component."""
+    q, y = np.zeros((4, 6)), np.zeros((4, 3))
+    rows = np.array([1e-5, 2e-5, 3e-5, 4e-5])
+    by_row = ro.Dataset.of(q, y, rows).blocks[0].covariance
+    assert by_row == pytest.approx(rows[:, None, None] ** 2 * np.eye(3))
+    both = rows[:, None] * [1.0, 2.0, 3.0]
+    assert ro.Dataset.of(q, y, both).blocks[0].covariance == pytest.approx(both[:, :, None] ** 2 * np.eye(3))
+    of_components = ro.Dataset.of(q[:3], y[:3], [1e-5, 2e-5, 3e-5]).blocks[0].covariance
+    assert len(of_components) in (1, 3)
+    assert of_components[0] == pytest.approx(np.diag([1e-5, 2e-5, 3e-5]) ** 2)
+    with pytest.raises(ro.InputError, match="sigma"):
+        ro.Dataset.of(q, y, [1e-5, 2e-5, 0.0, 4e-5])

@@ -57,7 +57,7 @@ def test_mirrored_points_get_a_proper_rotation() -> None:
 @pytest.mark.parametrize(
     ("points", "found"),
     [
-        (np.zeros((2, 3)), "points: found 2"),
+        (np.zeros((2, 3)), "measured positions: found 2"),
         (np.ones((5, 3)), "points on a line, or all in one place"),
         (np.outer(np.arange(5.0), [1.0, 2.0, 3.0]), "points on a line, or all in one place"),
         (np.zeros((4, 2)), "shapes"),

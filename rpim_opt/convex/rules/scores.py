@@ -117,6 +117,10 @@ def gcv(program: Program) -> Selection:
     return linear_rule(program, "gcv", score, "smallest generalized cross-validation error")
 
 
+ROOM = 1.1
+"""Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
+
+
 @on_squares
 def discrepancy(program: Program) -> Selection:
     """Choose the largest weight whose misfit agrees with the declared noise (Morozov 1966).
@@ -127,7 +131,7 @@ def discrepancy(program: Program) -> Selection:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.discrepancy)
     >>> f"{result.weight:.2g}", result.selection.note
-    ('28', 'misfit equal to the declared noise')
+    ('28', 'residual norm 1.1 times that of the declared noise')
     """
 
     def score(weights: Array) -> Array:  # ln(rho / (tau^2 (m - dof)))
@@ -135,7 +139,7 @@ def discrepancy(program: Program) -> Selection:
         left = ROOM**2 * np.maximum(program.squared.equations - freedom, 1e-9)
         return np.log(np.maximum(rho, np.finfo(float).tiny) / left)
 
-    note = "misfit equal to the declared noise"
+    note = f"residual norm {ROOM:g} times that of the declared noise"
     chosen = linear_rule(program, "discrepancy", score, note)
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights
@@ -153,10 +157,6 @@ def discrepancy(program: Program) -> Selection:
     share = chosen.score[k] / (chosen.score[k] - chosen.score[k + 1])
     weight = float(np.exp(np.log(weights[k]) + share * np.log(weights[k + 1] / weights[k])))
     return replace(chosen, weight=weight, interior=True, note=note)
-
-
-ROOM = 1.1
-"""Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
 
 
 @on_squares

@@ -242,7 +242,9 @@ class Clarabel:
         numbers = {"P": P.data.copy(), "q": q, "A": A.data.copy(), "b": b}
         for k, attempt in enumerate(self.attempts):
             if k == 0 and solver is not None:
-                solver.update(**{key: v for key, v in numbers.items() if not np.array_equal(v, self._numbers[key])})
+                changed = {key: v for key, v in numbers.items() if not np.array_equal(v, self._numbers[key])}
+                if changed:  # Clarabel panics at none
+                    solver.update(**changed)
             else:
                 solver = import_module("clarabel").DefaultSolver(P, q, A, b, self.cones, _settings(attempt))
             if k == 0 and solver.is_data_update_allowed():  # not where it decomposes a matrix

@@ -155,7 +155,8 @@ class Measurement(Brief):
         return "pixel" in self.components.values()
 
     def __post_init__(self) -> None:
-        require_columns(self.extra, f"measurement {self.name}")
+        for dimensions in (self.columns, self.components, self.noise, self.parameters, self.extra):
+            require_columns(dimensions, f"measurement {self.name}")
         for name in self.sees:
             if name not in ("q", "torque", *self.extra):
                 accepted = "'q', 'torque', or a column of its extra"

@@ -27,7 +27,7 @@ def register(source: Array, target: Array) -> Array:
     if source.shape != target.shape or source.shape[1:] != (3,):
         raise InputError("points", f"shapes {source.shape}, {target.shape}", "N points, N points")
     if len(source) < 3:
-        raise InputError("points", f"{len(source)}", "three or more, not on a line")
+        raise InputError("measured positions", f"{len(source)}", "three or more, not on a line")
     for points, what in ((source, "source"), (target, "target")):
         spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
         if spread[1] <= 1e-6 * spread[0]:
