@@ -145,11 +145,9 @@ def load(
     (16, 9, 'Tikhonov')
     """
     definition = read_problem(name, variant, measurements, model, chain)
-    if len(definition.chains) > 1 and chain is None:
-        return _of_chains(
-            definition, {each: load(name, variant, measurements, model, each) for each in definition.chains}
-        )
     table = definition.table
+    if len(table.chain) > 1 and chain is None:
+        return _of_chains(definition, {each: load(name, variant, measurements, model, each) for each in table.chain})
     path = definition.path
     data, files = _read_tables(definition)
     tools = definition.tools

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
 from pathlib import Path
-from typing import TypeVar
+from typing import TypeGuard, TypeVar
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import inside
@@ -32,7 +32,7 @@ def allow_code() -> Iterator[None]:
         _ALLOWED.reset(token)
 
 
-def is_own(name: object) -> bool:
+def is_own(name: object) -> TypeGuard[str]:
     """Return whether a name is of an object in a Python file, ``mine:height`` for ``height`` in ``mine.py``."""
     return isinstance(name, str) and ":" in name
 

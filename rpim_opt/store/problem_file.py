@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,6 +22,7 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import identifiable
+from rpim_opt.robot.chain import Described
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
@@ -258,11 +259,18 @@ class ProblemFile:
     placed: Mapping[str, Any]
     robot: Robot
     kinds: Mapping[str, Measurement]
-    observations: tuple[Observation, ...]
     tools: Mapping[str, tuple[float, ...]]
     base: tuple[float, ...] | None
-    chains: tuple[str, ...] = ()
-    board: Board | None = None
+    board: Board | None
+
+    @property
+    def observations(self) -> list[Observation]:
+        """The tables of every kind of measurement, that of the top level first."""
+        table = self.table
+        if table.identification is None:
+            return table.observation
+        keys = ("measurement", "identification", "validation")
+        return [Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={}), *table.observation]
 
     def chosen(self, parameters: Parameters, data: Dataset) -> Parameters:
         """Return the parameters with the file's scales, tolerances and selection of identified parameters."""
@@ -283,87 +291,76 @@ def read_problem(
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     content = read_toml(path)
-    for kind in _own_kinds(content):
-        kinds[kind] = replace(own_object(kind, Measurement, "key measurement", path), name=kind)
     table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is asked for
     if variant is not None:
-        variants = content.get("variant", {})
-        own = {key: value for key, value in content.items() if key != "variant"}
-        content = _overlay(own, pick(variants, variant, "variant", path))
+        content = _overlay(content, pick(table.variant, variant, "variant", path))
         table, placed = _checked(content, kinds, path)
-    chains = tuple(table.chain)
-    if chains:
-        own = {key: value for key, value in content.items() if key not in ("variant", "chain")}
-        table, placed = _checked(_overlay(own, table.chain[chain or chains[0]]), kinds, path)
-    observations = list(table.observation)  # behind that of the top level
-    if table.identification is not None:
-        keys = ("measurement", "identification", "validation")
-        observations.insert(0, Observation.model_construct(**{key: getattr(table, key) for key in keys}, noise={}))
-    if not observations:
+    if table.chain:
+        content = _overlay(content, pick(table.chain, chain or next(iter(table.chain)), "chain", path))
+        table, placed = _checked(content, kinds, path)
+    arm = _arm(table, path, model)
+    base = None
+    if table.base != "auto":
+        base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
+    tools = {"": tuple(arm.tool)}
+    if any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
+        tools = {"": _frame(table.tool, "tool", path)}
+    elif table.tool:
+        tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
+    file = ProblemFile(path, table, placed, arm.robot, kinds, tools, base, _board(table, path))
+    if not file.observations:
         raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
-    for each in observations:
+    for each in file.observations:
         pick(kinds, each.measurement, "key measurement", path)
         inside(path.parent, each.identification, "key identification", path)
         if each.validation:  # an empty one is how a variant has none
             inside(path.parent, each.validation, "key validation", path)
     named_formulation(table.formulation, path)
     named_weight(table.selector, path)
-    file = find_robot(table.robot, path.parent)
-    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or chains):
-        what = "chain" if chains else "urdf_base, urdf_tip"
-        raise InputError(f"key {what}", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
-    arm = read_arm(file, table.urdf_base, table.urdf_tip, origins=bool(chains))
-    turned = numeric_frame(arm.base)[:3, :3]
-    gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
-    arm = replace(arm, robot=replace(arm.robot, gravity=gravity))
-    if table.terms and model is None:
-        model = KinematicModel([own_object(term, Term, "key terms", path) for term in table.terms])
-    if model is not None:
-        if not isinstance(model, KinematicModel):
-            accepted = "a ro.robot.Model with terms of your own; extensions are chosen by calibrate(model='auto')"
-            raise InputError("model", f"{model!r}"[:80], accepted)
-        terms = (*arm.robot.model.terms, *model.terms)
-        arm = replace(arm, robot=replace(arm.robot, model=KinematicModel(terms)))
-    base = None
-    if table.base != "auto":
-        base = _frame(table.base, "base", path) if table.base else tuple(arm.base)
-    if not table.tool:
-        tools = {"": tuple(arm.tool)}
-    elif any(split_unit(key)[0] in FRAME for key in table.tool):  # one without a name is the only one
-        tools = {"": _frame(table.tool, "tool", path)}
-    else:
-        tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
-    board = None
-    if isinstance(table.target, str):
-        board = read_board(inside(path.parent, table.target, "key target", path))
-    elif table.target is not None:
-        pattern = validate(GridTable, table.target, path, "target")
-        try:
-            board = grid_board(pattern.columns, pattern.rows, pattern.spacing)
-        except InputError as error:
-            raise InputError("key target", error.found, error.accepted, path) from None
-    return ProblemFile(path, table, placed, arm.robot, kinds, tuple(observations), tools, base, chains, board)
+    return file
 
 
-def _own_kinds(content: Mapping[str, Any]) -> Iterator[Any]:
-    """Yield the measurement types of a Python file that a problem file and its variants name."""
-    variants = content.get("variant", {})
-    chains = content.get("chain", {})
-    overlays = [each for tables in (variants, chains) if isinstance(tables, dict) for each in tables.values()]
-    for table in (content, *overlays):
-        if isinstance(table, dict):
-            observations = table.get("observation", [])
-            listed = [each for each in observations if isinstance(each, dict)] if isinstance(observations, list) else []
-            yield from filter(is_own, (each.get("measurement") for each in (table, *listed)))
-
-
-def _checked(
-    content: dict[str, Any], kinds: Mapping[str, Measurement], path: Path
-) -> tuple[ProblemTable, dict[str, Any]]:
-    """Return the checked table, and apart from it those that place fixtures."""
+def _checked(content: dict[str, Any], kinds: dict[str, Measurement], path: Path) -> tuple[ProblemTable, dict[str, Any]]:
+    """Return the checked table, and apart from it those that place fixtures; types of Python files are added."""
+    observations = content.get("observation", [])
+    for each in (content, *(observations if isinstance(observations, list) else [])):
+        kind = each.get("measurement") if isinstance(each, dict) else None
+        if is_own(kind):
+            kinds[kind] = replace(own_object(kind, Measurement, "key measurement", path), name=kind)
     fixtures = {name.partition("_")[0] for kind in kinds.values() for name in kind.parameters}
     placed = {key: value for key, value in content.items() if key in fixtures and isinstance(value, dict)}
     return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path), placed
+
+
+def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> Described:
+    """Return the robot with its gravity, and terms of a script or of the file."""
+    file = find_robot(table.robot, path.parent)
+    if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or table.chain):
+        what = "chain" if table.chain else "urdf_base, urdf_tip"
+        raise InputError(f"key {what}", f"a robot '{table.robot}'", "a robot in a file .urdf", path)
+    arm = read_arm(file, table.urdf_base, table.urdf_tip, origins=bool(table.chain))
+    turned = numeric_frame(arm.base)[:3, :3]
+    gravity = gravity_with(arm.robot.gravity, table.mounting, table.payload, path, turned)
+    if model is None:
+        model = KinematicModel([own_object(term, Term, "key terms", path) for term in table.terms])
+    if not isinstance(model, KinematicModel):
+        accepted = "a ro.robot.Model with terms of your own; extensions are chosen by calibrate(model='auto')"
+        raise InputError("model", f"{model!r}"[:80], accepted)
+    whole = KinematicModel((*arm.robot.model.terms, *model.terms))
+    return replace(arm, robot=replace(arm.robot, gravity=gravity, model=whole))
+
+
+def _board(table: ProblemTable, path: Path) -> Board | None:
+    """Return what a camera sees: the points of a table, or of a grid."""
+    if table.target is None:
+        return None
+    if isinstance(table.target, str):
+        return read_board(inside(path.parent, table.target, "key target", path))
+    pattern = validate(GridTable, table.target, path, "target")
+    try:
+        return grid_board(pattern.columns, pattern.rows, pattern.spacing)
+    except InputError as error:
+        raise InputError("key target", error.found, error.accepted, path) from None
 
 
 def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
