@@ -45,7 +45,7 @@ from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import frame_of
 from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
 
-IDENTIFICATION, VALIDATION, TARGET = "identification.csv", "validation.csv", "target.csv"
+TABLES = ("identification.csv", "validation.csv", "target.csv")
 ROBOT_OF_CHAINS = "robot.urdf"
 """Files of a new folder."""
 SHARED = (
@@ -113,71 +113,48 @@ def new_problem(
     """
     folder = Path(folder)
     source = find_source(robot)
-    drawing = f"a copy of the ready robot {source.stem}"
-    if source.parent != READY:
-        drawing = f"modified DH table, from {source.name}"
     before = _with_chains(folder, source, chain)
     chain = chain or branching_tip(source, urdf_base, urdf_tip)
-    options = options or TableOptions()
     if validation and hold_out is not None:
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
     arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
-    paths = [data] if isinstance(data, str | Path) else data
-    later = [validation] if isinstance(validation, str | Path) else list(validation or ())
+    paths, later = _files(data), _files(validation or ())
+    tell = understood or (lambda understanding: None)
     understanding = understand_of(arm, paths, measurement, options)
-    if understood is not None:
-        understood(understanding)
-    names = {name: f"{chain}_{name}" if chain else name for name in (IDENTIFICATION, VALIDATION, TARGET)}
-    board = stated_target(target, names[TARGET])
+    tell(understanding)
+    identified, validated, seen = (f"{chain}_{name}" if chain else name for name in TABLES)
+    board = stated_target(target, seen)
     kind, how = _kind(arm, understanding, board, measurement)
-    noise = usual_noise(kind)
     rows = rows_of(understanding, on_board(understanding.columns, board.board), arm, kind)
     columns = understanding.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
-    held = np.zeros(len(rows), dtype=bool)
-    validated_by = f'# validation = "{names[VALIDATION]}"   # a table that is used for no choice; none was given'
-    if hold_out is not None:
-        held = _held_out(rows, hold_out, seed)
-        validated_by = f'validation = "{names[VALIDATION]}"\nheld_out = true  # drawn with seed {seed}; used in the end'
-    tables = {names[IDENTIFICATION]: _rows(columns, ~held)}
-    if hold_out is not None:
-        tables[names[VALIDATION]] = _rows(columns, held)
-        rows = rows.take(np.flatnonzero(~held))
+    held = np.zeros(len(rows), dtype=bool) if hold_out is None else _held_out(rows, hold_out, seed)
+    tables = {identified: _rows(columns, ~held)}
+    rows = rows.take(np.flatnonzero(~held))
+    if held.any():
+        tables[validated] = _rows(columns, held)
+    validated_by = ""
     if later:
         other = understand_of(arm, later, kind.name, understanding.options)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
-        tables[names[VALIDATION]] = other.columns
-        if understood is not None:
-            understood(other)
-        validated_by = f'validation = "{names[VALIDATION]}"\n# from {Path(other.file).name}; used for no choice'
+        tell(other)
+        tables[validated] = other.columns
+        validated_by = Path(other.file).name
     if board.table:
-        tables[names[TARGET]] = board.table
-    handed = [Path(file) for file in (*paths, *later)]
-    links = [("urdf_base", urdf_base), ("urdf_tip", urdf_tip)]
-    followers = [f"{i}" for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading]
-    context = {
-        "chain": chain,
-        "followers": ", ".join(followers),
-        "first": not before,
-        "links": [(key, toml(link)) for key, link in links if chain and link is not None],
-        "robot": ROBOT_OF_CHAINS if chain else "robot.toml",
-        "identification": names[IDENTIFICATION],
-        "target": board.stated,
-        "drawing": f"a copy of {source.name}" if chain else drawing,
-        "columns": how,
-        "data": Path(understanding.file).name,
-        "count": len(rows),
-        "validation": validated_by,
-        "raw": {toml(str(name)): sha256_of(file) for name, file in zip(_names(handed), handed, strict=True)},
-        "fixture": kind.start is not None,
-        "assumed": not any(name.startswith(("sigma", "u95")) for name in columns),
-        "reading": [
-            (name, toml(text)) for name, text in replace(understanding.options, joints=arm.names).texts().items()
-        ],
-    }
+        tables[seen] = board.table
+    handed = [*paths, *later]
+    several = len({file.name for file in handed}) < len(handed)  # of one name: then by their paths
+    noise = usual_noise(kind)
     with in_file(understanding.file):
-        text, guessed = _problem_text(arm, kind, rows, noise, context)
+        text, guessed = _problem_text(
+            arm, kind, rows, noise, chain=chain, first=not before, source=source, ready=source.parent == READY,
+            links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, identification=identified, target=board.stated,
+            columns=how, data=Path(understanding.file).name, validation=validated, held_out=held.any(), seed=seed,
+            validated_by=validated_by, assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
+            raw={str(file) if several else file.name: sha256_of(file) for file in handed},
+            reading=replace(understanding.options, joints=arm.names).texts(),
+        )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
     contents["problem.toml"] = before + text.encode()
     if before:
@@ -205,10 +182,8 @@ def new_problem(
     return Started(folder, counts, tuple(notes), replace(understanding, kind=kind))
 
 
-def _names(files: Sequence[Path]) -> list[str]:
-    """Return the names of files; their paths where two have one name."""
-    names = [file.name for file in files]
-    return names if len(set(names)) == len(names) else [str(file) for file in files]
+def _files(stated: str | Path | Sequence[str | Path]) -> list[Path]:
+    return [Path(stated)] if isinstance(stated, str | Path) else [Path(file) for file in stated]
 
 
 def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
@@ -267,7 +242,7 @@ class StatedTarget(NamedTuple):
     table: Columns
 
 
-def stated_target(text: str, file: str = TARGET) -> StatedTarget:
+def stated_target(text: str, file: str = TABLES[-1]) -> StatedTarget:
     """Return the board of ``--target``: a table, called ``file`` in the folder, or a grid; empty without one."""
     if not text:
         return StatedTarget({}, "", {})
@@ -334,7 +309,7 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
 
 
 def _problem_text(
-    arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], context: Mapping[str, Any]
+    arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], chain: str, **context: Any
 ) -> tuple[str, str]:
     """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
     from jinja2 import Environment
@@ -344,33 +319,31 @@ def _problem_text(
     base, how = _base(arm, rows, tools, kind)
     parameters = starting_parameters(arm.robot, rows, base, tools)
     names = list(identifiable("auto", arm.robot, parameters, rows))
-    if context["chain"] and markers == [""]:
+    if chain and markers == [""]:
         names = _at_links(names, carried_by(arm.robot.model.terms), base is not None)
     lenses = starting_cameras(rows, {})
-    cameras = []
-    for fixture in sorted({block.fixture for block in camera_blocks(rows)}):
-        values = {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in ("fx", "fy", "cx", "cy")}
-        cameras.append((_subtable(fixture), "\n".join(f"{name}_px = {value:.1f}" for name, value in values.items())))
     touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
+    template.filters |= {"toml": toml, "key": _key, "frame": _frame}
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         **context,
-        title=toml(arm.robot.name),
-        measurement=toml(kind.name),
-        identify=toml(_patterns(names, len(arm.robot.mdh))),
-        noise=list(noise.items()),
-        sigma=f"sigma_{next(iter(noise)).rpartition('_')[2]}",
-        base="" if base is None else _frame(base),
+        chain=chain,
+        robot=arm.robot,
+        followers=[i for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading],
+        kind=kind,
+        rows=rows,
+        identify=_patterns(names, len(arm.robot.mdh)),
+        noise=noise,
+        base=None if base is None else _frame(base),
         how=how,
-        known="guessed at the tip of the robot's file" if arm.tool.any() else "unknown, so from the flange's origin",
-        markers=[_subtable(marker) for marker in markers],
-        tool=_frame(arm.tool),
-        cameras=cameras,
-        touched=toml(list(dict.fromkeys(touched))[:2]) if kind.touching else "",
-        sessions=rows.sessions,
-        temperatures=len(rows.temperatures),
-        label=_key(rows.label[0]),
-        words=kind.words,
+        guessed_tool=arm.tool.any(),
+        markers=markers,
+        tool=arm.tool,
+        cameras={
+            fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in ("fx", "fy", "cx", "cy")}
+            for fixture in sorted({block.fixture for block in camera_blocks(rows)})
+        },
+        touched=list(dict.fromkeys(touched))[:2] if kind.touching else [],
     )
     return text, how
 
@@ -436,7 +409,3 @@ def _frame(place: Array) -> str:
 def _key(text: str) -> str:
     """Return a TOML key."""
     return text if re.fullmatch(r"[\w-]+", text, re.ASCII) else toml(text)
-
-
-def _subtable(name: str) -> str:
-    return f".{_key(name)}" if name else ""
