@@ -185,22 +185,12 @@ class Acceptance:
 
     The verdict is ``"accepted"`` where at every configuration of the region the bound is within the limit, and held-out
     rows bear it out; ``"rejected"`` where they miss oftener than chance allows, or the robot's repeatability at its
-    least is above the limit; ``"undecided"`` where something is lacking.
+    least is above the limit; ``"undecided"`` where something is lacking. ``reasons`` say why, a sentence each; empty
+    where it is accepted.
 
-    Parameters
-    ----------
-    requirement
-        Limit, confidence and region.
-    verdict
-        ``"accepted"``, ``"rejected"`` or ``"undecided"``.
-    reasons
-        Why, a sentence each; empty where it is accepted.
-    workspace
-        Expanded uncertainties at configurations of the region.
-    repeatability
-        The largest of them if all parameters were known: the repeatability's part [m].
-    held_out
-        Errors on held-out rows and coverage of their intervals, a document [mm] with its ``sentence``.
+    ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
+    ``repeatability`` would be the largest of them if all parameters were known [m]. ``held_out`` are the errors on
+    held-out rows and the coverage of their intervals, a document [mm] with its ``sentence``.
 
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()

@@ -11,10 +11,11 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.verdict import BAD, NOISY, UNITS, kept_rows, noise_ratio, residuals, rms
+from rpim_opt.calibration.verdict import BAD, NOISY, kept_rows, noise_ratio, residuals, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.misreadings import Better, better_reading
+from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
 

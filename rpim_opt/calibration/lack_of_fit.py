@@ -20,8 +20,8 @@ from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.verdict import UNITS
 from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 

@@ -53,20 +53,11 @@ COVERAGE_FACTOR = 2.0
 
 
 class Prediction(NamedTuple):
-    """Predicted positions with their uncertainty.
+    """Predicted positions (N, 3) in the instrument's frame [m] with their ``covariance`` (N, 3, 3) [m^2].
 
-    Parameters
-    ----------
-    position
-        (N, 3) in the instrument's frame [m].
-    covariance
-        (N, 3, 3) of the positions [m^2].
-    coverage_factor
-        k of U = k u; (N, 1) where rows have degrees of freedom of their own.
-    outside
-        Which rows are beyond the measured joint ranges; there an interval may be too narrow.
-    freedom
-        Degrees of freedom; (N,) for readings of an unknown session, whose offset few sessions estimate.
+    ``coverage_factor`` is k of U = k u, (N, 1) where rows have degrees of freedom of their own; ``freedom`` are these,
+    (N,) for readings of an unknown session, whose offset few sessions estimate. ``outside`` are the rows beyond the
+    measured joint ranges: there an interval may be too narrow.
     """
 
     position: Array

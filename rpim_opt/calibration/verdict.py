@@ -13,6 +13,7 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.diagnosis import decimals_of
+from rpim_opt.problem.noise import UNITS
 from rpim_opt.robot.parameters import own_name
 
 BAD = "Larger than expected"
@@ -25,8 +26,6 @@ REACH = 0.003
 """Residual RMS over the length of the arm that a robot's own effects stay below."""
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
-UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
-"""Unit in which residuals are said, and its size in SI."""
 ANGULAR = 0.02
 """Residual RMS of orientations [rad] that a robot's own effects stay below."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}

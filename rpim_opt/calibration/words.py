@@ -232,20 +232,17 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         if ratio[i] > UNUSUAL:
             cause = ": an error of assembly or of its zero" if is_joint_offset(names[i]) else ""
             unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
-    excluded = [str(row) for row in learned.left_out]
-    lines = [
-        *_scale_lines(learned),
-        *_noise_lines(learned),
-        *_condition_lines(learned, names, z),
-        *_model_lines(learned),
-        *unusual,
-        *_said("Excluded outliers", [listed(excluded, MOST)] if excluded else []),
-    ]
+    sizes = {**_scales(learned), **_noise(learned), **_conditions(learned, names, z)}
+    lines = [f"{what}: {joined(parts)}." for what, parts in sizes.items() if parts]
+    lines += [*_model_lines(learned), *unusual]
+    if learned.left_out:
+        excluded = [str(row) for row in learned.left_out]
+        lines.append(f"Excluded outliers: {listed(excluded, MOST)}.")
     return [*lines, *learned.notes]
 
 
-def _scale_lines(learned: Learned) -> list[str]:
-    """Say the prior scales of the deviations, of model extensions and of transmission errors."""
+def _scales(learned: Learned) -> dict[str, list[str]]:
+    """Return the prior scales of the deviations, of model extensions and of transmission errors as texts."""
     groups, deflections, curves = [], [], []
     for name, size in learned.sizes.items():
         if name in DEFLECTIONS:
@@ -255,15 +252,15 @@ def _scale_lines(learned: Learned) -> list[str]:
     if learned.curves is not None:
         ripple, waves = (_figure(size, 1e3, "mrad") for size in (learned.curves.size, learned.curves.waves))
         curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad; waves {waves}")
-    return [
-        *_said("Estimated prior scale", groups),
-        *_said("Estimated scale of model extensions", deflections),
-        *_said("Transmission error of joints (1 sigma)", curves),
-    ]
+    return {
+        "Estimated prior scale": groups,
+        "Estimated scale of model extensions": deflections,
+        "Transmission error of joints (1 sigma)": curves,
+    }
 
 
-def _noise_lines(learned: Learned) -> list[str]:
-    """Say the robot's repeatability, its parts beside the largest, and the factor on the instrument's noise."""
+def _noise(learned: Learned) -> dict[str, list[str]]:
+    """Return the robot's repeatability, its parts beside the largest, and the factor on the instrument's noise."""
     robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
     largest = max((size.value for size in robot.values()), default=0.0)
     parts = []
@@ -273,11 +270,11 @@ def _noise_lines(learned: Learned) -> list[str]:
             parts.append(f"{_figure_or_bound(size, 1e3, unit)} {where}")
     factor = learned.noise.get("instrument")
     instrument = [] if factor is None else [_figure_or_bound(factor, 1.0, "x the stated one")]
-    return [*_said("Robot repeatability (1 sigma)", parts), *_said("Measurement noise", instrument)]
+    return {"Robot repeatability (1 sigma)": parts, "Measurement noise": instrument}
 
 
-def _condition_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[str]:
-    """Say session offsets, of a coordinate and an axis, and thermal expansion."""
+def _conditions(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, list[str]]:
+    """Return session offsets, of a coordinate and an axis, and thermal expansion."""
     sessions = []
     for dimension, group in SESSIONS.items():
         if group in learned.sizes:
@@ -290,7 +287,7 @@ def _condition_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list
         per_kelvin = 1e6 * learned.stated * learned.sizes[EXPANSION].value * z
         of = [own_name(name) == EXPANSION for name in names]
         expansion = [f"{value:.3g} um per metre and kelvin" for value in per_kelvin[of]]
-    return [*_said("Session offsets (1 sigma)", sessions), *_said("Thermal expansion", expansion)]
+    return {"Session offsets (1 sigma)": sessions, "Thermal expansion": expansion}
 
 
 def _model_lines(learned: Learned) -> list[str]:
@@ -306,10 +303,6 @@ def _model_lines(learned: Learned) -> list[str]:
         f"Model: geometry with {joined(learned.extensions)}{evidence}. `compensate` uses the whole model; files "
         "of controllers hold geometry alone, and `export` states the error of what it writes."
     ]
-
-
-def _said(what: str, parts: Sequence[str]) -> list[str]:
-    return [f"{what}: {joined(parts)}."] if parts else []
 
 
 def _figure(size: Size, factor: float, unit: str) -> str:

@@ -20,8 +20,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import WRONG, better_reading, coupling, signs
-from rpim_opt.problem.noise import Equations
+from rpim_opt.problem.misreadings import BETTER, WRONG, better_reading, coupling, signs
+from rpim_opt.problem.noise import UNITS, Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
@@ -33,14 +33,8 @@ from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
 """A joint that moves less [rad, m] is hardly seen."""
-SPREAD = {"length": ("mm", 1e-3), "pixel": ("px", 1.0)}
-"""Units of typical deviations, where they are not milliradians."""
-STANDS_OUT = 5.0
-"""Rows further than this many robust standard deviations above the median residual are listed."""
 FAR = 5.0
-"""A row is in question from so many medians of the errors on."""
-FITS = 0.2
-"""What a row is mistaken for leaves less than this part of its error."""
+"""A row is in question from so many medians of the errors on, or robust standard deviations above their median."""
 ALIKE = (0.4, 2.5)
 """Rounding explains errors that are between these multiples of what it makes."""
 MOVED = 0.5
@@ -210,7 +204,7 @@ class Inspection(Tabled):
                 row = {"measured": what, "unit": unit, "from": None, "to": None}
                 if kind.columns:
                     row |= {"from": block.y[:, i].min() / si, "to": block.y[:, i].max() / si}
-                each, size = SPREAD.get(dimension, ("mrad", 1e-3))
+                each, size = UNITS.get(dimension, ("mrad", 1e-3))
                 rows[what] = row | {f"sigma_{each}": of[column] / size if column in of else None}
         return list(rows.values())
 
@@ -239,7 +233,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     fitted, x = fitted_frames(problem)
     residual = fitted.errors(x)
     middle = np.nanmedian(residual)
-    limit = middle + STANDS_OUT * 1.4826 * np.nanmedian(np.abs(residual - middle))
+    limit = middle + FAR * 1.4826 * np.nanmedian(np.abs(residual - middle))
     order = np.argsort(-np.nan_to_num(residual))
     groups: list[tuple[str, ...]] = []
     squares, freedom = 0.0, 0
@@ -500,7 +494,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     pairs = []
     for i, j in combinations(far, 2):
         crossed = np.linalg.norm([points.y[i] - fit.modelled[j], points.y[j] - fit.modelled[i]], axis=1)
-        if points.marker[i] == points.marker[j] and (crossed < FITS * fit.error[[i, j]]).all():
+        if points.marker[i] == points.marker[j] and (crossed < BETTER * fit.error[[i, j]]).all():
             pairs.append(f"{label[i]} and {label[j]}")
     if pairs:
         yield f"the measured values of rows {listed(pairs)} fit each other's joint values: exchange them."
@@ -509,7 +503,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     model = transformed((fit.base @ forward_kinematics(points.robot, points.q[far]))[:, None], fit.tools)
     error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
     error[np.arange(len(far)), points.marker[far]] = np.inf
-    markers = [label[i] for i in far[error.min(axis=1) < FITS * fit.error[far]]]
+    markers = [label[i] for i in far[error.min(axis=1) < BETTER * fit.error[far]]]
     if markers:
         yield (
             f"{_rows(markers, 'fits', 'fit')} another reflector than the stated one (column marker): reflectors "
@@ -542,7 +536,7 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     fitted = {i: replace(points, q=_values_that_fit(points, i)) for i in turning}
     left = {i: misfit(each) for i, each in fitted.items()}
     i = min(left, key=left.__getitem__)
-    if left[i] >= min(FITS * whole, WRONG):  # free values take up much of any other mistake
+    if left[i] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
         return
     apart = np.abs(np.angle(np.exp(1j * (fitted[i].q - points.q)[:, i])))
     odd = [problem.data.label[row] for row in points.row[apart > LEAST_TRAVEL["revolute"] / 2]]
@@ -585,7 +579,7 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     parted = {k: [points.take(part) for part in np.split(rows, [k])] for k in _places(len(rows))}
     left = {k: max(misfit(part) for part in parts) for k, parts in parted.items()}
     place = min(left, key=left.__getitem__)
-    if left[place] >= FITS * whole:
+    if left[place] >= BETTER * whole:
         return
     first, second = (fit_points(part) for part in parted[place])
     if points.lengths:
@@ -627,7 +621,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
             named = replace(points, marker=marker, tools=tools)
             fit = fit_points(named)
         sizes = np.bincount(named.marker, minlength=count)
-        if sizes.min() >= FEWEST // 2 and misfit(named) < FITS * whole:
+        if sizes.min() >= FEWEST // 2 and misfit(named) < BETTER * whole:
             far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()
             others = [problem.data.label[i] for i in points.row[named.marker != sizes.argmax()]]
             yield (
@@ -644,7 +638,7 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
         return
     whole = misfit(points)
     first = {k: points.take(np.arange(k)) for k in _places(len(points.row))}
-    fitting = [k for k, part in first.items() if misfit(part) < FITS * whole]
+    fitting = [k for k, part in first.items() if misfit(part) < BETTER * whole]
     if not fitting:
         return
     error = fit_points(first[max(fitting)]).error
@@ -830,7 +824,7 @@ def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
             best = max(best, (float(step @ along), off, what))
     gain, off, what = best
     spare = len(r) - N
-    if off < LOOSE or whole - gain >= FITS * whole or spare < N:
+    if off < LOOSE or whole - gain >= BETTER * whole or spare < N:
         return
     if _by_chance(gain, whole, N, spare) < RARE:
         left = f"that leaves {100 * np.sqrt(1 - gain / whole):.0f} % of the residuals"

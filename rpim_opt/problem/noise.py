@@ -10,6 +10,9 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 
+UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
+"""Unit in which residuals and their deviations are said, and its size in SI."""
+
 
 @dataclass(frozen=True, eq=False)
 class Repeatability:

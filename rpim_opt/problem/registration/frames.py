@@ -250,32 +250,24 @@ def starting_parameters(
         # a board or a camera that is turned otherwise is not in sight
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
-    values, fixtures = _of_measurements(robot, data, base, places, own)
+    values: dict[str, tuple[str, float]] = {}  # dimension and value [SI] of the measurements' own parameters
+    fixtures: set[str] = set()  # which of them the nominal robot locates
+    for block in data.blocks:
+        kind = block.measurement
+        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
+        start: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
+        if names and not start and kind.start is not None:
+            tool = numeric_frame(places[block.markers[0]])
+            T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
+            start = kind.start(T[:, :3, 3], block.y)
+            fixtures |= {names[name] for name in start}
+        values |= {full: (kind.parameters[name], float(start.get(name, 0.0))) for name, full in names.items()}
     if temperature is None and len(data.temperatures):
         temperature = float(data.temperatures.mean())
     named = sorted({*data.sessions, *sessions})
     frames = dict.fromkeys(of_fixture(f"{name}_", b.fixture) for b in data.blocks for name in b.measurement.frames)
     parameters = model_parameters(robot, base, tools, values, tuple(frames), named, temperature)
     return _with_fitted(robot, data, parameters, fixtures) if fixtures else parameters
-
-
-def _of_measurements(
-    robot: Robot, data: Dataset, base: Place, tools: Mapping[str, Place], own: Mapping[str, float]
-) -> tuple[dict[str, tuple[str, float]], set[str]]:
-    """Return dimension and value [SI] of the measurements' own parameters, and which the nominal robot locates."""
-    values: dict[str, tuple[str, float]] = {}
-    located: set[str] = set()
-    for block in data.blocks:
-        kind = block.measurement
-        names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
-        start_values: Mapping[str, float] = {name: own[full] for name, full in names.items() if full in own}
-        if names and not start_values and kind.start is not None:
-            tool = numeric_frame(tools[block.markers[0]])
-            T = numeric_frame(base) @ forward_kinematics(robot, block.q[:, 0]) @ tool
-            start_values = kind.start(T[:, :3, 3], block.y)
-            located |= {names[name] for name in start_values}
-        values |= {full: (kind.parameters[name], float(start_values.get(name, 0.0))) for name, full in names.items()}
-    return values, located
 
 
 def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: Collection[str]) -> Parameters:
