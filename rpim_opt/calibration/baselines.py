@@ -28,9 +28,7 @@ class Baseline(NamedTuple):
 
 def linear_least_squares(problem: CalibrationProblem) -> Baseline:
     """Linear least squares of the paper: one step from nominal, of smallest norm in units of the scales."""
-    scale = problem.parameters.free.scale
-    model = problem.linearize(np.zeros_like(scale))
-    return Baseline(scale * np.linalg.lstsq(model.A, model.b, rcond=1e-12)[0], 1, "linear least squares")
+    return gauss_newton(problem, iterations=1, cutoff=1e-12)._replace(method="linear least squares")
 
 
 def gauss_newton(

@@ -14,6 +14,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import BAD, NOISY, kept_rows, noise_ratio, residuals, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
+from rpim_opt.problem.diagnosis import first
 from rpim_opt.problem.misreadings import Better, better_reading
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
@@ -107,26 +108,27 @@ def _found(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return list(diagnosis.rows_without_values(problem))
     ordered = _in_table_order(result, problem)
     better = better_reading(ordered)
-    causes = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
-    if causes:
-        return [*diagnosis.rows_without_values(problem), *causes]
-    causes = [*diagnosis.rows_without_values(problem), *diagnosis.exchanged_rows(problem)]
-    causes += list(diagnosis.moved_far(problem)) or diagnosis.mixed_reflectors(problem)
+    read = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
+    rows = list(diagnosis.rows_without_values(problem))
+    if read:
+        return [*rows, *read]
+    causes = [*rows, *diagnosis.exchanged_rows(problem)]
+    causes += first(diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem))
     if not causes:
-        error, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
-        rows = own | (error <= np.nanmax(error[own]))  # held-out rows that are gross errors were not looked for
-        alone, x = ordered.on(ordered.data.take(np.flatnonzero(rows))), result.x
+        errors, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
+        likely = own | (errors <= np.nanmax(errors[own]))  # held-out rows that are gross errors were not looked for
+        alone, x = ordered.on(ordered.data.take(np.flatnonzero(likely))), result.x
         if result.learned is not None and result.learned.added:  # curves take up ratios and scales of all kinds
             p = problem.parameters
             alone = alone.identifying(p.identified & ~np.isin(p.names, result.learned.added))
             x = settled(alone)
-        causes = list(diagnosis.shown_by_residuals(alone, x)) or list(diagnosis.scattering_joint(alone, x))
+        causes = first(diagnosis.shown_by_residuals(alone, x), diagnosis.scattering_joint(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
-    causes = causes or list(diagnosis.rounded(problem, error))
+    causes = first(causes, diagnosis.rounded(problem, error))
     if causes or error < LARGEST["length"]:  # which a robot's own effects may be
         return causes
-    causes = list(diagnosis.odd_columns(problem)) or list(diagnosis.odd_joint(problem))
-    return causes or list(diagnosis.unrelated_rows(problem, error))
+    odd = diagnosis.odd_columns(problem), diagnosis.odd_joint(problem)
+    return first(*odd, diagnosis.unrelated_rows(problem, error))
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

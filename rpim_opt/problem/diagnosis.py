@@ -259,7 +259,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     else:
         there = np.array([own.get(name, 0.0) for name in free])
         warnings += exchanged_rows(problem)
-        warnings += list(moved_far(problem)) or shown_by_residuals(whole, there, transmission=False)
+        warnings += first(moved_far(problem), shown_by_residuals(whole, there, transmission=False))
     return Inspection(
         problem=problem,
         residual=residual,
@@ -271,6 +271,11 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         observability=observe(whole),
         contact=tuple(contact_sentences(problem)),
     )
+
+
+def first(*explanations: Iterable[str]) -> list[str]:
+    """Return the sentences of the first explanation that has any; later ones are not looked for."""
+    return next((sentences for sentences in map(list, explanations) if sentences), [])
 
 
 # What is said of a table

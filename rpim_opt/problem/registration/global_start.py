@@ -312,15 +312,14 @@ def _judged(
     free = max(equations - max(robot.dof - 2, 0) - fits.tools[0].size - 6, 1)
     cost = (fits.error[:, inliers] ** 2).sum(axis=1)
     chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
-    near = [i for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
-    turning = _turning(robot)
+    near = [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
     measured = points.q.reshape(-1, robot.dof)
-    low, high = measured.min(axis=0), measured.max(axis=0)
-    elsewhere = np.where(
-        turning, rng.uniform(-np.pi, np.pi, (UNSEEN, robot.dof)), rng.uniform(low, high, (UNSEEN, robot.dof))
-    )
-    zeros = [_gauged(robot, fits.zero[i]) for i in range(len(sign))]
-    classes: list[list[int]] = []
+    low, high = np.where(_turning(robot), [[-np.pi], [np.pi]], [measured.min(axis=0), measured.max(axis=0)])
+    elsewhere = rng.uniform(low, high, (UNSEEN, robot.dof))
+    zeros = [_gauged(robot, zero) for zero in fits.zero]
+    plain = [_plain(*each) for each in zip(sign, zeros, strict=True)]
+    same = 0.5 * max(least, LEAST_NOISE)
+    plainest: list[int] = []  # of fits that predict the same elsewhere, each with that prediction
     predictions: list[Array] = []
     for i in near:
         T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
@@ -328,18 +327,17 @@ def _judged(
         if points.lengths:
             there -= there.mean(axis=(0, 1))
         gaps = [_apart(there, other, points.lengths) for other in predictions]
-        if gaps and min(gaps) <= 0.5 * max(least, LEAST_NOISE):
-            classes[int(np.argmin(gaps))].append(i)
+        if gaps and min(gaps) <= same:
+            k = int(np.argmin(gaps))
+            plainest[k] = min(plainest[k], i, key=plain.__getitem__)
         else:
-            classes.append([i])
+            plainest.append(i)
             predictions.append(there)
-    plainest = [min(members, key=lambda i: _plain(sign[i], zeros[i])) for members in classes]
-    same = 0.5 * max(least, LEAST_NOISE)
 
     def mirrors(first: int) -> list[bool]:
         return [points.lengths and bool(_apart(-there, predictions[first], True) <= same) for there in predictions]
 
-    first = min([0, *np.flatnonzero(mirrors(0)).tolist()], key=lambda k: _plain(sign[plainest[k]], zeros[plainest[k]]))
+    first = min([0, *np.flatnonzero(mirrors(0)).tolist()], key=lambda k: plain[plainest[k]])
     mirror = mirrors(first)
     others = []
     for k, i in enumerate(plainest):
