@@ -793,8 +793,8 @@ def _calibrated(
             **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
         )
     except NoSolutionFound as error:
-        from rpim_opt.calibration.causes import likely_causes, mistakes
         from rpim_opt.calibration.identify import calibrate
+        from rpim_opt.calibration.verdict import likely_causes, mistakes
         from rpim_opt.convex.formulation import tikhonov
 
         causes = [] if error.conflict else likely_causes(calibrate(instance.problem, tikhonov, weight=1.0))

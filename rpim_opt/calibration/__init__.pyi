@@ -1,7 +1,6 @@
 from . import baselines as baselines
 from .acceptance import Acceptance as Acceptance
 from .acceptance import accept as accept
-from .causes import likely_causes as likely_causes
 from .certificate import Certificate as Certificate
 from .held_out import refit_all as refit_all
 from .identify import calibrate as calibrate
@@ -15,3 +14,4 @@ from .result import Calibration as Calibration
 from .uncertainty import Uncertainty as Uncertainty
 from .uncertainty import monte_carlo as monte_carlo
 from .verdict import Verdict as Verdict
+from .verdict import likely_causes as likely_causes

@@ -14,7 +14,6 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
-from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
 from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, judged
@@ -22,6 +21,7 @@ from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
+from rpim_opt.calibration.verdict import refuse_misread
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import CONFIDENCE, Requirement

@@ -10,9 +10,8 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.causes import likely_causes, mistakes
 from rpim_opt.calibration.outcome import Iteration, Kept, Outcome, Prediction
-from rpim_opt.calibration.verdict import Verdict, judge
+from rpim_opt.calibration.verdict import Verdict, judge, likely_causes, mistakes
 
 __all__ = ["Calibration", "Iteration", "Kept", "Prediction"]
 

@@ -15,10 +15,10 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import listed
 from rpim_opt.bayes.outliers import by_block
-from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
+from rpim_opt.calibration.verdict import misread
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem

@@ -17,9 +17,9 @@ from rpim_opt.basics.units import UNITS, accepted_units, display
 from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.calibration.causes import refuse_misread
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.verdict import refuse_misread
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.formulation import Formulation

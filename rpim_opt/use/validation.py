@@ -11,11 +11,10 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table, three_digits
-from rpim_opt.calibration.causes import misread
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import displaced, judged, registered
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import REACH, arm_length, worse_sentence, worse_than_nominal
+from rpim_opt.calibration.verdict import REACH, arm_length, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.diagnosis import shared_rows

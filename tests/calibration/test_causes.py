@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
-from rpim_opt.calibration.causes import _in_table_order
+from rpim_opt.calibration.verdict import _in_table_order
 from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together, part_way
 from rpim_opt.problem.misreadings import better_reading
