@@ -126,7 +126,10 @@ def advice(structure: Structure, status: str, found: Conflict | None) -> str:
     if found is not None:
         return ""
     if status.startswith("unbounded"):
-        return "the objective appears to be unbounded below: use a larger weight, or a start nearer to the data"
+        return (
+            "the objective appears to be unbounded below: bound what falls without end, such as a linear loss or an "
+            "own variable without a price, or use a larger weight"
+        )
     if structure.constrained and status.startswith(("infeasible", "optimal")):
         return (
             "its constraints are feasible, but not to the solver's accuracy: check their units, or loosen them slightly"
