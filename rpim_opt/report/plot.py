@@ -319,7 +319,7 @@ CLOSE, VERY_CLOSE = 3.0, 1.6
 """Ratios of a logarithmic axis's ends below which it has ticks between 1, 2 and 5, and at every tenth."""
 MANY_DOTS = 1000
 """Dots beyond which they are one picture in a vector graphic."""
-FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 4.0
+FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
 """Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
 LINE_HEIGHT = 1.25  # distance of names over their size
 
@@ -356,17 +356,16 @@ def logarithmic(ax: Axes, which: str) -> None:
 
 
 def _name(ax: Axes, which: str, names: Sequence[str]) -> None:
-    """Name the places 1, 2, ... along an axis, from top to bottom, where the names can be read."""
+    """Name the places 1, 2, ... along an axis, from top to bottom; of rows so many that the names can be read."""
     limits = (0.5, len(names) + 0.5)
     box = ax.get_window_extent()
     length, largest = (box.width, FONT_X) if which == "x" else (box.height, FONT_Y)
     size = length * 72 / ax.figure.dpi / (LINE_HEIGHT * max(len(names), 1))
-    if size >= FONT_LEAST:
-        turned = 90 if which == "x" and len(names) > 3 else 0
-        ticks = range(1, len(names) + 1)
-        getattr(ax, f"set_{which}ticks")(
-            ticks, list(names), fontsize=min(size, largest * ax.xaxis.label.get_fontsize()), rotation=turned
-        )
+    step = int(np.ceil(FONT_LEAST / size)) if which == "x" else 1
+    turned = 90 if which == "x" and len(names) > 3 else 0
+    size = min(step * size, largest * ax.xaxis.label.get_fontsize())
+    ticks = range(1, len(names) + 1, step)
+    getattr(ax, f"set_{which}ticks")(ticks, list(names[::step]), fontsize=size, rotation=turned)
     ax.set(**{f"{which}lim": limits if which == "x" else limits[::-1]})
 
 
