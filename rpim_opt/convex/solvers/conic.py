@@ -39,6 +39,8 @@ DENSE = 4e5
 """Entries of the constraints' matrix up to which active sets are tried."""
 CENTRED = 1e-10
 """Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
+DEAR = 1e6
+"""Costs beside a loss from which they are scaled down."""
 MOST_ACTIVE_SETS = 8
 """Active sets that are tried before Clarabel is asked for one."""
 
@@ -246,13 +248,22 @@ class Clarabel:
                 if changed:  # Clarabel panics at none
                     solver.update(**changed)
             else:
-                solver = import_module("clarabel").DefaultSolver(P, q, A, b, self.cones, _settings(attempt))
-            if k == 0 and solver.is_data_update_allowed():  # not where it decomposes a matrix
+                solver = self._made(P, q, A, b, attempt)
+            if k == 0 and solver.is_data_update_allowed():
                 self._solver, self._numbers = solver, numbers
             solution = solver.solve()
             if str(solution.status) in SOLVED:
                 return solution
         raise Unsolved(str(solution.status))
+
+    def _made(self, P: Any, q: Array, A: Any, b: Array, attempt: Attempt) -> Any:
+        """Return a solver, set up without costs: those of one weight would scale those of all that follow."""
+        make = import_module("clarabel").DefaultSolver
+        solver = make(P, np.zeros_like(q), A, b, self.cones, _settings(attempt))
+        if not solver.is_data_update_allowed():  # it decomposes a matrix
+            return make(P, q, A, b, self.cones, _settings(attempt))
+        solver.update(q=q)
+        return solver
 
 
 class Unsolved(RuntimeError):
@@ -400,9 +411,11 @@ class Small:
             bounds.append(data.linked(A @ z0 - b))
             dense.append(-A.ravel())
         cost = np.concatenate(q)
-        scale = 1.0 / max(1.0, np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
+        # tolerances are absolute below one; a loss, which is no smaller, takes fewer iterations as it is
+        largest = max(np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
+        scale = 1.0 / max(1.0, largest if self.loss is None else largest / DEAR)
         P, matrix = data.filled(weight, np.concatenate(dense))
-        P.data *= scale  # tolerances are absolute below one
+        P.data *= scale
         solution = data.clarabel.solve(P, cost * scale, matrix, np.concatenate(bounds))
         x, z, s = np.array(solution.x), np.array(solution.z) / scale, np.array(solution.s)
         x[: p.size] += x0
