@@ -305,13 +305,8 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     if not curves:
         return
     yield "heading", "Transmission errors of the joints"
-    yield (
-        "text",
-        [
-            "The actual joint angle is the encoder value plus this error. Outside the measured range the error is"
-            " unknown."
-        ],
-    )
+    text = "The actual joint angle is the encoder value plus this error; outside the measured range it is unknown."
+    yield "text", [text]
     yield "table", Table("Within the measured range", *curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
@@ -376,10 +371,8 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
     yield "text", [text]
     yield "bullets", redundant
     indices = ", ".join(f"{name} {value:.3g}" for name, value in observability.indices.items())
-    condition = (
-        f"Condition number {observability.condition:.3g}; observability indices (Sun and Hollerbach 2008): {indices}."
-    )
-    yield "text", [condition]
+    source = "observability indices (Sun and Hollerbach 2008)"
+    yield "text", [f"Condition number {observability.condition:.3g}; {source}: {indices}."]
 
 
 def _flagged(result: Calibration) -> Block:
@@ -429,17 +422,15 @@ def _convergence(result: Calibration) -> Iterator[Block]:
 def _provenance(content: Content) -> Iterator[Block]:
     result = content.result
     record = result.record
-    yield (
-        "facts",
-        [
-            ("Source", record.source or "not stated"),
-            ("Measurements", "simulated" if record.simulated else "as stated in the source; not marked as simulated"),
-            ("Robot", "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items())),
-            ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
-            ("Made", record.made),
-            ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
-        ],
-    )
+    facts = {
+        "Source": record.source or "not stated",
+        "Measurements": "simulated" if record.simulated else "as stated in the source; not marked as simulated",
+        "Robot": "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items()),
+        "Formulation": f"{result.formulation.name}: {_formulation(result)}",
+        "Made": record.made,
+        "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
+    }
+    yield "facts", list(facts.items())
     count: Counter[tuple[str, str]] = Counter()
     for name, data in summary.sets(result).items():
         for block in data.blocks:

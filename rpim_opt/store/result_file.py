@@ -122,7 +122,8 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         result = _calibration(file, ready, model)
         for name, rows in _rows(result).items():
             for before, now in zip(file.rows.get(name, ()), rows, strict=True):
-                same = np.allclose(*_errors(before, now), rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True)
+                errors = np.array([before[1:], now[1:]], dtype=float)  # NaN for none
+                same = np.allclose(*errors, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True)
                 if before.label != now.label or not same:
                     found = f"{before.identified_mm} mm"
                     accepted = (
@@ -336,11 +337,6 @@ def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
     return rows
 
 
-def _errors(*rows: RowErrors) -> Array:
-    """Return the errors of rows (K, 2) [mm], NaN for those that have none."""
-    return np.array([row[1:] for row in rows], dtype=float)
-
-
 def _finite(value: float) -> float | None:
     return float(value) if math.isfinite(value) else None
 
@@ -387,16 +383,10 @@ def definition(formulation: Formulation) -> dict[str, Any]:
 
 def formulation_of(name: str, stated: Mapping[str, Any]) -> Formulation:
     """Return the formulation of a file; with functions of a script it cannot be solved."""
-    functions = [stated[key] for key in ("loss", "penalty", "penalty_over")]
-    return Formulation(
-        name,
-        loss=_function(stated["loss"], name),
-        penalty=_function(stated["penalty"], name),
-        constraints=tuple(_function(term, name) for term in stated["constraints"]),
-        loss_over=stated["loss_over"],
-        penalty_over=_function(stated["penalty_over"], name),
-        solvable=None not in (*functions, *stated["constraints"]),
-    )
+    functions = {key: _function(stated[key], name) for key in ("loss", "penalty", "penalty_over")}
+    constraints = tuple(_function(term, name) for term in stated["constraints"])
+    solvable = None not in (*stated.values(), *stated["constraints"])
+    return Formulation(name, **functions, constraints=constraints, loss_over=stated["loss_over"], solvable=solvable)
 
 
 def _name(function: Callable[..., Any] | None) -> str | list[Any] | None:

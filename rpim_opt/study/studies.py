@@ -170,11 +170,9 @@ def files_of(path: Path, study: ModuleType) -> dict[str, str]:
         if not named and not glob.has_magic(pattern):
             raise InputError("DEPENDS", f"no file '{pattern}'", "names or patterns of files, from its folder", path)
         files |= named
-    digests = {}
-    for file in sorted(files):
-        name = os.path.relpath(file, folder)
-        digests[name] = "unreadable"  # nor can the study read it
-        with suppress(OSError), file.open("rb") as stream:
+    digests = {os.path.relpath(file, folder): "unreadable" for file in sorted(files)}  # nor can the study read it
+    for name in digests:
+        with suppress(OSError), Path(folder, name).open("rb") as stream:
             digests[name] = file_digest(stream, "sha256").hexdigest()
     return digests
 
