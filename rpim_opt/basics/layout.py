@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.exceptions import InputError, choices, in_file
+from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
@@ -107,8 +107,7 @@ class TableOptions:
     def stated(cls, texts: Mapping[str, str]) -> TableOptions:
         """Return the options from their texts, as in ``[reading]`` of a problem file."""
         for name in texts:
-            if name not in cls.__dataclass_fields__:
-                raise InputError("key reading", f"'{name}'", choices(name, cls.__dataclass_fields__))
+            pick(cls.__dataclass_fields__, name, "key reading")
         options: dict[str, Any] = dict(texts)
         for name in ("columns", "constants", "joints"):
             options[name] = tuple(filter(None, texts.get(name, "").split(",")))
@@ -479,8 +478,8 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point; others as is."""
-    texts = {name: {str(cell).lower() for cell in cells} for name, cells in table.columns.items()}
-    axis = next((name for name, different in texts.items() if different == set("xyz")), None)
+    different = ((name, {str(cell).lower() for cell in cells}) for name, cells in table.columns.items())
+    axis = next((name for name, texts in different if texts == set("xyz")), None)
     if axis is None:
         return table
     others = {name: [str(cell) for cell in cells] for name, cells in table.columns.items()}

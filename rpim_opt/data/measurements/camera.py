@@ -14,7 +14,7 @@ import casadi as ca
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices, in_file, pick
+from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split, split_unit
 from rpim_opt.data.dataset import Dataset
@@ -208,19 +208,13 @@ def on_board(table: Columns, board: Board) -> Columns:
     if own:
         raise InputError("the header", f"column '{own[0]}' beside a target", "one of them")
     if "point" not in table:
-        raise InputError(
-            "the header",
-            f"no column point among {', '.join(table)}",
-            "a column point with the name of the board's point",
-        )
+        accepted = "a column point with the name of the board's point"
+        raise InputError("the header", f"no column point among {', '.join(table)}", accepted)
     names = texts(table["point"], "point")
-    for i, name in enumerate(names):
-        if name not in board:
-            label = texts(table["label"], "label")[i] if "label" in table else str(i + 1)
-            raise InputError(
-                f"row {label}, column point", f"'{name}'", "a point of the target: " + choices(name, board)
-            )
-    places = np.array([board[name] for name in names]).T.tolist()
+    label = texts(table["label"], "label") if "label" in table else range(1, len(names) + 1)
+    rows = zip(names, label, strict=True)
+    points = [pick(board, name, f"row {row}, column point", also="a point of the target: ") for name, row in rows]
+    places = np.array(points).T.tolist()
     return {**table, **{f"{stem}_m": values for stem, values in zip(TARGET, places, strict=True)}}
 
 

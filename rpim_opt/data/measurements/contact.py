@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.tables import Columns
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.distance import distance
@@ -168,8 +168,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     for i, each in enumerate(known):
         where = each.measurement.name.replace("_", " ")
         for name in each.between:
-            if name not in touched:
-                raise InputError(where, f"'{name}'", choices(name, touched))
+            pick(touched, name, where)
         planar = {touched[name].measurement.planar for name in each.between}
         if len(planar) > 1 or (each.measurement is not known_distance and planar == {False}):
             accepted = "two planes, or for a distance two points"

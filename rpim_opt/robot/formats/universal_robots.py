@@ -193,10 +193,8 @@ def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, in
     values: dict[tuple[str, str], float] = {}
     places: dict[tuple[str, str], tuple[int, int]] = {}
     joint = ""
-    start = 0
-    for number, line in enumerate(data.split(b"\n"), start=1):
-        begin = start
-        start += len(line) + 1
+    for number, place in enumerate(re.finditer(rb"^.*$", data, re.MULTILINE), start=1):
+        line = place[0]
         if not line.strip() or line.lstrip().startswith((b"#", b"---")):
             continue
         match = LINE.match(line)
@@ -212,7 +210,7 @@ def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, in
             if joint not in JOINTS or (joint, key) in values:
                 raise InputError(f"line {number}", f"{joint}.{key} twice or out of place", "each joint once")
             values[joint, key] = _number(match[3], f"line {number}, {joint}.{key}")
-            places[joint, key] = (begin + match.start(3), begin + match.end(3))
+            places[joint, key] = (place.start() + match.start(3), place.start() + match.end(3))
     missing = [f"{joint}.{key}" for joint in JOINTS for key in SIX if (joint, key) not in values]
     if missing:
         raise InputError(f"key {missing[0]}", "nothing", "a number [m or rad]")
