@@ -731,7 +731,10 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if transmission:
         tried += [*_gears(problem, model), *_scales(problem, x, model)]
     best = _explained(model, x, tried)
-    several = _explained(model, x, _several_zeros(problem, x))
+    # zeros of all joints fit two gross errors, whatever these are, but no more
+    what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
+    changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, least=3)
+    several = _explained(model, x, changes)
     if several is not None and (best is None or several.left < SEVERAL * best.left):
         best = several
     if best is not None and abs(best.coefficients[0]) <= best.addition.largest:
@@ -763,13 +766,6 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     A = whole.linearize(there).A
     for what, (names, cause) in parts.items():
         yield from _changes(whole, there, A, names, what, cause, steadily=what in placed)
-
-
-def _several_zeros(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
-    """Yield that the zeros of all joints changed: they fit two gross errors, whatever these are, but no more."""
-    zeros = _zeros(problem.robot)
-    cause = "did several joints slip, or were they remastered"
-    yield from _changes(problem, x, problem.linearize(x).A, zeros, "set of joint zeros", cause, least=3)
 
 
 def _changes(

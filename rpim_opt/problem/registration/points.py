@@ -408,11 +408,6 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
     return np.stack([x, y, z]), p, axes, origins
 
 
-def _cross(a: Array, b: Array) -> Array:
-    """Return a x b (3, ...): `numpy.cross` takes three times as long."""
-    return np.stack([a[i - 2] * b[i - 1] - a[i - 1] * b[i - 2] for i in range(3)])
-
-
 def _step(candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool) -> Array:
     """Return the damped Gauss-Newton steps (B, columns): reflectors, joint zeros, then what was eliminated."""
     B, N, coordinates = candidates.y.shape
@@ -427,7 +422,8 @@ def _step(candidates: Candidates, pull: Array, weights: Array, state: _State, da
     for j in range(dof):
         slope = state.axes[j]
         if candidates.robot.joint_types[j] == "revolute":
-            slope = _cross(slope, state.points - state.origins[j])
+            arm = state.points - state.origins[j]  # `numpy.cross` takes three times as long
+            slope = np.stack([slope[i - 2] * arm[i - 1] - slope[i - 1] * arm[i - 2] for i in range(3)])
         J[:, 3 * M + j] = np.moveaxis(slope, 0, 1)
     for k in range(turning):  # about the base's axes
         J[:, 3 * M + dof + k, k - 2], J[:, 3 * M + dof + k, k - 1] = -state.away[k - 1], state.away[k - 2]
