@@ -281,7 +281,7 @@ class _Table:
         """Return measured values (N, c): millimetres to a nanometre, quaternions to 1e-12."""
         columns = {}
         for i, (name, dimension) in enumerate(self.kind.columns.items()):
-            unit, si = display(dimension) if dimension else ("", 1.0)
+            unit, si = display(dimension)
             columns[f"{name}_{unit}".rstrip("_")] = [f"{v:.{6 if unit else 12}f}" for v in y[:, i] / si]
         return columns
 
