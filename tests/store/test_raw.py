@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from time import perf_counter
+from time import process_time
 
 import numpy as np
 import pytest
@@ -297,9 +297,9 @@ def test_a_table_of_a_hundred_thousand_columns_is_refused_in_a_moment(monkeypatc
     path = tmp_path / "wide.csv"
     for mark in (",", ";", "\t"):
         path.write_text("\n".join([mark.join(f"c{i}" for i in range(100_000)), mark.join(["1.5"] * 100_000)]))
-        start = perf_counter()
+        start = process_time()
         assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
-        assert perf_counter() - start < 2.0
+        assert process_time() - start < 2.0
         assert "a row of 100000 cells, accepted: at most 1000 columns" in capsys.readouterr().err
 
 
