@@ -17,7 +17,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.diagnosis import decimals_of, first
-from rpim_opt.problem.misreadings import Better, better_reading
+from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
@@ -37,6 +37,8 @@ ANGULAR = 0.02
 """Residual RMS of orientations [rad] that a robot's own effects stay below."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
+UNUSUAL_LENGTH = 0.004
+"""Deviation of a length of the arm [m] from which on ready robots with nearly the same parameters are tried."""
 EXCLUDED = 0.25
 """Share of the rows that may be outliers."""
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5
@@ -212,7 +214,7 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     ratio = max(sizes["length"][1], sizes["pixel"][1])
     share = size / arm_length(result.problem)
     for each, ratio_of in sizes.values():
-        if each > COMPUTED_RMS and ratio_of < OVERSTATED:
+        if each > COMPUTED_RMS and 0 < ratio_of < OVERSTATED:  # 0 where the dimension was not measured
             yield f"Residuals are {ratio_of:.2g} times the stated noise: it is in another unit, or far too large."
     if ratio > NOISY and share > REACH:
         yield (
@@ -373,6 +375,8 @@ def likely_causes(result: Outcome) -> list[str]:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
         causes = [*_explanations(result, problem), *diagnosis.computed_columns(problem)]
+    elif _of_another_robot(result) and len(problem.arms) == 1 and (other := sibling(problem)) is not None:
+        causes = [other.sentence]
     elif not kept.all():
         causes = [*diagnosis.rows_without_values(problem), *diagnosis.exchanged_rows(problem)]
     if causes or shared:
@@ -380,6 +384,13 @@ def likely_causes(result: Outcome) -> list[str]:
     if max(ratio for _, ratio in sizes.values()) > HOPELESS:
         return [*head, NOTHING]
     return []
+
+
+def _of_another_robot(result: Outcome) -> bool:
+    """Whether a length of the arm deviates by more than one that is machined to a drawing usually does."""
+    free = result.problem.parameters.free
+    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames
+    return bool((np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any())
 
 
 def _explanations(result: Outcome, problem: CalibrationProblem) -> list[str]:

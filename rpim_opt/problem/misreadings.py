@@ -426,8 +426,18 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                     chain, left = [*chain, *second], size
     if left < BETTER * present and (left <= LEFT or points.seen):
         return _told(points, chain, present, left)
-    own = np.inf if points.seen else misfit(points)
-    for each in () if points.seen else _other_robots(points):  # nearly the same parameters: a UR10 for a UR10e
+    return None if points.seen else _sibling(points)
+
+
+def sibling(problem: CalibrationProblem) -> Better | None:
+    """Return the ready robot of nearly the same parameters that fits far better, a UR10e for a UR10; or None."""
+    points = points_of(problem)
+    return None if points is None or points.seen else _sibling(points)
+
+
+def _sibling(points: Points) -> Better | None:
+    own = misfit(points)
+    for each in _other_robots(points):
         other = each.change(points)
         if np.abs(other.robot.mdh - points.robot.mdh).max() < SIBLING and misfit(other) < SIBLING_BETTER * own:
             return Better(each.what, each.remedy, own * points.extent, misfit(other) * points.extent)

@@ -14,6 +14,7 @@ import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import joined
 from rpim_opt.robot.kinematics import (
     FRAME,
     forward_kinematics,
@@ -141,8 +142,12 @@ def require_same_arm(
     """Refuse a robot whose joints or nominal parameters differ from a file's MDH table (n, 5)."""
     joint_map = np.eye(len(joint_types)) if joint_map is None else joint_map
     if robot.joint_types != joint_types or not np.array_equal(robot.joint_map, joint_map):
-        found = ", ".join(robot.joint_types) + (", with signs or couplings" if robot.joint_types == joint_types else "")
-        raise InputError("joints of the robot", found, f"those of the file, {', '.join(joint_types)}", file)
+        found, accepted = ", ".join(robot.joint_types), f"those of the file, {', '.join(joint_types)}"
+        if robot.joint_types == joint_types:
+            other = [str(i + 1) for i in np.flatnonzero((robot.joint_map != joint_map).any(axis=1))]
+            found = f"a sign or coupling of joint {joined(other)}"
+            accepted = "joints as in the file: turn the axes of reversed joints there, and calibrate with that file"
+        raise InputError("joints of the robot", found, accepted, file)
     deviation = np.abs(robot.mdh - table)
     deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))
     joint, column = np.unravel_index(np.argmax(deviation), deviation.shape)
@@ -150,7 +155,8 @@ def require_same_arm(
         found = f"{MDH[column]}{joint + 1} off by {deviation[joint, column]:.3g} m or rad"
         accepted = "a robot whose parameters were identified from this file's"
         if np.pi - deviation[joint, column] < ANOTHER_ARM:
-            accepted += "; half a turn: --urdf-base with the link where its chain begins, such as base_link_inertia"
+            accepted += "; for half a turn at the base: --urdf-base with the chain's first link (base_link_inertia), "
+            accepted += "in `new` and in `export`"
         raise InputError("robot", found, accepted, file)
 
 

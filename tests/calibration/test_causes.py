@@ -14,7 +14,9 @@ from rpim_opt.calibration.verdict import _in_table_order
 from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together, part_way
 from rpim_opt.problem.misreadings import better_reading
+from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
+from rpim_opt.robot.library import READY
 from tests.calibration import mistakes
 from tests.calibration.mistakes import (
     COUNT,
@@ -462,3 +464,15 @@ def test_a_gear_ratio_is_no_transmission_error() -> None:
     result = ro.calibrate(problem, model="auto")
     assert not result.verdict.delivered
     assert "joint 1 turns" in result.verdict.reasons[-1]
+
+
+def test_a_ready_robot_next_to_the_right_one_is_not_delivered() -> None:
+    """Its lengths take up the difference: the fit is good, and files for the other model would be wrong."""
+    right = simulated_arm("ur10e")
+    wrong = read_robot(READY / "ur10.toml")
+    data = right.data
+    result = ro.calibrate(ro.problem_from(wrong, data))
+    assert 1e3 * result.errors().mean() < 0.2
+    assert not result.verdict.delivered
+    assert 'write robot = "ur10e"' in str(result.verdict)
+    assert ro.calibrate(ro.problem_from("ur10e", data)).verdict.delivered

@@ -527,6 +527,12 @@ def test_what_the_controller_cannot_hold_is_refused(tmp_path: Path) -> None:
             ro.robot.write_ur_calibration(path, robot, UR10, tmp_path / "new.conf")
     with pytest.raises(ro.InputError, match="joints of the robot: found revolute"):
         ro.robot.write_ur_calibration(path, ro.read_robot(find_robot("iiwa7")), UR10, tmp_path / "new.conf")
+    # a URDF's base_link stands half a turn from the controller's base: signs of a and alpha would be the other ones
+    half_turn = UR10.mdh.copy()
+    half_turn[2:4, 1] *= -1
+    turned = replace(UR10, mdh=half_turn)
+    with pytest.raises(ro.InputError, match=r"found a2 = 612.* accepted: the controller's table.*base_link_inertia"):
+        ro.robot.write_ur_calibration(path, turned, turned, tmp_path / "new.conf")
     assert not (tmp_path / "new.conf").exists()
 
 

@@ -102,6 +102,13 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     require_same_arm(robot, nominal.mdh, REVOLUTE, path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
         raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1")
+    if not (nominal.mdh[2:4, 1] < 0).all():
+        found = f"a2 = {1e3 * nominal.mdh[2, 1]:.1f} mm and a3 = {1e3 * nominal.mdh[3, 1]:.1f} mm"
+        accepted = (
+            "the controller's table, in which both are negative: new --robot ur10e (the model's name), or a URDF "
+        )
+        accepted += "with --urdf-base base_link_inertia"
+        raise InputError("robot", found, accepted)
     change = without_beta(robot).mdh - nominal.mdh
     behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
     new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}

@@ -459,7 +459,9 @@ class _Urdf:
             leaves = [link for link in self.links if link not in parents and link != base] or [base]
             below = [link for link in leaves if any(joint.parent == base for joint in self._to_root(link))] or leaves
             if len(below) > 1:
-                accepted = "one of them: --urdf-tip, urdf_tip in problem.toml, or the argument tip"
+                accepted = (
+                    "one of them or a link before it (tool0): --urdf-tip, urdf_tip in problem.toml, or the argument tip"
+                )
                 raise InputError(f"links at the end of chains from '{base}'", ", ".join(below), accepted)
             tip = below[0]
         up, down = self._to_root(base), self._to_root(tip)
