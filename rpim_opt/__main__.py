@@ -1,4 +1,4 @@
-"""Entry point of the program; an interrupt ends it with one word, even while it is starting."""
+"""Entry point of the program, with a one-word exit on interrupt, even during start-up."""
 
 import sys
 

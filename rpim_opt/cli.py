@@ -121,28 +121,28 @@ ROBOTS = _completed(lambda: import_module("rpim_opt.robot.library").robots())
 MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
 Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
-RULES = "learned (prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
+RULES = "learned (estimated prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
 Selector = Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)]
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
 Formulation = Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)]
-PARTS = "Variance components to estimate: robot, free, level, declared (none)."
+PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated noise), free (both), declared (none)."
 Noise = Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)]
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
-Result = Annotated[Path, Argument(help="result.json, or the folder it lies in.")]
+Result = Annotated[Path, Argument(help="result.json, or its folder.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
 Sheet = Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")]
 Key = Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")]
 TimeTolerance = Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")]
-Several = "several files are stacked, or joined as by new."
+Several = "several files are stacked, or joined as by rpim-opt new."
 Type = Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")]
-Tolerance = Annotated[Number, Option(help="Tolerance of acceptance [mm]: exit code 1 if rejected, 4 if undecided.")]
+Tolerance = Annotated[Number, Option(help="Acceptance tolerance [mm]: exit code 1 if rejected, 4 if inconclusive.")]
 Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
 Largest = Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
-Workers = Annotated[int, Option(help="Processes on this machine.")]
+Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
 Folder = Annotated[File, Option(help="Folder in which to write result.json.")]
@@ -157,7 +157,7 @@ def _with_code(context: typer.Context, allowed: bool) -> None:
         context.with_resource(allow_code())
 
 
-Code = Annotated[bool, Option("--allow-code", help="Run the Python files that the folder names.", callback=_with_code)]
+Code = Annotated[bool, Option("--allow-code", help="Allow running the folder's Python files.", callback=_with_code)]
 
 
 # --- how a command is made ---------------------------------------------------------------------------------
@@ -242,8 +242,8 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
 
 @command
 def new(
-    folder: Annotated[Path, Argument(help="The problem folder to make; with --chain one that is there gets one more.")],
-    robot: Annotated[str, Option(help="A ready one (see robots), or a file that describes it.", autocompletion=ROBOTS)],
+    folder: Annotated[Path, Argument(help="Problem folder to create, or with --chain to extend.")],
+    robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     units: Units = "",
     dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
@@ -256,7 +256,7 @@ def new(
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
     constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = "",
     encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = "",
-    separator: Annotated[str, Option(help="comma, semicolon, tab, bar, space.")] = "",
+    separator: Annotated[str, Option(help="Column separator: comma, semicolon, tab, bar, space.")] = "",
     decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
     measurement: Annotated[Text, Option(help="position, pose, cable, distance, ...; guessed from columns.")] = None,
     validation: Annotated[list[Path] | None, Option(help="A table for validation; several are joined.")] = None,
@@ -265,7 +265,7 @@ def new(
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
     chain: Annotated[
-        str, Option(help="Name of the chain: makes a problem on the origins of a URDF's joints, or adds a chain to it.")
+        str, Option(help="Chain name: makes a problem with a URDF's joint origins, or adds a chain to one.")
     ] = "",
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
@@ -323,7 +323,7 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         document |= {name: part.content()} if name else part.content()
         text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
     if together is not None:
-        text += f"\n\nAll together: {together}"
+        text += f"\n\nAll robots together: {together}"
     document["lack_of_fit"] = None
     if lacking is not None:
         document["lack_of_fit"] = {**lacking.content(), "outliers": [row.label for row in outliers]}
@@ -342,7 +342,7 @@ def calibrate(
     formulation: Formulation = None,
     noise: Noise = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
-    use_validation: Annotated[Choice, Option(help="Once validated, use all rows; default: those held out.")] = None,
+    use_validation: Annotated[Choice, Option(help="Refit with the validation rows; default: if held out.")] = None,
     limit: Tolerance = None,
     box: Box = None,
     out: Folder = None,
@@ -388,7 +388,7 @@ def report(
     result: Result,
     out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
 ) -> Answer:
-    """Write the calibration report: one HTML page that works offline, in the order in which it is signed."""
+    """Write the calibration report: one self-contained HTML page, ready to be signed."""
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import inside, refused
         from rpim_opt.report.report import write_report
@@ -411,7 +411,7 @@ def validate(
     register: Register = False,
     out: Table = None,
 ) -> Answer:
-    """Validate a result on new measurements; rows outside their prediction intervals are named.
+    """Validate a result on new measurements, and list rows outside their prediction intervals.
 
     In the table of --out, sigmas is a row's error over its predicted standard deviation; the largest of all rows
     exceeds allowed_sigmas with probability 0.01.
@@ -444,7 +444,7 @@ def accept(
 ) -> Answer:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
 
-    Exit code 0 if it is accepted, 1 if it is rejected, 4 where that cannot be decided: then it says what is lacking.
+    Exit code 0 if it is accepted, 1 if it is rejected, 4 if inconclusive: then it says what is missing.
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.calibration.acceptance import accept
@@ -500,7 +500,7 @@ def update(
 ) -> Answer:
     """Recalibrate with the previous result as prior, and report which parameters changed.
 
-    Exit code 1 if nothing explains what the new measurements miss, or the robot is not delivered.
+    Exit code 1 if errors on the new measurements stay unexplained, or the robot is not delivered.
     """
     with _loaded(result) as (loaded, say):
         from rpim_opt.basics.files import sha256_of
@@ -555,7 +555,7 @@ def export(
     urdf_tip: UrdfTip = None,
     tip_measured: Annotated[
         bool,
-        Option("--tip-measured", help="The reflector is the tip link: write its identified place."),
+        Option("--tip-measured", help="The reflector is the tip link: write its identified pose."),
     ] = False,
     marker: Marker = None,
     despite_verdict: Despite = False,
@@ -587,7 +587,7 @@ def compensate(
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
     largest: Annotated[float, Option(help="Largest permitted correction of a joint [rad or m].")] = 0.2,
     limit: Annotated[
-        Number, Option(help="Largest error left plus its U (k = 2) [mm]; rows above are marked, exit 1.")
+        Number, Option(help="Largest residual error plus its U (k = 2) [mm]; rows above are marked, exit code 1.")
     ] = None,
     out: Table = None,
     despite_verdict: Despite = False,
@@ -595,7 +595,7 @@ def compensate(
     """Correct joint commands so that the real robot goes where the nominal one would.
 
     Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or error and uncertainty
-    above the limit, without one the error above twice its standard uncertainty.
+    above the limit (without a limit: error above twice its standard uncertainty).
     """
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
@@ -641,7 +641,7 @@ def design(
     table: Annotated[File, Option(help="Table of candidates to use instead: q1_deg, ...")] = None,
     point: Annotated[Text, Option(help="For touches: the point x,y,z [mm] in the robot's base frame.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
-    augment: Annotated[bool, Option("--augment", help="Add to the measured ones, in their joint ranges.")] = False,
+    augment: Annotated[bool, Option("--augment", help="Add to measured configurations, in their ranges.")] = False,
     out: Table = None,
 ) -> Answer:
     """Choose the next configurations to measure by optimal design."""
@@ -681,10 +681,10 @@ def design(
 @command
 def study(
     name: Annotated[str, Argument(help="A file mine.py, a folder with study.py, or a study of the checkout.")],
-    quick: Annotated[bool, Option("--quick", help="The small version.")] = False,
+    quick: Annotated[bool, Option("--quick", help="Run the reduced version.")] = False,
     workers: Workers = 1,
     resume: Resume = None,
-    redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from the last replicates.")] = False,
+    redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from stored replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
     as_json: Json = False,
@@ -712,7 +712,7 @@ def study(
 @command
 def compare(
     problems: Annotated[list[str], Argument(help="Problem folders, shipped names, a folder of problem folders.")],
-    formulations: Annotated[str, Option(help="tikhonov,robust,...; folder: each its own.")] = "tikhonov",
+    formulations: Annotated[str, Option(help="tikhonov,robust,...; folder: each problem's own.")] = "tikhonov",
     selector: Annotated[str, Option(help="learned,reml,l_curve,1.0,...: rules and weights.")] = "learned",
     methods: Annotated[str, Option(help="Baselines: nominal,levenberg_marquardt,...")] = "",
     splits: Annotated[str, Option(help="Held-out data: folder, a fraction (0.25), or a number of folds.")] = "folder",
@@ -728,7 +728,7 @@ def compare(
 ) -> Answer:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
-    With --out every replicate is written down when it is finished, and README.md with the figure in the end.
+    With --out every replicate is stored when it is finished, and README.md with the figure at the end.
     """
     from rpim_opt.study.comparison import compare
     from rpim_opt.study.methods import USUAL

@@ -142,7 +142,7 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
                "--validation", str(cell / "later.csv"), "--units", "m,rad") == 0  # fmt: skip
     said = capsys.readouterr().out
     assert re.search(r"joint_1 .* q1_rad ", said)
-    assert "Guessed: the data put the base" in said
+    assert "Guessed: the base was registered" in said
     assert run(monkeypatch, "inspect", "arm") == 0
     assert "Warning" not in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "arm", "--out", "arm/results") == 0
@@ -256,7 +256,7 @@ def test_joints_and_points_in_two_files_with_a_point_missing(monkeypatch, capsys
     folder = tmp_path / "arm"
     assert run(monkeypatch, "new", str(folder), "--robot", str(cell / "arm.urdf"), *files, "--units", "rad,m") == 0
     said = capsys.readouterr().out
-    assert "rows that lack one of their measured values are left out: P7." in said
+    assert "rows that lack one of their measured values are ignored: P7." in said
     made = ro.load(folder)
     assert len(made.problem.data) == 39
     assert made.record.validation is not None
@@ -445,7 +445,7 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
     sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]
     assert run(monkeypatch, "export", str(made / "results"), *sources, *outs) == 2  # of another robot
-    assert "a robot whose parameters were identified from this file's" in capsys.readouterr().err
+    assert "a robot identified from this file's nominal parameters" in capsys.readouterr().err
     assert not (tmp_path / "again.json").exists()
     assert not (tmp_path / "both").exists()
 
@@ -550,7 +550,7 @@ BAD = {
     "another robot's data": ([*NEW[:3], "panda", *NEW[4:]], ["measured.csv", "no column for 'q7'"]),
     "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point", "marker"]),
     "the same twice": ([*NEW[:5], "twice.csv", *NEW[6:]], ["columns 'x1' and 'X' for x_m"]),
-    "rotation vector?": ([*NEW[:5], "turns.csv", *NEW[6:]], ["column 'rx', of angles or of a rotation vector"]),
+    "rotation vector?": ([*NEW[:5], "turns.csv", *NEW[6:]], ["column 'rx', either angles or a rotation vector"]),
     "no rows": ([*NEW[:5], "empty.csv", *NEW[6:]], ["empty.csv", "a header and no rows"]),
     "no positions": ([*NEW[:5], "joints.csv", *NEW[6:]], ["joints.csv", "no positions", "--measurement"]),
     "option unknown": ([*NEW, "--unit", "m"], ["No such option", "--units"]),
@@ -562,7 +562,7 @@ BAD = {
     "nothing to export": (["export", *RESULT], ["nothing to write", "--urdf", "--robodk"]),
     "nowhere to export": (["export", *RESULT, "--urdf", "arm.urdf"], ["--out", "arm.urdf"]),
     "over the original": (["export", *RESULT, "--urdf", "arm.urdf", "--out", "arm.urdf"], ["is not overwritten"]),
-    "another arm": (["export", *RESULT, "--urdf", "other.urdf", "--out", "made"], ["other.urdf", "off by"]),
+    "another arm": (["export", *RESULT, "--urdf", "other.urdf", "--out", "made"], ["other.urdf", "differs from"]),
     "ending of a table": (["export", *RESULT, "--mdh", "made.txt"], ["made.txt", "ending in .toml"]),
     "two files in one": (["export", *RESULT, "--mdh", "made.csv", "--robodk", "made.csv"], ["made.csv", "two files"]),
     "unwritable": (

@@ -243,12 +243,12 @@ def _notes(grid: Grid, above: Sequence[int], left: Sequence[int], options: Table
     elif len(above) > 1:
         notes.append(f"the header has {len(above)} lines, from line {grid.lines[above[0]]}.")
     if above and above[0]:
-        notes.append(f"{above[0]} lines above the header are left out ('{' '.join(grid.rows[0])[:50]}' ...).")
+        notes.append(f"{above[0]} lines above the header are ignored ('{' '.join(grid.rows[0])[:50]}' ...).")
     for i in left[:MOST_NAMED]:
         text = ", ".join(filter(None, grid.rows[i]))
-        notes.append(f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' left out.")
+        notes.append(f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' ignored.")
     if len(left) > MOST_NAMED:
-        notes.append(f"{len(left) - MOST_NAMED} more lines are not rows of the table: left out.")
+        notes.append(f"{len(left) - MOST_NAMED} more lines are not rows of the table: ignored.")
     return notes
 
 
@@ -407,10 +407,10 @@ def _decimal_mark(cells: Iterable[str], stated: str) -> str:
     if stated:
         shown.pop(stated, None)
         for cell in shown.values():
-            raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the mark that the numbers have")
+            raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the decimal mark of the numbers")
         return stated
     if len(shown) > 1:
-        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark, or --decimal with it")
+        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark, or set --decimal")
     if not shown and doubtful:
         found = f"'{doubtful}', whose mark may separate thousands or decimals"
         raise InputError("the numbers", found, "--decimal comma, or --decimal point")
@@ -492,8 +492,8 @@ def _one_row_each(table: RawTable) -> RawTable:
             others[name] = without
     points = _points(letters, others.values())
     if not points:
-        accepted = "a column that names its point, all three once"
-        raise InputError("the header", f"a row a coordinate ('{axis}')", accepted)
+        accepted = "a column naming the point; x, y, z once each"
+        raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
     columns: dict[str, Sequence[Any]] = {}
     values = []
     for name, cells in others.items():
@@ -504,13 +504,13 @@ def _one_row_each(table: RawTable) -> RawTable:
             values.append(name)
     measured = [name for name in values if VALUE.search(name)] or values
     if len(measured) != 1:
-        found = f"a row a coordinate, with values {', '.join(measured) or 'nowhere'}"
+        found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     (value,) = measured
     for letter in "xyz":
         cells = [others[value][rows[letter]] if letter in rows else "" for rows in points]
         columns[_with_unit(letter, split(value)[1])] = cells
-    note = f"a row a coordinate: column '{value}' by '{axis}'."
+    note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
 
 

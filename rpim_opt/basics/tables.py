@@ -134,7 +134,7 @@ def _require_names(header: Sequence[Any]) -> None:
         raise InputError("the header", f"{len(header)} columns", f"at most {WIDEST}")
     for name in header:
         if not isinstance(name, str):
-            raise InputError("the header", f"column {name!r}", "unique names that are texts")
+            raise InputError("the header", f"column {name!r}", "unique strings as names")
         if not name:
             raise InputError("the header", "a column without a name", accepted)
         if header.count(name) > 1:
@@ -172,7 +172,7 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
         cells += [None if i is None else values[i] for i in chunk.indices.to_pylist()]
     size = sum(len(cell) for cell in cells if isinstance(cell, str | bytes))
     if size > MOST_TEXT:
-        raise InputError("the table", f"{size} bytes of texts", f"at most {MOST_TEXT}")
+        raise InputError("the table", f"{size} bytes of text", f"at most {MOST_TEXT}")
     return cells
 
 
@@ -182,7 +182,7 @@ def _parquet_cells(column: Any) -> Sequence[Any]:
 def array_columns(path: Path) -> Columns:
     """Return the arrays of numbers of a MATLAB or NumPy file, of the most common length, as ``q_1, q_2, ...``."""
     require_file(path, LARGEST_DATA)
-    accepted = "a file that MATLAB saved with -v7, or NumPy's savez, with variables of numbers, a row a configuration"
+    accepted = "a file that MATLAB saved with -v7, or NumPy's savez, with numeric arrays, one row per configuration"
     try:
         if path.suffix.lower() == ".npz":
             with ZipFile(path) as archive:
@@ -338,7 +338,7 @@ def _split(text: str, mark: str, strict: bool = True) -> tuple[list[list[str]], 
             lines.append(number)
     except csv.Error as error:
         if strict:
-            raise InputError(f"line {reader.line_num}", str(error), "short cells whose quotes end") from None
+            raise InputError(f"line {reader.line_num}", str(error), "short cells with closed quotes") from None
     return rows, lines
 
 

@@ -206,7 +206,7 @@ def parse_units(text: str) -> dict[str, str]:
             raise InputError("--units", f"'{part}'", choices(part, [*UNITS, *FOREIGN]))
         key = stem or dimension_of(name)
         if key in units:
-            accepted = "one unit a dimension; a different one for joint values alone as q=rad"
+            accepted = "one unit per dimension; another for joint values alone as q=rad"
             raise InputError("--units", f"{units[key]} and {part}", accepted)
         units[key] = name
     return units

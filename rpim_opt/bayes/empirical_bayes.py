@@ -49,8 +49,8 @@ def estimate(problem: Source, estimator: Estimator, model: str, start: Array | N
     try:
         return _estimate(problem, estimator, model, start)
     except np.linalg.LinAlgError:
-        found = "equations, scales and noise of too different magnitudes to estimate hyperparameters"
-        raise InputError("data", found, "correct units, or a weight") from None
+        found = "magnitudes of equations, scales and noise too different to estimate hyperparameters"
+        raise InputError("data", found, "correct units, or a fixed weight") from None
 
 
 def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Estimated:
@@ -69,8 +69,8 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         fall = without.point.value - whole.point.value
         if fall < ASKED:
             estimator, whole = plain, without
-            reason = f"-2 ln L falls by {fall:.1f} with it, where {ASKED:g} are required."
-            notes = (f"The population prior was left out: {reason}",)
+            reason = f"it lowers -2 ln L by {fall:.1f}; {ASKED:g} are required."
+            notes = (f"The population prior is not used: {reason}",)
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
     requested = p.free.names
     curved = None

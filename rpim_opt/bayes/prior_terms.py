@@ -234,7 +234,7 @@ class Statement:
             turned = np.flatnonzero(some.of_frames & some.periodic & (offset != 0))
             if len(turned):  # angles of frames do not add up
                 found = f"'{some.names[turned[0]]}' relative to another nominal orientation"
-                accepted = "the frame's earlier nominal values; or no prior on a frame that was set up again"
+                accepted = "the frame's earlier nominal values; or no prior on a frame that was re-registered"
                 raise InputError(self.where, found, accepted)
             return
         rows = np.array(self.rows)[:, own]

@@ -303,17 +303,17 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         )
     if not np.isfinite(mapped.largest):
         lacking.append(
-            "Lacking: measurements that identify the parameter combinations that neither data nor penalty determine."
+            "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
         )
     elif mapped.largest > limit and repeatability > limit:
         lacking.append(
-            f"Lacking: a more precise repeatability. Its upper bound, {1e3 * repeatability:.3f} mm, may exceed the "
+            f"Missing: a tighter bound on repeatability: {1e3 * repeatability:.3f} mm may exceed the "
             "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
         )
     elif mapped.largest > limit:
         lacking.append(
-            f"Lacking: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
-            f"robot's repeatability would leave {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
+            f"Missing: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
+            f"robot's repeatability would still cause {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
             "--augment --count 10` names the configurations that help most."
         )
     verdict: Verdict = "accepted"
@@ -345,7 +345,7 @@ def _held_out(
         apart = result.problem.data.take([known[label] for label in held.label if label in known])
         error, sigmas, allowed, coverage = held.error[kept], held.sigmas[kept], held.allowed[kept], held.coverage
     else:
-        return None, [], ["Lacking: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
+        return None, [], ["Missing: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
     inside = np.isfinite(error) & region.rows(apart)
     instrument = np.zeros(len(apart))  # what it may add to an error, with the required confidence
     for block in apart.blocks:
@@ -368,10 +368,10 @@ def _held_out(
         missed += [moved] if moved else []
     lacking: list[str] = []
     if rows < FEWEST:
-        lacking.append(f"Lacking: at least {FEWEST} held-out rows; there are {rows}.")
+        lacking.append(f"Missing: at least {FEWEST} held-out rows; there are {rows}.")
     if beyond:
         lacking.append(
-            f"Lacking: valid prediction intervals. Rows outside theirs: {listed(beyond, MOST)}. "
+            f"Missing: valid prediction intervals. Rows outside them: {listed(beyond, MOST)}. "
             + (moved or "Repeat these measurements, or extend the model.")
         )
     sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm, of "
@@ -382,11 +382,11 @@ def _held_out(
         share = f"{100 * coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
         sentence += f"; {share} (at least {100 * least:.0f} % are required for this number of rows)"
         if coverage < least:
-            lacking.append(f"Lacking: valid prediction intervals. Only {share}.")
+            lacking.append(f"Missing: valid prediction intervals. Only {share}.")
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
         if not any(region.rows(part.data).any() for part in result.problem.rows()):
-            lacking.append("Lacking: measurements in the region. No identification row is in it either.")
+            lacking.append("Missing: measurements in the region. No identification row is in it either.")
     if excluded:
         sentence += f". Not counted: {listed(excluded, MOST)}, excluded from the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
@@ -418,7 +418,7 @@ def _unmodelled(result: Calibration, region: Region) -> list[str]:
     lines: list[str] = []
     fit = judged_fit(result)
     if fit is not None and fit.alarming:
-        lines.append(f"Lacking: a model that fits. {fit}")
+        lines.append(f"Missing: a model that fits. {fit}")
     corners = Dataset.of(region.limits.T.copy(), np.zeros((2, 3)), 1.0)
     named: list[str] = []
     for joint in result.outside(corners).joints:
@@ -427,5 +427,5 @@ def _unmodelled(result: Calibration, region: Region) -> list[str]:
         named.append(f"joint {joint} from {low:.4g} to {high:.4g} {unit}")
     if named:
         where = f"{joined(named)}, which is part of the region: no measurement checked the model there."
-        lines.append(f"Lacking: measurements with {where}")
+        lines.append(f"Missing: measurements with {where}")
     return lines

@@ -91,8 +91,8 @@ def displaced(result: Calibration, data: Dataset, intervals: Judged) -> str:
         return ""
     return (
         f"Likely: the instrument or the base moved. The measurements are {motion}; registered again, their RMS error "
-        f"is {1e3 * after:.3g} mm in place of {1e3 * before:.3g} mm. `validate` and `accept` do so with --register, "
-        "`update --reset 'base_*'` recalibrates. If neither moved, the robot errs alike at these configurations."
+        f"is {1e3 * after:.3g} mm instead of {1e3 * before:.3g} mm. `validate` and `accept` do so with --register, "
+        "`update --reset 'base_*'` recalibrates. If neither moved, the robot has one common error there."
     )
 
 
@@ -126,7 +126,7 @@ def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
         blocks.append(replace(block, y=y, covariance=covariance))
     centre = measured.mean(axis=0)
     shift = 1e3 * np.linalg.norm(transformed(motion, centre) - centre)
-    text = f"displaced together by {shift:.3g} mm and {np.degrees(turn.magnitude()):.3g} degrees"
+    text = f"displaced as a whole by {shift:.3g} mm and {np.degrees(turn.magnitude()):.3g} degrees"
     return replace(data, blocks=tuple(blocks)), text
 
 

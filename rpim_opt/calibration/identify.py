@@ -222,11 +222,11 @@ def ending(ended: Ended, most: int) -> str:
         return " ".join(filter(None, [text, state.choice.note]))
     if state.outcome == "rest":
         decrease = ended.certificate.decrease
-        why = f"the constraints are violated by {ended.certificate.violation:.1g} scales."
+        why = f"the constraints are violated by {ended.certificate.violation:.1g} prior standard deviations."
         if decrease is None:
             why = "the final convex program could not be solved again, so the solution is not certified."
         elif decrease > DECREASE:
-            why = f"the final convex program still predicts a decrease by {decrease:.1g} of the objective."
+            why = f"the final convex program still predicts a decrease of the objective by {decrease:.1g}."
     elif state.outcome == "stuck":
         why = (
             "no step, however short, decreases the nonlinear objective; the formulation may have no minimum "
@@ -257,8 +257,8 @@ def _displaced_frames(stated: Source, registered: Source) -> list[str]:
     if not far:
         return []
     return [
-        f"Stated frames are far from their registration, to which deviations refer: {joined(far)}. The flange frame is "
-        "that of the DH table after the last joint; that of a data sheet may be turned."
+        f"Deviations refer to registered frames, far from the stated ones: {joined(far)}. The flange frame is "
+        "that of the DH table after the last joint; that of a data sheet may be rotated."
     ]
 
 

@@ -58,7 +58,7 @@ class Extension(NamedTuple):
 
 
 EXTENSIONS = {
-    "gravity": Extension(("compliance?",), "gravity", "The arm bends under gravity"),
+    "gravity": Extension(("compliance?",), "gravity", "The arm deflects under gravity"),
     "first harmonic": Extension(
         ("ecc_cos?", "ecc_sin?"),
         "eccentric encoders or gears (once a turn)",
@@ -171,7 +171,7 @@ class LackOfFit:
             agree = f"Repeated readings of a configuration agree to {_size(self, self.repeated)} RMS"
             if self.excess:
                 lines.append(
-                    f"{agree}; {_size(self, self.excess)} of the residuals repeat with the configuration, unless the "
+                    f"{agree}; {_size(self, self.excess)} of the residuals is systematic (repeatable), unless the "
                     "robot stood still between them."
                 )
             else:

@@ -117,7 +117,7 @@ def influence(result: Outcome) -> Influence:
     moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
-        accepted = "a loss that weighs its equations by their residuals: squares, Huber's"
+        accepted = "a loss that is a reweighted sum of squares: squares, Huber's"
         raise InputError("influence", f"formulation '{formulation.name}'", accepted)
     T = _inverse_root(np.vstack([A, L]), moving)
     residual = model.A @ result.z - model.b
@@ -272,7 +272,7 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     joints = [name for name in parameters.free.names if of_joint(name) or name in parameters.terms]
     own = [name for name in joints if own_name(name) != name]
     if own:
-        raise InputError("improvement", f"several robots: '{own[0]}' is of one alone", "one robot")
+        raise InputError("improvement", f"several robots: '{own[0]}' belongs to one only", "one robot")
     places = parameters.places_of(robot)
     columns = (np.cumsum(parameters.identified) - 1)[places[parameters.identified[places]]]
     of_robot = parameters.of_robot(robot)

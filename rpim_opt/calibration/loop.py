@@ -455,7 +455,7 @@ def damped(damping: float, gain: float, promised: float, effect: float) -> float
 
 def require_start(start: Array, count: int) -> Array:
     """Return the checked start (n,) of the deviations."""
-    accepted = f"{count} deviations, finite, one a parameter"
+    accepted = f"{count} finite deviations, one per parameter"
     try:
         x = np.asarray(start, dtype=float)
     except (TypeError, ValueError):

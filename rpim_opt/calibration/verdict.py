@@ -30,11 +30,11 @@ NOISY = 3.0
 OVERSTATED = 0.05
 """Residual RMS over the stated noise below which the noise is not that of these data; of 20 um and more."""
 REACH = 0.003
-"""Residual RMS over the length of the arm that a robot's own effects stay below."""
+"""Residual RMS over the length of the arm that a robot's own errors stay below."""
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
 ANGULAR = 0.02
-"""Residual RMS of orientations [rad] that a robot's own effects stay below."""
+"""Residual RMS of orientations [rad] that a robot's own errors stay below."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL_LENGTH = 0.004
@@ -219,13 +219,13 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     if ratio > NOISY and share > REACH:
         yield (
             f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the stated noise and "
-            f"{100 * share:.2g} % of the arm's length; a robot's own effects stay below {100 * REACH:g} %."
+            f"{100 * share:.2g} % of the arm's length; a robot's own errors stay below {100 * REACH:g} %."
         )
     size, ratio = sizes["angle"]
     if ratio > NOISY and size > ANGULAR:
         yield (
             f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the stated noise; a "
-            f"robot's own effects stay below {1e3 * ANGULAR:g} mrad."
+            f"robot's own errors stay below {1e3 * ANGULAR:g} mrad."
         )
 
 
@@ -262,7 +262,7 @@ def _deviations(result: Outcome) -> Iterator[str]:
             continue
         unit, largest = MACHINED[kind]
         sentence = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
-        sentence = f"{sentence}: no robot is machined worse than {1e3 * largest:g} {unit}."
+        sentence = f"{sentence}: manufacturing errors stay below {1e3 * largest:g} {unit}."
         worst = max(worst, (float(abs(x)) / largest, sentence))
     if worst[1]:
         yield f"{worst[1]} Check the order, signs and units of the joint columns, and the DH table."
@@ -359,7 +359,7 @@ def likely_causes(result: Outcome) -> list[str]:
             signs.append(f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)")
         if ratio > NOISY:
             noise = f"{three_digits(ratio)} times the stated noise"
-            signs.append(f"residuals {noise}, including the degrees of freedom of transmission errors")
+            signs.append(f"residuals {noise}, counting the degrees of freedom of transmission errors")
     # no nominal model is as wrong as that; an estimated scale is not the expected one
     expected = free.scale if learned is None else learned.stated
     largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])

@@ -230,7 +230,7 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
     unusual = []
     for i in np.argsort(-ratio)[:MOST]:
         if ratio[i] > UNUSUAL:
-            cause = ": an error of assembly or of its zero" if is_joint_offset(names[i]) else ""
+            cause = ": an assembly or joint-zero error" if is_joint_offset(names[i]) else ""
             unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
     sizes = {**_scales(learned), **_noise(learned), **_conditions(learned, names, z)}
     lines = [f"{what}: {joined(parts)}." for what, parts in sizes.items() if parts]
@@ -251,7 +251,7 @@ def _scales(learned: Learned) -> dict[str, list[str]]:
             groups.append(f"{name} {_figure(size, 1.0, 'x' if groups else 'x the stated one')}")
     if learned.curves is not None:
         ripple, waves = (_figure(size, 1e3, "mrad") for size in (learned.curves.size, learned.curves.waves))
-        curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad; waves {waves}")
+        curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad; slow component {waves}")
     return {
         "Estimated prior scale": groups,
         "Estimated scale of model extensions": deflections,
@@ -301,7 +301,7 @@ def _model_lines(learned: Learned) -> list[str]:
         return [f"Model: the data support no extension{evidence}."]
     return [
         f"Model: geometry with {joined(learned.extensions)}{evidence}. `compensate` uses the whole model; files "
-        "of controllers hold geometry alone, and `export` states the error of what it writes."
+        "for controllers hold geometry only, and `export` states the error of what it writes."
     ]
 
 
@@ -371,8 +371,8 @@ def camera_remarks(result: Outcome) -> list[str]:
             )
     if not any("stretch" in name for name in result.problem.parameters.free.names):
         remarks.append(
-            "Views do not identify the size of the board: an error of it scales the robot by the same factor "
-            "(identify board_stretch_x and board_stretch_y where it was printed)."
+            "Views do not identify the size of the board: an error in it scales the robot by the same factor "
+            "(for a printed board identify board_stretch_x and board_stretch_y)."
         )
     return remarks
 
@@ -434,12 +434,12 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     if not all(problem.touches.planar):
         nearest.append("the mean of all touches of its point")
     if any(problem.touches.planar):
-        nearest.append("the plane that fits all touches of it best")
+        nearest.append("the best-fit plane of all its touches")
     definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
-    tells = "how well the robot returns there"
+    tells = "how consistently the robot reaches them"
     if len(problem.arms) > 1:
-        tells = "how well the robots meet and return there"
-    remarks = [f"{definition}. Their positions were not measured: the error is {tells} from all sides."]
+        tells = "how consistently the robots reach them"
+    remarks = [f"{definition}. These were not measured: the error shows {tells} from all sides."]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
-        remarks.append("No distance is known: the size of the robot rests on its nominal lengths alone.")
+        remarks.append("No distance is known: the scale of the robot rests on its nominal lengths alone.")
     return remarks

@@ -119,7 +119,7 @@ class Box:
             found = f"for {parameters.names[i]} a lower bound of {low} above the upper one of {high}"
             raise InputError(f"constraint '{self.name}'", found, "lower <= upper")
         if not (np.isfinite(lower).any() or np.isfinite(upper).any()):
-            raise InputError(f"constraint '{self.name}'", "no finite bound", "a bound of one parameter at least")
+            raise InputError(f"constraint '{self.name}'", "no finite bound", "a bound on at least one parameter")
         return lower, upper
 
     def __call__(self, z: Any, parameters: Parameters) -> list[Any]:

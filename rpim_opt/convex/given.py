@@ -106,7 +106,7 @@ def problem_of(p: Given) -> CalibrationProblem:
     """Return the problem that predicts positions for some parameters; InputError if there is none."""
     if p.problem is None:
         found = "parameters without a problem"
-        raise InputError("positions", found, "those that a problem's linear model has (`CalibrationProblem`)")
+        raise InputError("positions", found, "parameters of a problem's linear model (`CalibrationProblem`)")
     p.asked.append("positions")
     return p.problem
 

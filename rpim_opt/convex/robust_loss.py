@@ -1,4 +1,4 @@
-"""Robust losses as weighted squares: of the configurations that they keep, and of all rows in blocks."""
+"""Robust losses as weighted least squares (IRLS): over inlier configurations, or over all rows in blocks."""
 
 from __future__ import annotations
 
@@ -99,10 +99,10 @@ def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: 
     if len(loss.expression.variables()) == 1:  # else there are own ones, on whose values the slope depends
         slope = loss.slope(np.concatenate([v, np.full(loss.variable.size - len(v), SMALL)]))
     found = f"formulation '{formulation.name}'"
-    accepted = "a loss without own variables and with slopes, which covariances, predictions and most rules need; "
+    accepted = "a loss with gradients, without own variables, which covariances, predictions and most rules need; "
     accepted += "`forward`, monte_carlo, l_curve and k_fold do not"
     if slope is None:
-        raise InputError(found, "a loss without slope", accepted)
+        raise InputError(found, "a loss without gradient", accepted)
     factor = float(np.median(np.abs(slope[: len(v)]) / (2 * v))) if len(v) else 0.0
     if not factor > 0:
         raise InputError(found, "a loss that rests on a few equations", accepted)
@@ -173,7 +173,7 @@ class Squares:
         """Return the loss's slopes at norms v, one each; InputError where CVXPY knows none."""
         slope = priced.slope(v)
         if slope is None:
-            raise InputError(f"formulation '{self.name}'", "a loss without slope", "one with a slope, as robust has")
+            raise InputError(f"formulation '{self.name}'", "a loss without gradient", "one with a gradient: robust")
         return slope
 
 

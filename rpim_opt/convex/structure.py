@@ -1,4 +1,4 @@
-"""What a formulation's functions return for data of one shape, and the structure by which they are solved.
+"""Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
 What is canonicalized lives as long as its `Structure`: a calibration long, or of a ready formulation until `MOST_KEPT`
 others came. Warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.

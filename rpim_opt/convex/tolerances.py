@@ -183,7 +183,7 @@ class _Reader:
         self._require_end()
         for name in (*right.names, *wide.names):
             accepted = f"a number with a unit: {choices(name, units())}"
-            raise self._wrong(f"'{name}' where a number should stand", accepted)
+            raise self._wrong(f"'{name}' where a number is expected", accepted)
         if not spread:
             raise self._wrong("no standard deviation")
         if not self.unit:
@@ -269,7 +269,7 @@ class _Reader:
         while sign := self._next("+", "-"):
             total = total.plus(self._item(sign))
         if total.nominal not in (0, -1 if total.names else 1):
-            raise self._wrong("nominal without a meaning here", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
+            raise self._wrong("nominal, meaningless here", "'d5 = nominal +- 0.1 mm', '|a2 - nominal| <= 0.1 mm'")
         return total
 
     def _item(self, sign: str) -> Sum:
@@ -294,8 +294,8 @@ class _Reader:
                 raise self._wrong(f"'{number} {name}'", "factors other than zero")
             return Sum((name,), (factor,))
         if not number or times:
-            word = f"'{self._tokens[self._at][1]}'" if self._at < len(self._tokens) else "an end"
-            raise self._wrong(f"{word} where a parameter or a number should stand")
+            word = f"'{self._tokens[self._at][1]}'" if self._at < len(self._tokens) else "the end"
+            raise self._wrong(f"{word} where a parameter or number is expected")
         if factor == 0:
             return Sum()
         if not self.unit:
@@ -305,7 +305,7 @@ class _Reader:
     def _constant(self, found: Sum) -> float:
         """Return the number [SI] that a sum is."""
         if found.names or found.nominal:
-            raise self._wrong("parameters where a number should stand", "a number with a unit: " + ", ".join(units()))
+            raise self._wrong("parameters where a number is expected", "a number with a unit: " + ", ".join(units()))
         return found.constant
 
     def _checked(self, found: Sum) -> None:

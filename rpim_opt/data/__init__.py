@@ -1,4 +1,4 @@
-"""What was measured."""
+"""Measured data: datasets, measurement types and tables."""
 
 import lazy_loader
 

@@ -381,7 +381,7 @@ def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | No
         return None
     sessions = np.array([str(name) for name in names], dtype=object)
     if len(sessions) != N:
-        raise InputError("session", f"{len(sessions)} names", f"{N}, one a row")
+        raise InputError("session", f"{len(sessions)} names", f"{N}, one per row")
     called: dict[str, str] = {}
     for name in dict.fromkeys(sessions):
         other = called.setdefault(session_prefix(name), name)

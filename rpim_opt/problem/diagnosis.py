@@ -158,7 +158,7 @@ class Inspection(Tabled):
             lines.append(f"Exceptionally large error of the nominal robot, or an outlier: {named}.")
         notes = self._notes()
         parts = [
-            table(["joint", "unit", "from", "to", "span", "limits", "of them"], joints),
+            table(["joint", "unit", "from", "to", "span", "limits", "covered"], joints),
             table(["measured", "unit", "from", "to", "typical sigma"], measured),
             "\n".join(lines),
             str(self.observability),
@@ -248,7 +248,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     proposals: tuple[str, ...] = ()
     if needed:
         pairs = ", ".join(f"{name[4:]} and {int(name[4:]) + 1}" for name in needed)
-        proposals = (f"the axes {pairs} are near parallel: add {', '.join(needed)} to `identify`.",)
+        proposals = (f"the axes {pairs} are nearly parallel: add {', '.join(needed)} to `identify`.",)
     # all are identified again, with frames where they were fitted
     own = dict(zip(fitted.parameters.free.names, x, strict=True))
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
@@ -300,7 +300,7 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         unit, si = display(dimension)
         low, high = robot.limits[i]
         if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
-            yield f"joint {i + 1} leaves its limits {low / si:.1f} to {high / si:.1f} {unit}."
+            yield f"joint {i + 1} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
         if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
             yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are poorly identifiable."
     turning = np.array(robot.joint_dimensions) == "angle"
@@ -309,7 +309,7 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
         if largest > 4 * np.pi:
             yield f"joints reach {np.degrees(largest):.0f} deg: degrees given as radians?"
         if largest < np.radians(2 * np.pi):
-            yield "no joint leaves 6.3 deg: radians given as degrees?"
+            yield "no joint exceeds 6.3 deg: radians given as degrees?"
     for block in problem.data.blocks:
         if block.y.shape[1] < 3:
             continue
@@ -393,7 +393,7 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
         share = (len(at) - len(run)) / max(len(ordered) - len(run), 1)
         if len(run) >= TOGETHER and len(at) * (1 - (1 - share) ** 2) ** (len(run) - 1) < CHANCE_RUNS:
             yield (
-                f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers, and follow each other: "
+                f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers and are consecutive: "
                 "did the instrument or the robot's base move there? Calibrate the two parts separately, or "
                 "register the second one again."
             )
@@ -409,14 +409,14 @@ def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
         named = dict(zip([*(f"q{i + 1}" for i in range(q.shape[1])), *"xyz"], np.hstack([q, y]).T, strict=False))
         ordered = [name for name, column in named.items() if np.ptp(column) > 0 and (np.diff(column) >= 0).all()]
         if len(ordered) == 1 and len(q) >= 2 * FEWEST:
-            yield f"column {ordered[0]} is in ascending order, and no other one: was it sorted alone?"
+            yield f"column {ordered[0]} is the only one in ascending order: was it sorted alone?"
         for (one, first), (other, second) in combinations(named.items(), 2):
             if np.ptp(first) > 0 and (first == second).all():
                 yield f"columns {one} and {other} have the same values: is one a copy?"
         if y.shape[1] == 3:
             spread = y.std(axis=0)
             for k in np.flatnonzero(spread < FLAT * spread.max()):
-                yield f"column {'xyz'[k]} spreads over {three_digits(1e3 * spread[k])} mm only: is it another column?"
+                yield f"column {'xyz'[k]} varies by only {three_digits(1e3 * spread[k])} mm: is it the wrong column?"
             if y.min() >= 0 and len(q) >= 2 * FEWEST:
                 yield "no value of column x, y and z is negative: were signs lost?"
 
@@ -485,7 +485,7 @@ def computed_columns(problem: CalibrationProblem) -> Iterator[str]:
     exact = np.sqrt(np.sum(left**2, axis=0) / (len(X) - LINEAR)) < EXACT
     if exact.any() and not exact.all():
         named = joined([axis for axis, k in zip("xyz", exact, strict=True) if k])
-        yield f"column {named} follows from the nominal robot to {1e3 * EXACT:g} mm: was it computed, not measured?"
+        yield f"column {named} agrees with the nominal robot to {1e3 * EXACT:g} mm: was it computed, not measured?"
 
 
 def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
@@ -549,7 +549,7 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     if len(odd) > len(apart) / 2:
         what = f"the values of joint {i + 1} explain nothing (sorted, shuffled or scaled alone, or another quantity?)"
     yield (
-        f"{what}: with other ones the points fit to {three_digits(1e3 * left[i] * points.extent)} mm instead of "
+        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[i] * points.extent)} mm instead of "
         f"{three_digits(1e3 * whole * points.extent)} mm; check column q{i + 1}."
     )
 
@@ -790,10 +790,10 @@ def _changes(
         rows = equations.length & (share > 0)
         change = problem.jacobian(x)[np.ix_(rows, some)] @ (free.scale[some] * coefficients) * share[rows]
         far = 1e3 * float(np.sqrt(change @ change / max(len(np.unique(equations.row[rows])), 1)))
-        moved = f"the points are {three_digits(far)} mm from where the others put them"
+        moved = f"the points are {three_digits(far)} mm off the fit to the others"
         if not rows.any():  # nothing but angles was measured
             moved = "the measurements contradict the others"
-        moved = f"{moved}, and fit a {what} that moved"
+        moved = f"{moved}, consistent with a changed {what}"
         return f"{when} {moved}", f"{cause}? Calibrate the two parts separately"
 
     shares = {}
@@ -821,7 +821,7 @@ def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
             step = along / np.maximum(size, 1e-12)
             off = float(np.sqrt(np.mean(step**2)) * free.scale[k])
             unit = "mrad" if free.dimensions[k] == "angle" else "mm"
-            what = f"joint {i} is {three_digits(1e3 * off)} {unit} (RMS) from its reading, otherwise in every row"
+            what = f"joint {i} is {three_digits(1e3 * off)} {unit} (RMS) from its reading, differently in every row"
             best = max(best, (float(step @ along), off, what))
     gain, off, what = best
     spare = len(r) - N
@@ -862,7 +862,7 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
         way = np.diff(q, axis=0, prepend=q[:1])[problem.owners] @ robot.joint_map.T
         lag = np.sum([of_zero[i] * way[:, i] for i in range(robot.dof)], axis=0)
         remedy = "read both when the arm stands still"
-        yield Addition(lag[:, None], lambda c: (f"joint values lag behind by {100 * c[0]:.2g} % of the way", remedy))
+        yield Addition(lag[:, None], lambda c: (f"joint values lag behind by {100 * c[0]:.2g} % of each move", remedy))
 
 
 def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterator[Addition]:
@@ -896,7 +896,7 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is {{}} too long", "check its scale")
         if i != j:
-            skew = f"column {'xyz'[i]} has {{}} of column {'xyz'[j]} in it"
+            skew = f"column {'xyz'[i]} contains {{}} of column {'xyz'[j]}"
             what = (skew, "check whether the instrument's axes are square")
         yield scale(of_axis[:, i] * y[:, j], *what)
 
@@ -914,11 +914,11 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
     things = " and ".join(f"{number} {name}" for name, number in kinds.items() if number)
     yield (
         f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} parameter "
-        "combinations are identified better than by their prior scales. Touches do not identify the base frame and the "
+        "combinations are identified better than by their prior scales. Touches do not identify the base frame or the "
         "offset of the first joint."
     )
     if all(tie.kind != "known_distance" for tie in touches.ties):
         yield (
-            "The size of the robot rests on its nominal lengths: a known distance between two touched points "
+            "The scale of the robot rests on its nominal lengths: a known distance between two touched points "
             "([[known_distance]]) would determine it."
         )

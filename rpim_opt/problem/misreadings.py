@@ -127,7 +127,7 @@ def _readings(points: Points) -> list[Misreading]:
     """Return all single mistakes that are looked for."""
     readings = [*_of_joints(points.robot), *_of_rows(len(points.row), points.robot.dof)]
     if points.seen:
-        remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or the other way round'
+        remedy = 'write measurement = "eye_to_hand" for "eye_in_hand", or vice versa'
         return [*readings, Misreading("the camera and the board exchanged", remedy, _inverted)]
     if points.lengths:
         for factor, (unit, _) in LENGTHS.items():
@@ -145,7 +145,7 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
 
     turning = np.array(robot.joint_dimensions) == "angle"
     eye = np.eye(robot.dof)
-    remedy = "sum them up from row to row"
+    remedy = "accumulate them row by row"
     yield Misreading(
         "joint values read as absolute, not as increments", remedy, lambda of: replace(of, q=np.cumsum(of.q, axis=0))
     )
@@ -244,16 +244,14 @@ def _of_poses() -> Iterator[Misreading]:
         return lambda turns: Rotation.from_quat(Rotation.from_matrix(turns).as_quat()[:, order]).as_matrix()
 
     yield turned(
-        "orientations the other way round (of the instrument in the tool)",
+        "inverted orientations (of the instrument in the tool's frame)",
         "invert the rotations",
         lambda turns: np.swapaxes(turns, 1, 2),
     )
     for where, order in (("last", [3, 0, 1, 2]), ("first", [1, 2, 3, 0])):
         remedy = "state the order of the quaternion's components (--quaternion); arrays have w first"
         yield turned(f"quaternions with w {where}", remedy, reordered(order))
-    yield Misreading(
-        "transforms the other way round (the instrument in the tool's frame)", "invert the poses", _inverted
-    )
+    yield Misreading("inverted transforms (the instrument in the tool's frame)", "invert the poses", _inverted)
     remedy = "express both in one frame: multiply the rotations by that between the two"
     yield Misreading("orientations in another frame than the positions", remedy, _in_one_frame)
     for order in map("".join, permutations("xyz")):
@@ -312,8 +310,8 @@ def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
     yield of("the rows of joint values in the reverse order", "reverse the order of one of the two", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
-    yield of("measured values sorted as texts (1, 10, 11, 2)", remedy, by_text, rows)
-    yield of("joint values sorted as texts (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
+    yield of("measured values sorted as text (1, 10, 11, 2)", remedy, by_text, rows)
+    yield of("joint values sorted as text (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
 
 
 def _factors(points: Points) -> Iterator[Misreading]:

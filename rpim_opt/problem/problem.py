@@ -193,7 +193,7 @@ class CalibrationProblem(RobotModel):
                 raise InputError("data", found, f"Dataset.of_robots of {choices(block.robot, self.arms)}")
             dof = self.arms[block.robot].dof
             if block.q.shape[2] != dof:
-                raise InputError("q", f"{block.q.shape[2]} columns", f"{dof}, one a joint")
+                raise InputError("q", f"{block.q.shape[2]} columns", f"{dof}, one per joint")
             names = self.parameters.of_robot(block.robot).names
             for marker in block.markers:
                 if tool_prefix(marker) + "x" not in names:

@@ -299,7 +299,5 @@ def visible_configurations(
         visible = np.concatenate([visible, q[before & inside & large & upright]])
         if len(visible) >= count:
             return visible[:count]
-    found_text = f"{len(visible)} of {count} views in which the board is in sight"
-    raise InputError(
-        "visible_configurations", found_text, "frames, a share and an image with which it is visible more often"
-    )
+    found_text = f"{len(visible)} of {count} views in which the board is visible"
+    raise InputError("visible_configurations", found_text, "frames, share and image in which it is visible more often")

@@ -123,7 +123,7 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
         columns["time"] = found.times
     columns["error [mm]"] = [mm(1e3 * error) for error in found.error]
     columns |= {"standard deviations": sigmas, "cumulative sum": sums}
-    table = Table("In the order of time", list(columns), list(zip(*columns.values(), strict=True)))
+    table = Table("In chronological order", list(columns), list(zip(*columns.values(), strict=True)))
     title_of_sum = "Cumulative sum of the checks and its limit"
     charts = [
         figure(partial(plot.checks, found), "Residual of every check and its limit", "Individual checks."),

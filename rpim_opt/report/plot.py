@@ -145,7 +145,7 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
     if len(x):
         reach = max(reach, float(np.median(np.abs(x) + spread)))
     reach *= 1.1
-    cut = "\nIntervals beyond the edge are cut." if (np.abs(x) + spread > reach).any() else ""
+    cut = "\nIntervals beyond the axis are clipped." if (np.abs(x) + spread > reach).any() else ""
     ax.set(xlim=(-reach, reach), xlabel=f"deviation from nominal [{unit}]{cut}")
     _name(ax, "y", [free.names[i] for i in own])
     return _with_legend(ax)

@@ -404,7 +404,7 @@ def _convergence(result: Calibration) -> Iterator[Block]:
         c = result.certificate
         text = (
             f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
-            f"violation {c.violation:.2g} (in prior scales)."
+            f"violation {c.violation:.2g} (in prior standard deviations)."
         )
     except RpimError as error:
         text = f"No certificate. {error}"
@@ -413,7 +413,7 @@ def _convergence(result: Calibration) -> Iterator[Block]:
         [str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"]
         for k, it in enumerate(result.history, start=1)
     ]
-    yield "table", Table("Iterations", ["iteration", "objective", "step [prior scales]", "weight"], rows)
+    yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 
 # --- provenance --------------------------------------------------------------------------------------------

@@ -152,8 +152,8 @@ def require_same_arm(
     deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))
     joint, column = np.unravel_index(np.argmax(deviation), deviation.shape)
     if deviation[joint, column] > ANOTHER_ARM:
-        found = f"{MDH[column]}{joint + 1} off by {deviation[joint, column]:.3g} m or rad"
-        accepted = "a robot whose parameters were identified from this file's"
+        found = f"{MDH[column]}{joint + 1} differs from the file by {deviation[joint, column]:.3g} m or rad"
+        accepted = "a robot identified from this file's nominal parameters"
         if np.pi - deviation[joint, column] < ANOTHER_ARM:
             accepted += "; for half a turn at the base: --urdf-base with the chain's first link (base_link_inertia), "
             accepted += "in `new` and in `export`"
@@ -168,9 +168,7 @@ def without_beta(robot: Robot) -> Robot:
     """
     table = robot.mdh
     if table[-1, 4]:
-        raise InputError(
-            "robot", f"beta{len(table)} = {table[-1, 4]:g} rad", "a tool that holds what follows the last joint"
-        )
+        raise InputError("robot", f"beta{len(table)} = {table[-1, 4]:g} rad", "0, with that rotation in the tool")
     before = np.append(0.0, table[:-1, 4])
     origins = [numeric_link(beta=b) @ numeric_link(*row[:4]) for b, row in zip(before, table, strict=True)]
     origins[0] = numeric_link(theta=table[0, 2], d=table[0, 3])  # alpha1 and a1 stay as they are
@@ -181,7 +179,7 @@ def without_beta(robot: Robot) -> Robot:
     q = np.random.default_rng(0).uniform(-1, 1, (20, robot.dof))
     lost = float(np.abs(forward_kinematics(result, q) - forward_kinematics(robot, q)).max())
     if lost > 1e-9:
-        raise InputError("robot", f"axes too nearly parallel (loses {lost:.1g})", "a table with beta", robot.name)
+        raise InputError("robot", f"nearly parallel axes (error {lost:.1g} m or rad)", "a table with beta", robot.name)
     return result
 
 

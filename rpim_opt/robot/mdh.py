@@ -207,7 +207,7 @@ class Robot(Brief):
         right = limits.shape == (k, 2) and bool((limits[:, 0] < limits[:, 1]).all())
         require(right, "limits", f"{limits.tolist()}", f"{k} pairs lower < upper")
         masses = len(self.gravity.masses)
-        require(masses in (0, n), "gravity", f"{masses} masses", f"{n}, one a joint")
+        require(masses in (0, n), "gravity", f"{masses} masses", f"{n}, one per joint")
         for name, value in (("mdh", mdh), ("joint_types", types), ("joint_map", joint_map), ("limits", limits)):
             object.__setattr__(self, name, value)
 

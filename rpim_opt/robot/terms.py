@@ -275,7 +275,7 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
     try:
         moves = term.moves(joint, *sizes)
     except (AttributeError, TypeError) as error:
-        accepted = f"moves({', '.join([term.at, *(entry.name for entry in term.entries)])}) of what `Joint` has"
+        accepted = f"moves({', '.join([term.at, *(entry.name for entry in term.entries)])}) using only what `Joint` has"
         raise InputError(f"term '{term.name}'", f"{type(error).__name__}: {error}", accepted) from error
     if isinstance(moves, list | tuple):
         moves = ca.vertcat(*moves)

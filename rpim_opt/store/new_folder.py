@@ -49,7 +49,7 @@ TABLES = ("identification.csv", "validation.csv", "target.csv")
 ROBOT_OF_CHAINS = "robot.urdf"
 """Files of a new folder."""
 SHARED = (
-    "Chains share the joints that they have in common. What else is one and the same, `shared` in problem.toml says: "
+    "Chains share the joints that they have in common. Other common parameters: `shared` in problem.toml, "
     '["base_*"] where one instrument measured several chains from one link, by chain { left = ["base_*"], ... }.'
 )
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
@@ -73,7 +73,7 @@ class Started:
         """Return the files and the sentences."""
         lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
         then = f"Check {self.folder / 'problem.toml'}, then run: rpim-opt inspect {self.folder}"
-        return "\n".join([f"Made: {self.folder}", *lines, *self.notes, then])
+        return "\n".join([f"Created: {self.folder}", *lines, *self.notes, then])
 
 
 def new_problem(
@@ -170,15 +170,13 @@ def new_problem(
     ]
     if source.suffix.lower() == ".csv" and arm.tool.any():  # a DH table in another convention than the modified one
         notes.append(
-            "[tool] and --tool count in the flange frame after the last joint. In it the last frame of the DH table is "
-            f"at {placed(arm.tool)}: state points of the table's frame there."
+            "[tool] and --tool refer to the flange frame after the last joint. In it the last frame of the DH table is "
+            f"at {placed(arm.tool)}: transform points of the table's frame by it."
         )
     if before:
         notes.append(SHARED)
     elif chain:
-        notes.append(
-            f"Chain '{chain}' identifies the URDF's own origins; {folder} takes another chain by --chain NAME."
-        )
+        notes.append(f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}.")
     return Started(folder, counts, tuple(notes), replace(understanding, kind=kind))
 
 
@@ -196,7 +194,7 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
     if not known:
         raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
     if chain in known:
-        raise InputError("--chain", f"'{chain}', which is there", "a unique name for every chain", folder)
+        raise InputError("--chain", f"'{chain}', which exists", "a unique name for every chain", folder)
     if read_bytes(folder / ROBOT_OF_CHAINS) != read_bytes(robot):
         raise InputError("the robot", f"another one than {ROBOT_OF_CHAINS}", "the same URDF for all chains", robot)
     return read_bytes(folder / "problem.toml")
@@ -266,7 +264,7 @@ def _kind(
     """Return the measurement type and how it is known; refuse pixels without a board, and a board without pixels."""
     kind = found.kind
     if target.board and not kind.by_camera:
-        raise InputError("--target", "a board", f"none: measurement {kind.name} sees no points of one", found.file)
+        raise InputError("--target", "a board", f"none: measurement {kind.name} uses no board", found.file)
     on_target = any(name.startswith("target_x") for name in found.columns)
     if kind.by_camera and not target.board and not on_target:
         accepted = "--target with what the camera sees: a table with point, x_mm, y_mm, or a grid such as 7x5,30mm"
@@ -372,11 +370,11 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     located, _, verdict = locate(arm.robot, rows, tools)
     if same_place(located, arm.base):
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
-        how = f"Guessed: the data put the base {offset:.1f} mm from the robot's own, so they are in its frame."
+        how = f"Guessed: the base was registered {offset:.1f} mm from the robot's own: data are in its frame."
         return arm.base, how
     if np.linalg.norm(located[:3]) > FARTHEST:
         verdict = "implausibly far away: are the units right?"
-    return None, f"Guessed: the data put the base at {placed(located)}, {kind.words.frame} ({verdict})."
+    return None, f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
 
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:

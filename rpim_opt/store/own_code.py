@@ -45,7 +45,7 @@ def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
     module, _, attribute = name.partition(":")
     source = inside(file.parent, f"{module}.py", where, file)
     if not _ALLOWED.get():
-        accepted = "a name that comes with the package; or --allow-code, which runs that file with your rights"
+        accepted = "a name that comes with the package; or --allow-code, which runs that file with your permissions"
         raise InputError(where, f"'{name}', code of {source.name}", accepted, file)
     spec = importlib.util.spec_from_file_location(f"rpim_opt_own.{module}", source)
     if spec is None or spec.loader is None or not source.is_file():

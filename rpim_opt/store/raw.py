@@ -1,4 +1,4 @@
-"""Interpretation of raw tables: the meaning of every column."""
+"""Interpretation of raw files: joined tables, measurement type, and checks by the nominal robot."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Understanding:
     >>> _ = Path("raw.csv").write_text("\n".join(rows))
     >>> found = ro.store.understand_tables("ur5e", ["raw.csv"])
     >>> print(str(found).splitlines()[2])
-    Point      label of the row   label         a usual name
+    Point      label of the row   label         a known name
     >>> found.columns["x_mm"], found.kind.name
     (['100.125', '200.125', '300.125'], 'position')
     """
@@ -237,7 +237,7 @@ def _upright(raw: RawTable, arm: Described) -> RawTable:
         return raw
     columns = {name: [cells[i] for _, cells in others] for i, name in enumerate(names)}
     columns = {"label": [name for name, _ in others], **columns}
-    return RawTable(columns, {}, (*raw.notes, "a row a quantity: turned by 90 degrees."), raw.units)
+    return RawTable(columns, {}, (*raw.notes, "one row per quantity: transposed."), raw.units)
 
 
 def _tables(
@@ -258,7 +258,7 @@ def _whole(
         whole = together(tables, arm.robot, kind, options.key, options.within)
     shown = []  # in what is shown the columns by which rows were joined are not left out
     for each in tables:
-        joins = [m.column.lower() in whole.keys and m.meaning == "left out" for m in each.meant]
+        joins = [m.column.lower() in whole.keys and m.meaning == "not used" for m in each.meant]
         join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
         meant = tuple(m._replace(**join) if joined else m for m, joined in zip(each.meant, joins, strict=True))
         shown.append(replace(each, meant=meant))
@@ -284,11 +284,11 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
     if doubt == "rotation":
         if misfit[USUAL] <= CLEARLY * misfit[best]:
             return first
-        missed = f"turns that the nominal robot misses by {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
+        missed = f"rotations with nominal errors of {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
         accepted = f"--rotation '{best}' if correct, or '{USUAL}'"
         raise InputError("rx, ry, rz", missed, accepted, first.file)
     if misfit[second] <= CLEARLY * misfit[best]:
         accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
         raise InputError("the order of the quaternion", f"an ambiguous order ({figures})", accepted, first.file)
-    note = f"the quaternion's order is {best}: the nominal robot misses {figures}."
+    note = f"the quaternion's order is {best}: nominal rotation errors {figures}."
     return replace(alternatives[best], notes=(*alternatives[best].notes, note))

@@ -149,7 +149,7 @@ def _require_whole(stored: Any) -> None:
         raise InputError("key version", repr(stored.get("version"))[:40], accepted)
     known = stored.get("digest", "nothing")
     if known != digest(stored):
-        found = f"{str(known)[:12]} for a content of {digest(stored)[:12]}"
+        found = f"{str(known)[:12]}, content digest {digest(stored)[:12]}"
         raise InputError("key digest", found, "the unmodified file: its content was changed")
 
 
@@ -462,7 +462,7 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
     own_terms = _terms(model, robot)
     if terms != own_terms:
         wanted = "; ".join(map(str, terms)) or "none"
-        accepted = f"model=ro.Model(terms=[...]) with what the calibration had: {wanted}"
+        accepted = f"model=ro.Model(terms=[...]) with the calibration's terms: {wanted}"
         raise InputError("key terms", "; ".join(map(str, own_terms)) or "no term given", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
     origins = [displaced(carried) for carried in file.origins.get(name, ())]

@@ -24,7 +24,7 @@ T = TypeVar("T")
 NOT_FINITE = ("inf", "-inf", "nan")
 """How a file spells the numbers that JSON does not have."""
 LARGEST = sys.float_info.max
-KINDS = {bool: "truth value", int: "integer", str: "text"}
+KINDS = {bool: "boolean", int: "integer", str: "string"}
 
 
 def plain(value: Any) -> Any:
@@ -128,7 +128,7 @@ def _array(values: Any, kind: Any) -> np.ndarray:
     if not array.size:
         return array.astype(int)
     if array.dtype.kind not in "biU":
-        raise _unfit(values, "integers, truth values or texts")
+        raise _unfit(values, "integers, booleans or strings")
     return array.astype(object) if array.dtype.kind == "U" else array
 
 
@@ -153,4 +153,4 @@ def _refusal(error: BaseException, place: str = "") -> InputError:
         return InputError(f"{where}, {error.where}" if error.where else where, error.found, error.accepted)
     if isinstance(error, KeyError):
         return InputError(where, "nothing", "this key is required")
-    return InputError(where, f"another kind of value ({error})", "the written kind")
+    return InputError(where, f"a value of another type ({error})", "the saved type")

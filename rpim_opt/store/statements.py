@@ -1,4 +1,4 @@
-"""What a problem file states besides data: constraints, prior, record, acceptance, places of fixtures."""
+"""Sections of a problem file other than data: constraints, prior, record, acceptance, poses of fixtures."""
 
 from __future__ import annotations
 
@@ -102,10 +102,10 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     try:
         q = np.array(joints_of_place, dtype=float)
     except ValueError:
-        raise InputError(where, "lists of different lengths", f"{robot.dof} joint values a configuration") from None
+        raise InputError(where, "lists of different lengths", f"{robot.dof} joint values per configuration") from None
     q = q.reshape(-1, q.shape[-1] if q.ndim else 1)
     if q.shape[1] != robot.dof:
-        raise InputError(where, f"{q.shape[1]} joint values", f"{robot.dof} a configuration")
+        raise InputError(where, f"{q.shape[1]} joint values", f"{robot.dof} per configuration")
     return q
 
 
@@ -285,7 +285,7 @@ def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]
     own: dict[str, float] = {}
     for table, content in placed.items():
         if table not in used:
-            raise InputError(f"table {table}", "a fixture of no measurement in this problem", choices(table, used))
+            raise InputError(f"table {table}", "a fixture that no measurement here has", choices(table, used))
         for fixture, coordinates in used[table].items():
             part: Any = content
             where = f"table {table}"

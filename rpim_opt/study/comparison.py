@@ -529,7 +529,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         notes.append(f"There are no intervals: {few}.")
     late = sum(each.unconverged for each in standings)
     if late:
-        notes.append(f"{late} replicates did not converge; their figures count (column status).")
+        notes.append(f"{late} replicates did not converge; their results are included (column status).")
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:

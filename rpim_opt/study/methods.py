@@ -1,4 +1,4 @@
-"""What a comparison is made of: problems, what is held out of them, methods, and metrics of what these return."""
+"""Elements of a comparison: problems, held-out sets, methods, and metrics."""
 
 from __future__ import annotations
 

@@ -109,7 +109,7 @@ class Compensation:
         for status in ("limited", "near singular", UNREACHABLE, ABOVE):
             at = [i for i, each in enumerate(self.status) if each == status]
             if at:
-                left = [f"{1e3 * self.position_error[i]:.3f} mm left" for i in at]
+                left = [f"{1e3 * self.position_error[i]:.3f} mm off" for i in at]
                 if status == ABOVE:
                     left = [
                         f"{text}, U {1e3 * EXPANDED * self.std[i]:.3f} mm" for i, text in zip(at, left, strict=True)
@@ -122,9 +122,9 @@ class Compensation:
         far = [i for i in np.argsort(-np.nan_to_num(self.beside)) if self.beside[i] > BESIDE]
         if far:
             lines.append(
-                f"Positions of {len(far)} rows are far from the joint values beside them, at most "
+                f"Positions of {len(far)} rows are far from the joint values in the same row, by up to "
                 f"{1e3 * self.beside[far[0]]:.0f} mm (row {self.label[far[0]]}); the commands reach the positions. Are "
-                "they of another tool (--tool), or in another frame than the robot's base?"
+                "they of another tool (--tool), or not in the robot's base frame?"
             )
         return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])
 
@@ -314,7 +314,7 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
         except RowError as error:
             raise error.named(f"poses, {error.where}") from None
     if len(stated.label) not in (0, N):
-        raise InputError("label", f"{len(stated.label)} labels", f"{N}, one a row")
+        raise InputError("label", f"{len(stated.label)} labels", f"{N}, one per row")
     return Targets(stated.label or tuple(str(i) for i in range(1, N + 1)), q, poses, torque)
 
 

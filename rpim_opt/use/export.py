@@ -183,8 +183,8 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
     sentence = (
-        f"Files hold no {joined(result.learned.extensions)}: written is the geometry that the same measurements give "
-        f"without, which leaves {left:.3f} mm RMS on the {where} rows where the whole model leaves {whole:.3f} mm."
+        f"Files cannot hold {joined(result.learned.extensions)}: their geometry is from a fit to the same measurements "
+        f"without it, with {left:.3f} mm RMS on the {where} rows ({whole:.3f} mm with the whole model)."
     )
     return alone, [sentence]
 
@@ -272,7 +272,7 @@ def export_urdf(
             notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)} in {where}.")
         elif free:
             option = "; where the reflector is the tip, --tip-measured moves it there" if name == "tool" else ""
-            notes.append(f"URDF: its {link} link has the place that the file states; in {there}{option}.")
+            notes.append(f"URDF: its {link} link keeps its pose from the file; in {there}{option}.")
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, *written)

@@ -100,7 +100,7 @@ class Performance(Tabled):
             times = " to ".join(str(count) for count in dict.fromkeys((cycles[0], cycles[-1])))
             verb = "are" if len(self.poses) > 1 else "is"
             there = f"there {verb} {counted(len(self.poses), 'pose')}, approached {times} times"
-            lines.append(f"The standard has {POSES} poses approached {CYCLES} times each: {there}.")
+            lines.append(f"The standard requires {POSES} poses, {CYCLES} approaches each: {there}.")
         if self.accuracy is None:
             lines.append("No commanded poses are known: repeatability is computed, accuracy is not.")
         return lines
@@ -156,7 +156,7 @@ def iso9283(
     1.732 mm, 0.100 mm
     """
     if not len(pose):
-        raise InputError("iso9283", "no approach", "at least two of a pose")
+        raise InputError("iso9283", "no approach", "at least two per pose")
     attained = _rows(position, len(pose), "positions")
     commanded = None if command is None else _rows(command, len(pose), "commanded positions")
     turned = None if angles is None else _rows(angles, len(pose), "angles")
@@ -187,7 +187,7 @@ def iso9283(
 def _one_command(values: Array, name: str, what: str) -> Array:
     """Return the command of a pose (3,), which all its rows repeat."""
     if np.ptp(values, axis=0).max() > 1e-9:
-        raise InputError(f"pose '{name}'", f"commands of more than one {what}", "one command a pose")
+        raise InputError(f"pose '{name}'", f"commands of more than one {what}", "one command per pose")
     return values[0]
 
 

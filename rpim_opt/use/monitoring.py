@@ -128,7 +128,7 @@ class Monitoring:
             lines.append(f"Cumulative sum above its limit: alarm at {self._named(self.alarm)}, since {since}.")
         if self.drift is not None:
             cause, first = self.drift.cause, self.drift.first
-            course = f"at once before {self._named(first)}" if first else "before the first check"
+            course = f"in one step before {self._named(first)}" if first else "before the first check"
             if self.drift.steady:
                 course = "steadily from the first to the last check"
             lines.append(
@@ -143,7 +143,7 @@ class Monitoring:
         lines.append(
             f"Largest innovation: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
             f"({self.allowed[worst]:.1f} allowed), {1e3 * self.error[worst]:.3f} mm. "
-            f"Largest sum: {self.sums.max():.1f} ({self.limit:.1f} allowed)."
+            f"Largest cumulative sum: {self.sums.max():.1f} ({self.limit:.1f} allowed)."
         )
         return "\n".join(lines)
 
@@ -191,7 +191,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     if when is not None:
         when = np.asarray(when, dtype=float)
         if when.shape != (count,) or not np.isfinite(when).all():
-            raise InputError("monitor, when", f"shape {when.shape}", f"{count} finite times [s], one a check")
+            raise InputError("monitor, when", f"shape {when.shape}", f"{count} finite times [s], one per check")
         order = np.argsort(when, kind="stable")
         data = data.take(order)
         when = when[order]

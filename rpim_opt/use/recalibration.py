@@ -152,11 +152,11 @@ class Update:
         else:
             lines = [f"{count} lie outside the prediction intervals of the last calibration: {self.before}."]
         for cause in self.changes:
-            end = ", left out" if cause.kind == "reading" else ""
+            end = ", excluded" if cause.kind == "reading" else ""
             figures = f"chi-squared falls by {cause.gain:.1f}, posterior probability {cause.probability:.2g}"
             lines.append(f"  {cause.kind} {cause.name}: {figures}{end}.")
         if self.moved:
-            lines.append(f"Moved since: {joined([str(each) for each in self.moved])}.")
+            lines.append(f"Changed since then: {joined([str(each) for each in self.moved])}.")
         rivals = [c.name for c in self.causes[1:] if self.changes and c.probability > RIVAL]
         if rivals:
             lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
@@ -242,7 +242,7 @@ def update(
         if missed > STRANGE * furthest:
             accepted = f"those of the same robot ({robots}) in the same units and instrument's frame, or --reset "
             accepted += "with what moved (base_*)"
-            found = f"readings {1e3 * missed:.3g} mm off, whatever is released"
+            found = f"readings {1e3 * missed:.3g} mm off, whichever parameters change"
             raise InputError("the new measurements", found, accepted)
     old, new = result.problem.parameters.free, updated.problem.parameters.free
     was, now = (  # values: of a frame that was registered again, deviations refer to another orientation

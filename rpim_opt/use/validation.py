@@ -113,7 +113,10 @@ class Validation:
         covered = ""
         if self.coverage is not None:
             covered = f" {100 * self.coverage:.0f} % of the coordinates are within their 95 % prediction intervals."
-        named = [f"{self.label[i]} ({self.sigmas[i]:.1f} sigmas, {1e3 * self.error[i]:.3f} mm)" for i in self.beyond]
+        named = [
+            f"{self.label[i]} ({self.sigmas[i]:.1f} standard deviations, {1e3 * self.error[i]:.3f} mm)"
+            for i in self.beyond
+        ]
         judgement = f"Outside their prediction intervals: {listed(named)}.{covered}"
         if not np.isfinite(self.sigmas).any():
             judgement = "The calibration has no covariance for these rows: there are no prediction intervals."
@@ -167,7 +170,7 @@ def _elsewhere(result: Calibration, error: Array) -> str:
     if not np.isfinite(error).any() or np.nanmedian(error) <= REACH * arm_length(result.problem):
         return ""
     return (
-        f"Median error {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's own effects stay below "
+        f"Median error {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's own errors stay below "
         f"{100 * REACH:g} % of the arm's length. The instrument or the base may have moved (--register registers it "
         "again), or these are another robot's measurements."
     )

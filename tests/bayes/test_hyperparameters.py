@@ -198,7 +198,7 @@ def test_an_assembly_error_leaves_its_group_and_is_named() -> None:
     result = ro.calibrate(measured(POSITION, x, 3))
     assert result.x[free.names.index("theta3")] == pytest.approx(np.radians(1.0), abs=2e-4)
     assert "theta3 deviates by " in result.weight_sentence()
-    assert "error of assembly" in result.weight_sentence()
+    assert "assembly or joint-zero error" in result.weight_sentence()
 
 
 def test_fewer_equations_than_parameters_are_said() -> None:
@@ -253,7 +253,7 @@ def test_what_other_arms_say_is_left_out_where_the_evidence_is_against_it() -> N
     assert right.learned is not None
     assert wrong.learned is not None
     assert "The population prior" not in right.weight_sentence()
-    assert "The population prior was left out" in wrong.weight_sentence()
+    assert "The population prior is not used" in wrong.weight_sentence()
     assert np.abs(wrong.x - plain.x).max() < 1e-7
     errors = [
         np.sqrt(np.mean((POSITION.on(POSITION.data).errors(r.x) - POSITION.errors(x)) ** 2)) for r in (right, plain)

@@ -228,7 +228,7 @@ def test_folds_leave_whole_sessions_out(problem: ro.CalibrationProblem) -> None:
     by_session = partial(ro.k_fold, parts=problem.data.by_session())
     result = ro.calibrate(with_sessions(problem), weight=by_session)
     assert result.weight > 0
-    with pytest.raises(ro.InputError, match="every configuration in one of them"):
+    with pytest.raises(ro.InputError, match="every configuration in exactly one"):
         ro.calibrate(problem, weight=partial(ro.k_fold, parts=problem.data.by_session()[:3]))
 
 

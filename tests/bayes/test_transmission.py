@@ -148,7 +148,7 @@ def test_corrections_are_a_table(rippled, tmp_path):
     required = dataclasses.replace(result.record, requirement=ro.data.Requirement(limit=1e-6))
     _, said = ro.use.export_files(dataclasses.replace(result, record=required), mdh=tmp_path / "arm.csv")
     assert "whole model: Inconclusive: limit 0.001 mm" in said[2]
-    assert "Lacking: " in said[2]
+    assert "Missing: " in said[2]
     plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):
         ro.use.export_files(plain, corrections=tmp_path / "none.csv")

@@ -164,7 +164,7 @@ def test_a_region_in_which_nothing_was_measured_is_not_accepted(result) -> None:
     found = accept(result, Requirement(1e-3, box=box))
     assert found.bound < 1e-3
     assert found.verdict == "undecided"
-    assert found.reasons == ("Lacking: measurements in the region. No identification row is in it either.",)
+    assert found.reasons == ("Missing: measurements in the region. No identification row is in it either.",)
 
 
 def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
@@ -176,7 +176,7 @@ def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda r: replace(r, record=ro.data.Record()), "Lacking: held-out rows"),
+        (lambda r: replace(r, record=ro.data.Record()), "Missing: held-out rows"),
         (
             lambda r: replace(r, record=replace(r.record, validation=r.record.validation.take(range(3)))),
             "at least 5 held-out rows",

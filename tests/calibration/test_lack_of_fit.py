@@ -89,7 +89,7 @@ def test_model_that_has_gravity_says_so():
     found = lack_of_fit(ro.calibrate(arm(2, n=40, compliance=BENT), model="auto"))
     assert found.missing == ()
     assert found.present["gravity"] > 10
-    assert f"The arm bends under gravity: -2 ln L falls by {found.present['gravity']:.0f}." in str(found)
+    assert f"The arm deflects under gravity: -2 ln L falls by {found.present['gravity']:.0f}." in str(found)
     listed = arm(2, n=40, compliance=BENT, identify=LISTED)
     stated = lack_of_fit(ro.calibrate(listed, ro.tikhonov, ro.reml))
     assert stated.present["gravity"] > 10
@@ -130,7 +130,7 @@ def test_repeated_readings_tell_repeatability_from_what_comes_again():
     bent = lack_of_fit(learned(7, n=30, repeats=2, compliance=BENT))
     assert bent.repeated == pytest.approx(ROOT3 * NOISE, rel=0.2)
     assert bent.excess > bent.repeated
-    assert "repeat with the configuration" in str(bent)
+    assert "is systematic (repeatable)" in str(bent)
 
 
 def test_too_few_equations_are_not_judged():

@@ -98,7 +98,7 @@ def test_at_rest_a_weight_is_asked_for_once_more() -> None:
 
 @pytest.mark.parametrize("start", [np.zeros(N - 1), np.zeros((N, 1)), np.full(N, np.nan), np.full(N, np.inf)])
 def test_a_start_that_does_not_fit_is_refused(start: np.ndarray) -> None:
-    with pytest.raises(ro.InputError, match="deviations, finite, one a parameter"):
+    with pytest.raises(ro.InputError, match="finite deviations, one per parameter"):
         ro.calibrate(PROBLEM, ro.tikhonov, 1.0, start=start)
 
 
@@ -247,8 +247,8 @@ def test_why_passes_ran_out() -> None:
 
 
 def test_why_a_loop_at_rest_has_not_converged() -> None:
-    assert "still predicts a decrease by 0.002 of the objective" in uncertified(Certificate(1.0, 0.0, 0.002))
-    assert "constraints are violated by 3e-05 scales" in uncertified(Certificate(1.0, 3e-5, 1e-9))
+    assert "still predicts a decrease of the objective by 0.002" in uncertified(Certificate(1.0, 0.0, 0.002))
+    assert "constraints are violated by 3e-05 prior standard deviations" in uncertified(Certificate(1.0, 3e-5, 1e-9))
     assert "the solution is not certified" in uncertified(Certificate(1.0, 0.0, None))
 
 

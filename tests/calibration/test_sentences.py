@@ -32,11 +32,11 @@ def expanded(count: int, largest: float, typical: float) -> Workspace:
 
 
 def test_an_acceptance_says_what_it_rests_on() -> None:
-    bare = Acceptance(LIMIT, "undecided", ("Lacking: rows.",))
+    bare = Acceptance(LIMIT, "undecided", ("Missing: rows.",))
     assert bare.sentences() == [
         "Inconclusive: limit 0.1 mm with 95 % confidence at every configuration of the region.",
         "Region: joints within the measured ranges.",
-        "Lacking: rows.",
+        "Missing: rows.",
     ]
     assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "repeatability", "box")] == [None] * 4
     free = Acceptance(LIMIT, "undecided", (), expanded(500, np.inf, 5e-5), 2e-5)
@@ -183,7 +183,7 @@ def test_extensions_are_compared_with_the_best_model_without_them() -> None:
     assert found.gain("compliance") is None
     (text,) = said(found)
     assert text.startswith("Model: geometry with gravity (-2 ln L falls by gravity 30). `compensate` uses the whole")
-    assert "files of controllers hold geometry alone" in text
+    assert "files for controllers hold geometry only" in text
     alone = learned(trials=(Trial((), 40.0), Trial(("gravity",), 40.2)))
     assert said(alone) == ["Model: the data support no extension."]
 

@@ -127,7 +127,7 @@ def test_passes_are_counted(count: int, said: str) -> None:
     noted = replace(before, choice=replace(before.choice, note="It alternates."))
     assert said_of(noted) == f"Converged after {said}. It alternates."
     assert "no step, however short, decreases the nonlinear objective" in said_of(replace(before, outcome="stuck"))
-    assert "still predicts a decrease by 0.5 of the objective" in said_of(before, bad)
+    assert "still predicts a decrease of the objective by 0.5" in said_of(before, bad)
     ended = said_of(replace(before, outcome="", history=()), most=7)
     assert ended == "Not converged: 7 iterations were not enough; allow more (max_iterations)."
 

@@ -129,7 +129,7 @@ def test_what_triangles_cannot_hold_is_refused() -> None:
         in_blocks(ro.minimax, lambda: 120)
     squares = Squares(cp.norm1, "bent", "equation")
     flat: Any = SimpleNamespace(slope=lambda v: None)
-    with pytest.raises(ro.InputError, match="formulation 'bent': found a loss without slope"):
+    with pytest.raises(ro.InputError, match="formulation 'bent': found a loss without gradient"):
         squares.slope(flat, np.ones(3))
 
 

@@ -112,14 +112,14 @@ def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
 @pytest.mark.parametrize(
     ("loss", "said"),
     [
-        (lambda v: cp.sum_squares(v - cp.Variable()), "a loss without slope"),
+        (lambda v: cp.sum_squares(v - cp.Variable()), "a loss without gradient"),
         (cp.max, "a loss that rests on a few equations"),
     ],
 )
 def test_a_loss_that_has_no_factor_is_named(loss: Any, said: str) -> None:
     mine = ro.Formulation("mine", loss=loss)
     with pytest.raises(
-        ro.InputError, match=f"formulation 'mine': found {said}, accepted: a loss without own variables and with slopes"
+        ro.InputError, match=f"formulation 'mine': found {said}, accepted: a loss with gradients, without own variables"
     ):
         inliers_of(mine, np.full(5, 2.0), np.full(5, 3))
 

@@ -227,7 +227,7 @@ def test_one_text_in_three_million_rows_is_refused_before_it_is_repeated(tmp_pat
     texts = pa.DictionaryArray.from_arrays(pa.array(np.zeros(3_000_000, np.int32)), ["x" * 3600])
     parquet.write_table(pa.table({"label": texts}), path)
     assert path.stat().st_size < 2_000_000
-    assert "bytes of texts" in refused(path)
+    assert "bytes of text" in refused(path)
     script = f"try: ro.read_data({str(path)!r}, ro.load('position').problem.robot)\nexcept ro.InputError: pass"
     assert peak_of(script) < 2**28
 

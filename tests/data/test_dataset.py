@@ -97,7 +97,7 @@ def test_sigmas_of_components_and_poses_as_transforms() -> None:
     poses = ro.Dataset.of(q, T, sigma=1e-5, measurement="pose")
     assert poses.blocks[0].y[1] == pytest.approx([0.1, 0.2, 0.3, half, 0, 0, half])
     T[1, 0, 0] = 0.5
-    with pytest.raises(ro.InputError, match="y, row 2: found a matrix that misses"):
+    with pytest.raises(ro.InputError, match="y, row 2: found a matrix that violates"):
         ro.Dataset.of(q, T, sigma=1e-5, measurement="pose")
 
 

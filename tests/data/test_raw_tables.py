@@ -57,7 +57,7 @@ REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     "a sign that is two": (HEAD + ROWS, {"separator": "::"}, "--separator: found '::'"),
     "a decimal mark": (HEAD + ROWS, {"decimal": "'"}, "comma or point"),
     "a decimal mark that numbers do not have": (
-        HEAD + ROWS.replace("401", "401.5"), {"decimal": ",", "separator": ","}, "the mark that the numbers have"
+        HEAD + ROWS.replace("401", "401.5"), {"decimal": ",", "separator": ","}, "the decimal mark of the numbers"
     ),
     "nothing": ("\n\n", {}, "an empty file"),
     "an encoding that no text has": (HEAD + ROWS, {"encoding": "\ud800"}, "--encoding with the one that fits"),
@@ -140,7 +140,7 @@ def test_many_lines_between_rows_are_counted_beyond_those_that_are_shown(tmp_pat
     between = "".join(f"P{i},{i},2,40{i},5,6\npause {i},,,,,\n" for i in range(1, 10))
     found = read(write(tmp_path, HEAD + between + "P10,1,2,3,4,5\n"))
     assert len(found.columns["label"]) == 10
-    assert any(note.endswith("more lines are not rows of the table: left out.") for note in found.notes)
+    assert any(note.endswith("more lines are not rows of the table: ignored.") for note in found.notes)
 
 
 @pytest.mark.parametrize("name", ["u(x)", "u x", "u_x"])
@@ -181,7 +181,7 @@ def test_a_joint_of_another_robot_is_no_joint_of_this_one(tmp_path: Path) -> Non
         (
             "elbow,foot,1,2,401,5,6\nfoot,elbow,3,4,402,6,7\n",
             ("foot", "elbow"),
-            "2 names, accepted: one joint a column",
+            "2 names, accepted: one joint per column",
         ),
         ("elbow,foot,1,2,401,5,6\nelbow,foot,3,4,402,6,7\n", (), "a robot from a URDF, which names its joints"),
     ],
@@ -247,7 +247,7 @@ def test_a_common_column_counts_beside_a_pair_of_other_names(tmp_path: Path) -> 
         (JOINTS, VALUES + "c,1,2,3\n", "row", "2 rows of joints and 3 measured, accepted: equal numbers of both"),
         (JOINTS.replace("b,3", "a,3"), VALUES, "", "'a' twice in"),
         (JOINTS, VALUES, "time", "found 'time'"),
-        (JOINTS, VALUES, "row", "2 of 2 rows whose name is the name of another row"),
+        (JOINTS, VALUES, "row", "2 of 2 rows whose name matches name in another row"),
         (JOINTS.replace("name", "one"), "other,X [mm],Y [mm],Z [mm]\nc,402,6,7\nd,401,5,6\n", "", "no column in both"),
     ],
 )
@@ -278,12 +278,12 @@ def test_files_below_each_other_are_in_the_units_of_the_first(tmp_path: Path) ->
     tables = [read(write(tmp_path, HEAD + ROWS)), read(write(tmp_path, other, "later.csv"))]
     assert float(together(tables, ARM, position).columns["x_mm"][2]) == pytest.approx(400)
     lacking = read(write(tmp_path, "Point,J1 [deg],X [mm],Y [mm],Z [mm]\nP4,1,2,3,4\n", "lacking.csv"))
-    with pytest.raises(ro.InputError, match=r"q2 in one of raw\.csv and lacking\.csv alone"):
+    with pytest.raises(ro.InputError, match=r"q2 in only one of raw\.csv and lacking\.csv"):
         together([tables[0], lacking], ARM, position)
 
 
 def test_a_table_without_columns_and_one_whose_names_are_no_texts() -> None:
-    for table, said in (({}, "an empty table"), ({1: [2]}, "column 1, accepted: unique names that are texts")):
+    for table, said in (({}, "an empty table"), ({1: [2]}, "column 1, accepted: unique strings as names")):
         with pytest.raises(ro.InputError, match=said):
             ro.read_data(table, ARM, {"position_mm": 0.1})
 

@@ -157,7 +157,7 @@ def test_where_no_marker_tells_the_base_all_are_fitted() -> None:
         ({"base": [0, 0, 0]}, r"base: found \[0, 0, 0\], accepted: six finite numbers"),
         ({"base": None}, "base: found None"),
         ({"tool": "flange"}, "tool: found 'flange'"),
-        ({"data": 5}, "5 joint values a row, accepted: 6"),
+        ({"data": 5}, "5 joint values per row, accepted: 6"),
     ],
 )
 def test_frames_and_joints_that_do_not_fit_are_named(stated, said: str) -> None:

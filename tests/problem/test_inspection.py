@@ -88,7 +88,7 @@ def test_copied_values_limits_and_coverage() -> None:
     y[5] = y[4]
     warnings = inspect(problem.on(replace(problem.data, blocks=(replace(block, q=q, y=y),)))).warnings
     assert any("rows c4 and c5 have the same measured values" in text for text in warnings)
-    assert any("joint 2 leaves its limits" in text for text in warnings)
+    assert any("joint 2 exceeds its limits" in text for text in warnings)
     assert any("joint 5 moves only 0.00 deg" in text for text in warnings)
 
 
@@ -109,7 +109,7 @@ def test_deviations_of_pixels_are_in_pixels() -> None:
 def test_parallel_axes_are_proposed() -> None:
     problem = ro.load("position").problem
     without = ro.CalibrationProblem(problem.robot, problem.parameters.identify(["a?", "base_*"]), problem.data)
-    assert inspect(without).proposals == ("the axes 2 and 3 are near parallel: add beta2 to `identify`.",)
+    assert inspect(without).proposals == ("the axes 2 and 3 are nearly parallel: add beta2 to `identify`.",)
     assert inspect(problem).proposals == ()
 
 

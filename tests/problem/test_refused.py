@@ -59,7 +59,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a known distance of nothing": (lambda: KnownDistance(("A", "B"), 0.0, 1e-5), "a length greater than zero"),
     "a known distance without a deviation": (lambda: KnownDistance(("A", "B"), 0.3, 0.0), "sigma 0"),
     "an angle between one": (lambda: KnownAngle(("A", "A"), parallel=True, sigma=1e-5), "'A' twice"),
-    "touches of fewer names": (lambda: touches(Q, ["A"], 1e-4), "1 names, accepted: 4, one a touch"),
+    "touches of fewer names": (lambda: touches(Q, ["A"], 1e-4), "1 names, accepted: 4, one per touch"),
     "a point of another board": (
         lambda: on_board({"label": ["first", "second"], "point": ["3", "33"]}, BOARD),
         "row second, column point: found '33', accepted: a point of the target",
@@ -78,7 +78,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
         lambda: problem().with_parameters(problem().parameters.identify([])), "key identify: found no parameter"
     ),
     "data of another robot": (
-        lambda: problem().on(ro.Dataset.of(Q[:, :5], np.zeros((4, 3)), 1e-4)), "5 columns, accepted: 6, one a joint"
+        lambda: problem().on(ro.Dataset.of(Q[:, :5], np.zeros((4, 3)), 1e-4)), "5 columns, accepted: 6, one per joint"
     ),
     "a plane that the model does not have": (
         lambda: problem().on(ro.Dataset.of(Q, np.zeros((4, 0)), 1e-4, measurement=plane)), "no parameter 'plane_"
@@ -101,13 +101,13 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "views that show three corners": (
         lambda: posed(world("eye_in_hand").data.take(np.array([0, 1, 5, 12, 13, 17])), own()),
-        "no view that shows a pose",
+        "no view that determines a pose",
     ),
     "two views for a focal length": (
         lambda: starting_camera(few_views(2), few_views(2).blocks[0]), "2 views of a flat board"
     ),
     "three views from one side": (
-        lambda: starting_camera(one_side(), one_side().blocks[0]), "views that tell no focal length"
+        lambda: starting_camera(one_side(), one_side().blocks[0]), "views that do not determine the focal length"
     ),
 }  # fmt: skip
 

@@ -205,7 +205,7 @@ def test_what_is_no_gravity_is_refused(wrong: dict, match: str) -> None:
         ro.robot.Gravity(**wrong)
     with pytest.raises(ro.InputError, match="found 'roof', accepted"):
         ro.robot.Gravity().mounted("roof")
-    with pytest.raises(ro.InputError, match="2 masses, accepted: 6, one a joint"):
+    with pytest.raises(ro.InputError, match="2 masses, accepted: 6, one per joint"):
         replace(ARM, gravity=ro.robot.Gravity(masses=(1.0, 1.0), centres=((0, 0, 0),) * 2))
 
 

@@ -89,7 +89,7 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
     if said:
         assert read_sheet(path).robot.mdh[1, 1] == pytest.approx(0.05)
     else:
-        with pytest.raises(ro.InputError, match="no word of it"):
+        with pytest.raises(ro.InputError, match="not stated"):
             read_sheet(path)
 
 
@@ -106,5 +106,5 @@ def test_common_normals_far_away_are_warned_of(tmp_path: Path) -> None:
     mdh = ARM.mdh.copy()
     mdh[1, 4] = 1e-4
     (note,) = write_robodk(ro.robot.Robot("arm", mdh), tmp_path / "robodk.csv")
-    assert "rounded to 0.0001 degrees miss by" in note
+    assert "rounded to 0.0001 degrees cause" in note
     assert write_robodk(ARM, tmp_path / "plain.csv") == []

@@ -20,7 +20,7 @@ from tests.simulate import simulated
 
 PROBLEMS = {
     "a fixture of no measurement": (
-        "position", "[noise]", "[anchor]\nx_mm = 1\n[noise]", "a fixture of no measurement in this problem"
+        "position", "[noise]", "[anchor]\nx_mm = 1\n[noise]", "a fixture that no measurement here has"
     ),
     "an anchor that no row names": (
         "cable", "[anchor.B]", "[anchor.C]\nx_mm = 1\n[anchor.B]", "table anchor: found 'C'"

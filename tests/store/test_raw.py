@@ -82,7 +82,7 @@ def test_a_dry_run_says_every_column_and_writes_nothing(monkeypatch, capsys, tmp
     assert "u95_x_mm" in lines["U(95) X [mm]"]
     assert "coverage factor 2" in lines["U(95) X [mm]"]
     assert "joint 1" in lines["J1 [deg]"]
-    assert "left out" in lines["RMS"]
+    assert "not used" in lines["RMS"]
     assert said.splitlines()[-1] == f"{COUNT} rows, measurement position."
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run", "--json") == 0
     content = json.loads(capsys.readouterr().out)
@@ -127,7 +127,7 @@ def test_the_order_of_a_quaternion_is_checked_and_said(monkeypatch, capsys, tmp_
     path = write(tmp_path)
     assert new(monkeypatch, arm, tmp_path / "cell", path, *options(stated), "--dry-run") == 0
     said = capsys.readouterr().out
-    assert f"the quaternion's order is {right}: the nominal robot misses {right} 0.09 deg, {wrong} " in said
+    assert f"the quaternion's order is {right}: nominal rotation errors {right} 0.09 deg, {wrong} " in said
     assert f"order {right}" in said
     # a stated order is not checked here: it is the user's word
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--quaternion", wrong, "--dry-run") == 0
@@ -211,7 +211,7 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
     said = capsys.readouterr().out
     assert f"joined by label: {COUNT - 1} rows of {COUNT} with joints and {COUNT} measured" in said
-    assert f"without a match, left out: P{COUNT}, P0." in said
+    assert f"without a match, ignored: P{COUNT}, P0." in said
 
 
 def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, arm) -> None:
@@ -229,11 +229,11 @@ def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, 
 
 def test_rows_that_were_left_out_are_named(monkeypatch, capsys, tmp_path, arm) -> None:
     for shape, expected in (
-        ("beam lost", "rows without measured values are left out: lost."),
+        ("beam lost", "rows without measured values are ignored: lost."),
         ("footer and means", "is not a row of the table: 'Mean, 1.5,"),
-        ("footer and means", "is not a row of the table: 'End of export' left out."),
+        ("footer and means", "is not a row of the table: 'End of export' ignored."),
         ("header again on every page", "line 7 is not a row of the table: 'Point, J1 [deg],"),
-        ("preamble", "3 lines above the header are left out ('Export of cell 7' ...)."),
+        ("preamble", "3 lines above the header are ignored ('Export of cell 7' ...)."),
         ("Latin-1 with degrees", "read as cp1252: not UTF-8."),
         ("semicolon and decimal comma", "decimal commas: no comma can be a thousands separator."),
     ):
@@ -310,7 +310,7 @@ def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys,
     assert f"joined by the nearest time: {COUNT} rows of {10 * COUNT} with joints and {COUNT} measured" in said
     assert "times differ by 0.003 s at most, +0.003 s on average" in said
     assert "joins the files" in said
-    assert "left out" not in said
+    assert "not used" not in said
     data = ro.load(tmp_path / "cell").problem.data
     np.testing.assert_allclose(np.degrees(data.q), [[float(cell) for cell in row] for row in JOINTS], atol=1e-9)
     assert list(data.label) == [name[0] for name in NAMED]
@@ -321,7 +321,7 @@ def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_pat
     late = [["late", "99000", *POINTS[0]]]
     files[1].write_text(files[1].read_text() + text([], late))
     assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.006") == 0
-    assert "1 measured rows without a match within 0.006 s, left out: late." in capsys.readouterr().out
+    assert "1 measured rows without a match within 0.006 s, ignored: late." in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
@@ -370,7 +370,7 @@ def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, ar
         assert f"joined by Pose = Point Name: {COUNT} rows of {COUNT}" in capsys.readouterr().out
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "row") == 2
     said = capsys.readouterr().err
-    assert f"{COUNT - COUNT % 2} of {COUNT} rows whose Pose is the Point Name of another row" in said
+    assert f"{COUNT - COUNT % 2} of {COUNT} rows whose Pose matches Point Name in another row" in said
     points.write_text(text([["ID", "Point Name", *HEAD[7:]]], [[f"x{row[0]}", *row[1:]] for row in other_order]))
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints]) == 2
     assert "columns 'ID' and 'Point Name' for label" in capsys.readouterr().err

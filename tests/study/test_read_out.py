@@ -50,7 +50,7 @@ def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
 
 def test_replicates_that_did_not_converge_are_counted() -> None:
     found = compared({"a": even(1.0), "b": even(0.5)}, status=UNCONVERGED, reason="")
-    assert "12 replicates did not converge; their figures count (column status)." in found.summary().notes
+    assert "12 replicates did not converge; their results are included (column status)." in found.summary().notes
 
 
 @pytest.mark.parametrize(

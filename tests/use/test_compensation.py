@@ -281,7 +281,7 @@ def test_what_cannot_be_reached_is_named_with_what_is_left() -> None:
             np.sqrt(2 * nearest), abs=3e-4
         )  # the outstretched arm: a flat valley
         assert np.linalg.norm(error(found.q[i])) == pytest.approx(found.position_error[i], abs=1e-10)
-    assert f"Unreachable in the robot's base frame: 1 ({1e3 * found.position_error[0]:.3f} mm left)" in str(found)
+    assert f"Unreachable in the robot's base frame: 1 ({1e3 * found.position_error[0]:.3f} mm off)" in str(found)
 
 
 def base_position(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
@@ -518,7 +518,7 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     above = 2 * found.std + found.position_error > limit
     assert found.missed == [label for label, far in zip(found.label, above, strict=True) if far]
     assert 0 < len(found.missed) < 10
-    assert f"{found.missed[0]} (0.000 mm left, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in str(
+    assert f"{found.missed[0]} (0.000 mm off, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in str(
         found
     )
 
@@ -532,6 +532,6 @@ def test_orientations_have_no_uncertainty_where_they_do_not_count() -> None:
 def test_positions_far_from_the_joint_values_beside_them_are_named() -> None:
     result, q = known(), commands(ARM, 4)
     poses = nominal_poses(result, q)
-    assert "beside them" not in str(ro.use.compensate(result, q, poses))
+    assert "in the same row" not in str(ro.use.compensate(result, q, poses))
     poses[2, :3] += [0.0, 0.0, 0.1]
-    assert "at most 100 mm (row 3)" in str(ro.use.compensate(result, q, poses))
+    assert "by up to 100 mm (row 3)" in str(ro.use.compensate(result, q, poses))

@@ -67,12 +67,12 @@ def test_an_update_says_what_came_out() -> None:
     assert str(wrong).startswith(
         "The robot has not changed, but readings are wrong. With the previous calibration: chi-squared"
     )
-    assert "reading c1: chi-squared falls by 40.0, posterior probability 0.9, left out." in str(wrong)
+    assert "reading c1: chi-squared falls by 40.0, posterior probability 0.9, excluded." in str(wrong)
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
     assert str(moved).startswith("The robot has changed. With the previous calibration: chi-squared")
     assert "These readings do not distinguish this from a change of theta3: measure more." in str(moved)
-    assert "left out" not in str(moved)
+    assert "excluded" not in str(moved)
     sure = replace(moved, causes=(JOINT,))
     assert "do not tell it apart" not in str(sure)
 
@@ -83,7 +83,7 @@ def test_an_update_says_what_came_out() -> None:
         (None, "No single parameter or frame explains it."),
         (Drift(JOINT, 0, True, MOVED), "theta2 +0.0573 deg (standard deviation 0.0057), steadily from"),
         (Drift(JOINT, 0, False, MOVED), "before the first check"),
-        (Drift(JOINT, 3, False, None), "theta2, at once before '4'"),
+        (Drift(JOINT, 3, False, None), "theta2, in one step before '4'"),
     ],
 )
 def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
@@ -208,7 +208,7 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     assert "--register" in ro.use.validate(result, moved).mistake
     # less than the nominal robot's errors, many times the prediction intervals
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.0005, -0.0006, 0.0002])),))
-    assert "displaced together by 0.80" in ro.use.validate(result, moved).mistake
+    assert "displaced as a whole by 0.80" in ro.use.validate(result, moved).mistake
     accepted = ro.calibration.accept(result, ro.data.Requirement(limit=1e-2), moved)
     assert accepted.verdict == "undecided"
     assert "the instrument or the base moved" in str(accepted)

@@ -338,7 +338,7 @@ def test_new_makes_a_tree_chain_by_chain(
     before = Path("cell/problem.toml").read_bytes()
     Path("other.urdf").write_text(two_arms().replace("0.9", "0.8"))
     for options, said in (
-        ([*made[2:], "--chain", "left"], "'left', which is there"),
+        ([*made[2:], "--chain", "left"], "'left', which exists"),
         (made[2:], "nothing is overwritten"),
         ([*made[2:], "--chain", "a.b"], "letters, digits and _"),
         ([*made[2:4], "--chain", "c", *made[4:], "--robot", "other.urdf"], "the same URDF"),

@@ -126,7 +126,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.group_lasso, weight=ro.corner)
     >>> f"{result.weight:.1g}", result.selection.note
-    ('0.7', 'corner of the L-curve by golden sections')
+    ('0.7', 'corner of the L-curve by golden-section search')
     """
     low, high = np.log(weight_grid(program, 2))
     seen: dict[float, Array] = {}
@@ -160,7 +160,7 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
         program.solve(float(np.exp(best)))  # raises what the solver says
     points = np.array([seen[t] for t in order])
     interior = bool(low + 0.1 < best < high - 0.1)
-    note = "corner of the L-curve by golden sections"
+    note = "corner of the L-curve by golden-section search"
     if not interior:
         note = "the search ended at an edge: the L-curve has no corner"
     note += skipped(len(seen) - len(order))

@@ -70,8 +70,8 @@ def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.
     if parts is not None:
         present = [each for each in (np.intersect1d(part, groups) for part in parts) if len(each)]
         if len(present) < 2 or not np.array_equal(np.sort(np.concatenate(present)), groups):
-            found = f"{len(present)} that have {sum(map(len, present))} of {len(groups)} configurations"
-            raise InputError("selector k_fold, parts", found, "two or more, with every configuration in one of them")
+            found = f"{len(present)} parts with {sum(map(len, present))} of {len(groups)} configurations"
+            raise InputError("selector k_fold, parts", found, "two or more, with every configuration in exactly one")
         return _least(program, "k_fold", held_out_error(program, present))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")

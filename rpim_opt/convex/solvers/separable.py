@@ -1,4 +1,4 @@
-"""Proximal Newton for a convex loss that is a sum over residuals or norms: a sequence of squares.
+"""Proximal Newton for a separable convex loss: a sequence of weighted least-squares models.
 
 Around a point the loss has a quadratic model; its minimum with the penalty and the constraints is a small program, and
 a line search on the true loss ends the step. A non-smooth loss is smoothed by convolution with a box, or by

@@ -1,1 +1,1 @@
-"""Types of measurements: one module a type, with everything about it, found by `registry`."""
+"""Measurement types: one self-contained module per type, found by `registry`."""

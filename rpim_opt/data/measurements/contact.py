@@ -40,7 +40,7 @@ revisit_plane = Measurement(
     names=TOUCHED,
     words=Words(
         thing="a tip",
-        thing_at="The tip that touches, a ball's middle,",
+        thing_at="The tip that touches, a ball's centre,",
         noise_of="a good robot, a tight fit",
         wrong="the tip slipped",
         columns={"point": "touched point", "plane": "touched plane"},
@@ -171,7 +171,7 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
             pick(touched, name, where)
         planar = {touched[name].measurement.planar for name in each.between}
         if len(planar) > 1 or (each.measurement is not known_distance and planar == {False}):
-            accepted = "two planes, or for a distance two points"
+            accepted = "two planes, or two points for a distance"
             raise InputError(where, f"between '{each.between[0]}' and '{each.between[1]}'", accepted)
         # the row's joint values are those of a touch of either; it is of one robot, where the two are all touches say
         second = touched[each.between[1]]
@@ -218,6 +218,6 @@ def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool =
     """
     data = Dataset.of(q, np.empty((len(q), 0)), sigma, measurement=revisit_plane if planes else revisit)
     if len(point) != len(data):
-        raise InputError("point", f"{len(point)} names", f"{len(data)}, one a touch")
+        raise InputError("point", f"{len(point)} names", f"{len(data)}, one per touch")
     names = np.array([str(name) for name in point], dtype=object)[:, None]
     return replace(data, blocks=(replace(data.blocks[0], point=names),)).grouped_by_points()

@@ -88,7 +88,7 @@ def from_matrices(y: Array) -> Array:
     wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
     if len(wrong):
         row = int(wrong[0])
-        found = f"a matrix that misses R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
+        found = f"a matrix that violates R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
     return _posed(y, scipy.spatial.transform.Rotation.from_matrix(R))
 

@@ -1,1 +1,1 @@
-"""Tables of measurements: how they are written, what their columns mean, and how they become a dataset."""
+"""Tables of measurements: file formats, meanings of columns, and conversion to a dataset."""

@@ -62,7 +62,7 @@ def together(
         return _stacked(tables)
     if not moving or not seen or len(moving) + len(seen) != len(tables):
         lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
-        found = f"{lost or 'some tables'} with only part of joint and measured values"
+        found = f"{lost or 'some tables'} without joint or measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
     joints, values = _stacked(moving), _stacked(seen)
     return _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
@@ -79,7 +79,7 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
         own = {split_unit(name)[0]: name for name in table.columns if name != "label"}
         lacking = own.keys() ^ wanted.keys()
         if lacking:
-            found = f"{listed(sorted(lacking))} in one of {first.file} and {table.file} alone"
+            found = f"{listed(sorted(lacking))} in only one of {first.file} and {table.file}"
             accepted = "the same columns in all files, or one file of joints and one of values"
             raise InputError("the header", found, accepted)
         for stem, name in wanted.items():
@@ -153,7 +153,7 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Understood:
     lonely = [name for name in chosen.left if name not in set(names)]
     lonely += [name for name in chosen.right if name not in place]
     if lonely:
-        notes.append(f"without a match, left out: {listed(lonely)}.")
+        notes.append(f"without a match, ignored: {listed(lonely)}.")
     whole = _beside(joints, [place[name] for name in names], values, right, names)
     return replace(whole, notes=(*whole.notes, *notes), keys=tuple(chosen.columns))
 
@@ -208,8 +208,8 @@ def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Ke
         wrong = sum(a != b and a in there for a, b in zip(pair.left, pair.right, strict=True))
         if wrong:
             name, other_name = pair.how.split(" = ")
-            found = f"{wrong} of {count} rows whose {name} is the {other_name} of another row"
-            raise InputError("--key row", found, f"no --key, which joins by {pair.how}")
+            found = f"{wrong} of {count} rows whose {name} matches {other_name} in another row"
+            raise InputError("--key row", found, f"no --key, to join by {pair.how}")
     numbers = [str(i) for i in range(1, count + 1)]
     return Key("the number of the row", (), numbers, numbers)
 
@@ -267,7 +267,7 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
     ]
     lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:
-        several = f"{len(lonely)} measured rows without a match within {within:g} s, left out"
+        several = f"{len(lonely)} measured rows without a match within {within:g} s, ignored"
         notes.append(f"{several}: {listed(lonely)}.")
     whole = _beside(joints, left.tolist(), values, right.tolist(), [labels[i] for i in right])
     return replace(whole, notes=(*whole.notes, *notes), keys=clocks)

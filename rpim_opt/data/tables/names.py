@@ -1,4 +1,4 @@
-"""Names of columns that programs and people use: what each can only mean, and why; orientations that are numbered.
+"""Common column names with their unambiguous meaning and reason, and numbered orientation components.
 
 SpatialAnalyzer ``Point Name, X [mm], U(95) X [mm]``; Leica ``Point ID;Std X [mm]``; ROS ``field.name0, field.position0,
 field.pose.orientation.w, /joint_states/elbow_joint/position``; Universal Robots' RTDE ``actual_q_0, target_q_0``; KUKA
@@ -126,7 +126,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
         match = re.fullmatch(pattern, rest)
         if match:
             known = re.sub(r"(?<=[qu])0+(?=\d)", "", match.expand(meaning))
-            return Reading(known, "", "".join(reason) or "a usual name", kind)
+            return Reading(known, "", "".join(reason) or "a known name", kind)
     # u(x) is a standard uncertainty, U(x) an expanded one of unknown coverage factor
     match = re.fullmatch(r"u[\s_(]*([xyzXYZ])\)?", stem.strip())
     if match:

@@ -1,4 +1,4 @@
-"""Tables of measurements become a dataset: the columns that they may have, their numbers in SI, rows and noise."""
+"""Conversion of measurement tables to a dataset: permitted columns, values in SI, rows and noise."""
 
 from __future__ import annotations
 

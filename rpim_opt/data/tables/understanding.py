@@ -78,7 +78,7 @@ class Understood:
     @property
     def left_out(self) -> tuple[str, ...]:
         """Ignored columns."""
-        return tuple(each.column for each in self.meant if each.meaning == "left out")
+        return tuple(each.column for each in self.meant if each.meaning == "not used")
 
 
 def understand(
@@ -177,16 +177,16 @@ def _readings(
     read.update(_counted_coordinates(read))
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
-            raise InputError("the header", f"column '{name}', another point", "a row each, with a column marker")
+            raise InputError("the header", f"column '{name}', another point", "one row per point, with a column marker")
         if name.lower() in TURNED and each.stem in names and not (options.rotation or options.units.get("rx")):
             accepted = (
                 "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "
                 "'intrinsic xyz'; or --measurement position"
             )
-            raise InputError("the header", f"column '{name}', of angles or of a rotation vector", accepted)
+            raise InputError("the header", f"column '{name}', either angles or a rotation vector", accepted)
         wanted = {*options.units, *robot.model.columns}
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
-            read[name] = Reading("", "", "a temperature whose unit is not there")
+            read[name] = Reading("", "", "a temperature without a unit")
     _leave_out(read, targets)
     # of several labels the stated key, or the one that does more than count the rows
     labels = [name for name, each in read.items() if each.stem == "label"]
@@ -231,7 +231,7 @@ def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Seque
     for i, column in named.items():
         called = {str(cell) for cell in table[column]}
         if len(called) > 1:
-            raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint a column")
+            raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint per column")
         (joint,) = called
         place = joints.index(joint) + 1 if joint in joints else 0
         if not joints:
@@ -240,7 +240,7 @@ def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Seque
                 accepted = "a robot from a URDF, which names its joints"
                 raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
         new[f"q{i}"] = f"q{place}" if place else f"another q{i}"
-    _rename(read, new, "the joint that its column of names names")
+    _rename(read, new, "the joint named in its name column")
 
 
 def _rename(read: Readings, new: Mapping[str, str], why: str) -> None:
@@ -254,7 +254,7 @@ def _count_from_one(read: Readings, dof: int) -> None:
     """Count the joints from 1, where they are counted from 0."""
     if any(reading.stem == "q0" for reading in read.values()):
         new = {f"{stem}{i}": f"{stem}{i + 1}" for i in range(dof) for stem in ("q", "tau")}
-        _rename(read, new, "{}, counted from 0")
+        _rename(read, new, "{}, numbered from 0")
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
@@ -263,7 +263,7 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     Coordinates that are known with theirs, ``POS_ACT.X``, may be the controller's: beside others they are asked for.
     """
     known = [name for name, each in read.items() if each.stem in wanted]
-    direct = dict.fromkeys(known, Reading("", "", "another column is of the instrument"))
+    direct = dict.fromkeys(known, Reading("", "", "another column is the instrument's"))
     bare = any(len(split(name)[0]) == 1 or INSTRUMENT.search(name) for name in known)
     if known and (bare or wanted != COORDINATES):
         return {}
@@ -283,7 +283,7 @@ def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], sta
     if stated in whole:
         whole = {stated: whole[stated]}
     if len(whole) > 1:
-        raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix with the one that was measured")
+        raise InputError("the header", f"columns of {', '.join(whole)}", "--prefix of the measured robot")
     return direct | next(iter(whole.values())) if whole else {}
 
 
@@ -318,7 +318,7 @@ def _counted(read: Readings, robot: Robot) -> Readings:
     wanted = {(str(i), dimension) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
     words = _by_word(read, r"(\D+?)_?([1-9]\d?)", lambda each: each.unit != "")
     whole = [
-        {name: read[name]._replace(stem=f"q{i}", why=f"'{word}' counted from 1, in units of joints")
+        {name: read[name]._replace(stem=f"q{i}", why=f"'{word}' numbered from 1, in joint units")
          for i, name in names.items()}
         for word, names in words.items()
         if wanted <= {(i, dimension_of(read[name].unit)) for i, name in names.items()}
@@ -334,7 +334,7 @@ def _counted_coordinates(read: Readings) -> Readings:
     triples = [names for names in words.values() if sorted(names) in (list("123"), list("012"))]
     if len(triples) != 1:
         return {}
-    why = "the only three columns that are counted, beside the joints"
+    why = "the only three numbered columns besides the joints"
     names = [triples[0][number] for number in sorted(triples[0])]
     return {name: read[name]._replace(stem=axis, why=why) for name, axis in zip(names, "xyz", strict=True)}
 
@@ -351,7 +351,7 @@ def _leave_out(read: Readings, targets: bool) -> None:
         if each.kind == "derived":
             why = "computed from others"
         elif not each.kind and each.stem in by_instrument and not INSTRUMENT.search(name):
-            why = "another column is of the instrument"
+            why = "another column is the instrument's"
         elif name == "X_Value" and letters == COORDINATES:
             why = "LabVIEW's time"
         elif targets:
@@ -389,14 +389,14 @@ def _under_our_names(
     for name, cells in table.items():
         reading = read[name]
         if reading.stem not in known and reading.stem not in text_columns(kind):
-            meant.append(Meant(name, "left out", "", "", reading.why or "not used by this measurement type"))
+            meant.append(Meant(name, "not used", "", "", reading.why or "not used by this measurement type"))
             continue
         dimensions = [dimension for dimension in known.get(reading.stem, []) if dimension]
         if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
             dimensions = ["length"]
         unit, why = _unit(name, reading, dimensions, units)
         if unit and dimension_of(unit) not in dimensions:
-            accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units stand in the row below their names"
+            accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units are in the row below the names"
             raise InputError("the header", f"column '{name}' ({meaning(reading.stem)}) in {unit}", accepted)
         if unit in FOREIGN:
             ours, size = FOREIGN[unit]
@@ -415,7 +415,7 @@ def _under_our_names(
     if unitless:
         examples = {"angle": "deg", "length": "mm", "torque": "Nm", "mass": "kg"}
         missing = ",".join(examples.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
-        accepted = f"--units with theirs, such as {missing}, or names that carry one, such as q1_deg and x_mm"
+        accepted = f"--units, such as {missing}, or names with a unit, such as q1_deg and x_mm"
         raise InputError("the header", f"columns without a unit ({', '.join(unitless)})", accepted)
     return columns, meant
 
@@ -477,7 +477,7 @@ def _rows_with_values(
             some = []
         for rows, which in ((none, f"without {what} values"), (some, f"that lack one of their {what} values")):
             if rows:
-                notes.append(f"rows {which} are left out: {listed([str(labels[i]) for i in rows])}.")
+                notes.append(f"rows {which} are ignored: {listed([str(labels[i]) for i in rows])}.")
             out.update(rows)
     usable = [i for i in range(count) if i not in out]
     if columns and not usable:
@@ -486,7 +486,7 @@ def _rows_with_values(
     own = [str(cell).strip() for cell in whole.get("label", ())]
     both = [f"{label}/{marker}" for label, marker in zip(own, whole.get("marker", ()), strict=False)]
     if both and not _unique(own) and _unique(both):
-        notes.append("labels are those of point and reflector.")
+        notes.append("labels combine point and reflector.")
         whole = {"configuration": own, **whole, "label": both}
     elif not _unique(own):
         again = next((label for label in own if own.count(label) > 1), "")

@@ -161,7 +161,7 @@ def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
         size = b33 - b13**2 / b11 - b23**2 / b22
         squares = np.array([size / b11, size / b22])
     if s[3] <= 1e-9 * s[0] or not (np.isfinite(squares).all() and (squares > 0).all()):
-        raise InputError("the camera", "views that tell no focal length", accepted)
+        raise InputError("the camera", "views that do not determine the focal length", accepted)
     scale = unit[0, 0]
     fx, fy = np.sqrt(squares) / scale
     cx, cy = (np.array([-b13 / b11, -b23 / b22]) - unit[:2, 2]) / scale
@@ -197,7 +197,7 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
                         placed_views.append((int(view[0]), view_pose(points[view], xy[view])))
             if not placed_views:
                 accepted = f"views of {FEWEST[planar]} points or more"
-                raise InputError("the camera", "no view that shows a pose", accepted)
+                raise InputError("the camera", "no view that determines a pose", accepted)
             index = np.array([i for i, _ in placed_views])
             T = np.array([there for _, there in placed_views])
             focus = float(np.sqrt(camera["fx"] * camera["fy"]))

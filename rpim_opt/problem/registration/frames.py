@@ -182,7 +182,7 @@ def problem_from(
         robot = robot.robot
     joints = {block.q.shape[-1] for block in data.blocks}
     if joints - {robot.joint_map.shape[1]}:
-        found = f"{', '.join(map(str, sorted(joints)))} joint values a row"
+        found = f"{', '.join(map(str, sorted(joints)))} joint values per row"
         raise InputError("the data", found, f"{robot.joint_map.shape[1]}, those of '{robot.name}'")
     start = np.zeros(6) if tool is None else _frame(tool, "tool")
     placed = None if isinstance(base, str) and base == "auto" else _frame(base, "base")

@@ -104,7 +104,7 @@ class JointMapping:
         text = (
             f"Joint mapping estimated from the data: {described(self.joint_types, self.sign, self.zero)} "
             f"({three_digits(1e3 * self.left)} mm instead of {three_digits(1e3 * self.nominal)} mm; "
-            f"{self.starts} random starts: an optimum that one start in {round(1 / RARE_BASIN)} reaches is missed "
+            f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
         return " ".join([text, *self._said(self.alternatives)])
@@ -133,7 +133,7 @@ class JointMapping:
                 continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
             sentences.append(
-                f"{what} fits as well, and predicts {three_digits(1e3 * other.apart)} mm at other "
+                f"{what} fits as well, and differs by {three_digits(1e3 * other.apart)} mm at other "
                 f"configurations: measure at ({values}) to decide."
             )
         return tuple(sentences)

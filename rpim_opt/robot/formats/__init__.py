@@ -1,1 +1,1 @@
-"""Files that describe robots, one module a format."""
+"""Robot file formats, one module per format."""

@@ -124,7 +124,7 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     dof = len(table.joint)
     coupling = np.eye(dof).tolist() if table.coupling is None else table.coupling
     if len(coupling) != dof or {len(row) for row in coupling} - {len(coupling[0])} or not 0 < len(coupling[0]) <= dof:
-        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers, or fewer alike")
+        raise InputError("key coupling", f"{coupling}", f"{dof} rows of {dof} numbers, or all of fewer")
     limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
     for number, pair in enumerate(limits, start=1):
         if len(pair) != 2 or not pair[0] < pair[1]:
@@ -181,7 +181,7 @@ def read_robot(path: str | Path) -> Robot:
     if ending == ".csv":
         described = read_sheet(path)
         if described.tool.any() or described.base.any():
-            raise InputError("the table", "a link behind the last joint", "a script's read_arm, or rpim-opt new")
+            raise InputError("the table", "a link after the last joint", "a script's read_arm, or rpim-opt new")
         return described.robot
     content = read_json(path) if ending == ".json" else read_toml(path)
     if not isinstance(content, dict):
@@ -223,7 +223,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
             "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "
             "or a column convention with one of the words"
         )
-        raise InputError("the convention of the table", " and ".join(sorted(known)) or "no word of it", accepted)
+        raise InputError("the convention of the table", " and ".join(sorted(known)) or "not stated", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
     if known == {"modified"}:
@@ -304,7 +304,7 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     """
     table = without_beta(robot).mdh
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):
-        raise InputError("robot", "signs or couplings of joints", "joints that count as RoboDK's", robot.name)
+        raise InputError("robot", "signs or couplings of joints", "joints with RoboDK's signs", robot.name)
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
     far = [f"d{i} = {1e3 * d:.0f} mm" for i, d in enumerate(table[:, 3], start=1) if abs(d) > FAR]
     numbers = table[:, :4] / [si for _, si in units.values()]
@@ -314,8 +314,8 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
         return []
     lost = 1e3 * np.radians(1e-4) * np.abs(table[:, 3]).max()
     return [
-        f"Nearly parallel axes have their common normal far away ({', '.join(far)}): transfer all digits, for angles "
-        f"rounded to 0.0001 degrees miss by {lost:.2g} mm, or use a format that has beta (--mdh, --urdf)."
+        f"Nearly parallel axes have their common normal far away ({', '.join(far)}): transfer all digits (angles "
+        f"rounded to 0.0001 degrees cause {lost:.2g} mm of error), or use a format that has beta (--mdh, --urdf)."
     ]
 
 

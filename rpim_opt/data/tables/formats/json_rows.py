@@ -21,7 +21,7 @@ def read(text: str) -> Rows:
         else:
             content = parse_json(text)
     except ValueError as error:
-        raise InputError("the JSON text", str(error), "a whole JSON file, or an object a line") from None
+        raise InputError("the JSON text", str(error), "a complete JSON file, or one object per line") from None
     return _rows(content)
 
 
@@ -50,7 +50,7 @@ def _rows(found: Any) -> Rows:
         else:
             found = inner[0] if len(inner) == 1 else [found]
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
-        raise InputError("the text", "an array of other things", "an array of objects, one a row")
+        raise InputError("the text", "an array of other things", "an array of objects, one per row")
     return [dict(_flat("", row)) for row in found]
 
 

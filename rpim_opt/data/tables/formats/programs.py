@@ -110,7 +110,7 @@ def read_yaskawa(text: str) -> Rows:
     """Return the points; refuse encoder pulses, which need the robot's gear ratios."""
     kind = re.search(r"///POSTYPE\s+(\w+)", text)
     if kind is None or kind[1] == "PULSE":
-        raise InputError("the positions", "pulses of encoders", "///POSTYPE ANGLE or BASE: export the job so")
+        raise InputError("the positions", "encoder pulses", "a job that was exported with ///POSTYPE ANGLE or BASE")
     points = YASKAWA.findall(text)
     if kind[1] == "ANGLE":
         return _rows([(name, _joints(cells)) for name, cells in points])

@@ -60,7 +60,7 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
             rows = format.read(text) if format else ()
         if not rows and (format or ending not in TEXTS):
             names = " or ".join(each.name for each in fitting)
-            raise InputError("the file", "neither targets nor rows", f"{names} with some", path)
+            raise InputError("the file", "neither targets nor rows", f"{names} with at least one", path)
     if format is None:
         return read_table(path, options)
     names = dict.fromkeys(name for row in rows for name in row)
