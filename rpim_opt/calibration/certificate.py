@@ -1,4 +1,7 @@
-"""Optimality certificate of a solution, computed from the user's functions and the model, independently of the loop."""
+"""Optimality certificate of a solution: the user's functions are called and the model is linearized anew.
+
+Of data in blocks the linearization is the loop's.
+"""
 
 from __future__ import annotations
 

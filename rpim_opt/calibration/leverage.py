@@ -14,7 +14,7 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.covariance import coverage_factor
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.convex.robust_loss import Squares
+from rpim_opt.convex.robust_loss import QuadraticModel
 from rpim_opt.data.record import CONFIDENCE
 from rpim_opt.problem.blocks import in_parts
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
@@ -106,7 +106,7 @@ def influence(result: Outcome) -> Influence:
     squares = (model.A @ result.z - model.b) ** 2
     formulation = result.formulation
     if not result.squared_loss:  # squares with the weights that the loss ended with
-        model, _ = Squares(formulation.loss, formulation.name, formulation.loss_over)(model, result.z)
+        model, _ = QuadraticModel(formulation.loss, formulation.name, formulation.loss_over)(model, result.z)
     A, b = model.triangle[:, :-1], model.triangle[:, -1]
     L, c = np.zeros((0, len(free))), np.zeros(0)
     form = result.program.penalty_form

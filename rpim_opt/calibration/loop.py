@@ -15,7 +15,7 @@ from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.calibration.weight_choice import WeightChoice, weight_choice
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
-from rpim_opt.convex.robust_loss import Squares, inliers_of
+from rpim_opt.convex.robust_loss import QuadraticModel, inliers_of
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.structure import in_blocks
 from rpim_opt.problem.blocks import Source, in_parts
@@ -141,7 +141,7 @@ class Loop:
 
     source: Source
     formulation: Formulation
-    reweigh: Squares | None = None
+    reweigh: QuadraticModel | None = None
     options: Options = field(default_factory=Options)
     about: tuple[Array | None, Array | None] = (None, None)
 

@@ -30,8 +30,8 @@ class Formulation(Brief):
 
         minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
 
-    The functions may hold variables and parameters of their own, and read whatever they like: they are asked anew at
-    every calibration, and once in it.
+    The functions may hold variables and parameters of their own, and read whatever they like: every calibration calls
+    them anew, once for its iterations and once for its certificate (of data in blocks once a block and iteration).
 
     Parameters
     ----------

@@ -20,9 +20,9 @@ from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
-from rpim_opt.convex.solvers.conic import Damping, Point, Squares, Unsolved, box_sides, nearest
+from rpim_opt.convex.solvers.conic import Damping, Point, ReducedSquares, Unsolved, box_sides, nearest
 from rpim_opt.convex.solvers.separable import Rows
-from rpim_opt.convex.solvers.solve import Warm, minimum
+from rpim_opt.convex.solvers.solve import WarmStart, minimum
 from rpim_opt.convex.structure import Structure, structure
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
@@ -109,7 +109,7 @@ class Program(Brief):
     formulation: Formulation
     model: LinearModel
     structure: Structure
-    _warm: Warm  # shared with all programs that `on` makes of this
+    _warm: WarmStart  # shared with all programs that `on` makes of this
     _values: dict[Any, tuple[float, float]] = field(default_factory=dict, init=False)  # loops ask for a point again
 
     def __reduce__(self) -> Any:
@@ -135,7 +135,7 @@ class Program(Brief):
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""
         if self._warm.squares is None:
-            self._warm.squares = Warm(self.structure.on_squares())
+            self._warm.squares = WarmStart(self.structure.on_squares())
         warm = self._warm.squares
         return Program(warm.structure.formulation, model, warm.structure, warm)
 
@@ -213,9 +213,9 @@ class Program(Brief):
         return Rows(A, b, sizes, self.model.triangle)
 
     @property
-    def _squares(self) -> Squares | None:
+    def _squares(self) -> ReducedSquares | None:
         """A quadratic loss, reduced to n + 1 rows."""
-        return None if self.loss_form is None else Squares.of_factor(self.squared.triangle)
+        return None if self.loss_form is None else ReducedSquares.of_factor(self.squared.triangle)
 
     # --- values --------------------------------------------------------------------------------------------------
 
@@ -581,4 +581,4 @@ def pose(
     """
     formulation = formulation_of(formulation)
     made = structure(formulation, model, forms)
-    return Program(formulation, model, made, Warm(made))
+    return Program(formulation, model, made, WarmStart(made))

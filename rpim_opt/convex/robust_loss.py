@@ -113,7 +113,7 @@ def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: 
 
 
 @dataclass(frozen=True)
-class Squares:
+class QuadraticModel:
     """Replaces a loss that is a sum over rows by squares, some equations at a time: a `Reweigh` for blocks.
 
     With r_i the residual of a configuration (or of an equation) at z, v = |r_i|, u = r_i / v and w = loss'(v) / (2 v),
@@ -134,7 +134,7 @@ class Squares:
     over: str
     before: Array | None = None
 
-    def after(self, z: Array) -> Squares:
+    def after(self, z: Array) -> QuadraticModel:
         """Return the squares for the pass after one at z (n,)."""
         return replace(self, before=z)
 

@@ -36,7 +36,7 @@ from rpim_opt.convex.expressions import (
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.given import given
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
-from rpim_opt.convex.robust_loss import Squares, separable
+from rpim_opt.convex.robust_loss import QuadraticModel, separable
 from rpim_opt.convex.solvers.conic import Canonical
 from rpim_opt.convex.solvers.separable import Loss
 from rpim_opt.problem.linear import LinearModel
@@ -455,7 +455,7 @@ def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formula
     return replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
 
 
-def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, Squares | None]:
+def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, QuadraticModel | None]:
     """Return the formulation by which blocks of rows are solved, and what makes its squares of their equations.
 
     A loss that sees only the length of the residual needs nothing; ``equations`` counts them. InputError for a loss
@@ -467,5 +467,5 @@ def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[F
     accepted = "a squared loss, or a sum over configurations or equations (robust)"
     if not separable(formulation.loss, formulation.loss_over):
         raise InputError(where, "a loss that is not a sum, with data in blocks", accepted)
-    squares = Squares(formulation.loss, formulation.name, formulation.loss_over)
+    squares = QuadraticModel(formulation.loss, formulation.name, formulation.loss_over)
     return replace(formulation, loss=SQUARES, loss_over="equation"), squares

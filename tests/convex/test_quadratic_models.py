@@ -11,7 +11,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.convex.expressions import SQUARES
-from rpim_opt.convex.robust_loss import Squares, separable
+from rpim_opt.convex.robust_loss import QuadraticModel, separable
 from rpim_opt.convex.structure import in_blocks
 from tests.convex.test_formulation import model
 
@@ -31,7 +31,7 @@ def stated(name: str) -> ro.Formulation:
     return ro.Formulation(name, loss=loss, penalty=cp.sum_squares, loss_over=over)
 
 
-def of_squares(squares: Squares, at: np.ndarray) -> Any:
+def of_squares(squares: QuadraticModel, at: np.ndarray) -> Any:
     made, offset = squares(MODEL, at)
     return lambda z: float(np.sum((made.A @ z - made.b) ** 2)) + offset
 
@@ -46,7 +46,7 @@ def slopes(function: Any, z: np.ndarray) -> np.ndarray:
 def test_squares_have_value_and_slope_of_the_loss(name: str, before: np.ndarray | None) -> None:
     loss, over = LOSSES[name]
     program = ro.convex.pose(stated(name), MODEL)
-    squares = Squares(loss, name, over, before)
+    squares = QuadraticModel(loss, name, over, before)
     value = of_squares(squares, Z)
     want = program.value(Z)[0]
     assert value(Z) == pytest.approx(want, rel=1e-10)
@@ -58,7 +58,7 @@ def test_squares_have_value_and_slope_of_the_loss(name: str, before: np.ndarray 
 def test_the_first_squares_lie_nowhere_below_the_loss(name: str) -> None:
     loss, over = LOSSES[name]
     program = ro.convex.pose(stated(name), MODEL)
-    value = of_squares(Squares(loss, name, over), Z)
+    value = of_squares(QuadraticModel(loss, name, over), Z)
     for z in np.random.default_rng(6).normal(size=(50, 12)) * np.geomspace(0.01, 10, 50)[:, None]:
         assert value(Z + z) >= program.value(Z + z)[0] * (1 - 1e-9)
 
@@ -67,7 +67,7 @@ def test_the_first_squares_lie_nowhere_below_the_loss(name: str) -> None:
 def test_steps_are_short_beside_residuals_of_any_size(size: float) -> None:
     """Of sum v^4 as below, all residuals times a number."""
     model = MODEL.scaled(np.full(len(MODEL.b), size))
-    made, _ = Squares(lambda v: cp.sum(cp.power(v, 4)), "quartic", "equation").after(Z + 1e-6)(model, Z)
+    made, _ = QuadraticModel(lambda v: cp.sum(cp.power(v, 4)), "quartic", "equation").after(Z + 1e-6)(model, Z)
     r = model.A @ Z - model.b
     expected = (model.A.T * 6 * r**2) @ model.A
     assert pytest.approx(expected, rel=2e-3, abs=1e-6 * np.abs(expected).max()) == made.A.T @ made.A
@@ -75,11 +75,11 @@ def test_steps_are_short_beside_residuals_of_any_size(size: float) -> None:
 
 def test_with_short_steps_squares_have_the_curvature_of_the_loss() -> None:
     """Of sum v^4 over residuals: 12 v^2 along each, so that half the Hessian is A' diag(6 v^2) A."""
-    quartic = Squares(lambda v: cp.sum(cp.power(v, 4)), "quartic", "equation").after(Z + 1e-6)
+    quartic = QuadraticModel(lambda v: cp.sum(cp.power(v, 4)), "quartic", "equation").after(Z + 1e-6)
     made, _ = quartic(MODEL, Z)
     r = MODEL.A @ Z - MODEL.b
     assert pytest.approx((MODEL.A.T * 6 * r**2) @ MODEL.A, rel=2e-3) == made.A.T @ made.A
-    whole = Squares(lambda v: cp.sum(cp.power(v, 4)), "quartic", "configuration").after(Z + 1e-6)
+    whole = QuadraticModel(lambda v: cp.sum(cp.power(v, 4)), "quartic", "configuration").after(Z + 1e-6)
     made, _ = whole(MODEL, Z)
     hessian = np.zeros((12, 12))
     for g in np.unique(MODEL.group):  # of |r|^4: 4 |r|^2 + 8 r r', half of it
@@ -92,7 +92,7 @@ def test_where_a_loss_is_straight_along_residuals_squares_are_almost_flat() -> N
     """Beyond Huber's threshold, with a short step: a thousandth of the curvature across, which is slope / (2 v)."""
     far = MODEL.with_values(MODEL.b + 1e3)
     r = far.A @ Z - far.b
-    made, _ = Squares(ro.huber(1.0), "huber", "equation").after(Z + 1e-6)(far, Z)
+    made, _ = QuadraticModel(ro.huber(1.0), "huber", "equation").after(Z + 1e-6)(far, Z)
     across = 1.0 / np.abs(r)
     assert np.abs(np.sum(made.A**2, axis=1) / np.sum(far.A**2, axis=1)) == pytest.approx(1e-3 * across, rel=1e-6)
 
@@ -102,7 +102,7 @@ def test_a_loss_with_a_kink_expects_residuals_that_moved_far_to_end_there() -> N
     r = MODEL.A @ Z - MODEL.b
     direction = np.linalg.lstsq(MODEL.A, r)[0]
     moved = MODEL.A @ direction
-    made, _ = Squares(cp.norm1, "absolute", "equation").after(Z - direction)(MODEL, Z)
+    made, _ = QuadraticModel(cp.norm1, "absolute", "equation").after(Z - direction)(MODEL, Z)
     curvature = np.sum(made.A**2, axis=1) / np.sum(MODEL.A**2, axis=1)
     across = 0.5 / np.abs(r)
     far = np.abs(moved) > 0.3 * np.abs(r)
@@ -127,7 +127,7 @@ def test_what_is_a_sum_over_residuals() -> None:
 def test_what_triangles_cannot_hold_is_refused() -> None:
     with pytest.raises(ro.InputError, match="found a loss that is not a sum, with data in blocks"):
         in_blocks(ro.minimax, lambda: 120)
-    squares = Squares(cp.norm1, "bent", "equation")
+    squares = QuadraticModel(cp.norm1, "bent", "equation")
     flat: Any = SimpleNamespace(slope=lambda v: None)
     with pytest.raises(ro.InputError, match="formulation 'bent': found a loss without gradient"):
         squares.slope(flat, np.ones(3))

@@ -13,7 +13,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics import threads
 from rpim_opt.calibration import words
-from rpim_opt.convex.robust_loss import Squares, inliers_of
+from rpim_opt.convex.robust_loss import QuadraticModel, inliers_of
 from rpim_opt.problem import blocks as parts_module
 from rpim_opt.problem.blocks import PartitionedProblem, in_parts, whole_configurations
 
@@ -145,7 +145,7 @@ def test_squares_have_the_value_and_slope_of_the_loss(over: str, before: bool) -
     rng = np.random.default_rng(1)
     z = 0.05 * rng.normal(size=len(free))
     formulation = ro.Formulation("own", loss=ro.huber(3.0), penalty=cp.sum_squares, loss_over=over)
-    squares = Squares(formulation.loss, "own", over, z + 0.01 * rng.normal(size=len(z)) if before else None)
+    squares = QuadraticModel(formulation.loss, "own", over, z + 0.01 * rng.normal(size=len(z)) if before else None)
     rows = problem.linearize(free.scale * z)
     model = problem.linearize(free.scale * z, squares)
     program = ro.convex.pose(formulation, rows)

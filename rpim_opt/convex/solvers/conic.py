@@ -287,7 +287,7 @@ class Damping(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Squares:
+class ReducedSquares:
     """|R z - y|^2 + g'z with R (n + 1, n), y (n + 1,), g (n,); R'R is never formed, whose condition is squared."""
 
     R: Array
@@ -295,23 +295,23 @@ class Squares:
     g: Array
 
     @classmethod
-    def of_rows(cls, A: Array, b: Array, g: Array | None = None) -> Squares:
+    def of_rows(cls, A: Array, b: Array, g: Array | None = None) -> ReducedSquares:
         """Return the squares of rows (m, n) and (m,), reduced by QR."""
         n = A.shape[1]
         T = np.linalg.qr(np.column_stack([A, b]), mode="r")
         return cls.of_factor(np.vstack([T, np.zeros((n + 1 - len(T), n + 1))]), g)
 
     @classmethod
-    def of_factor(cls, T: Array, g: Array | None = None) -> Squares:
+    def of_factor(cls, T: Array, g: Array | None = None) -> ReducedSquares:
         """Return the squares of a QR factor (n + 1, n + 1) of [A b]."""
         return cls(T[:, :-1], T[:, -1], np.zeros(len(T) - 1) if g is None else g)
 
-    def damped(self, damping: Damping | None) -> Squares:
+    def damped(self, damping: Damping | None) -> ReducedSquares:
         """Return the squares with damping added."""
         if damping is None:
             return self
         R = np.vstack([self.R, np.diag(damping.size)])
-        return Squares.of_rows(R, np.concatenate([self.y, damping.size * damping.centre]), self.g)
+        return ReducedSquares.of_rows(R, np.concatenate([self.y, damping.size * damping.centre]), self.g)
 
 
 @dataclass(frozen=True, eq=False)
@@ -324,7 +324,7 @@ class Point:
     rest: Array | None = None
 
 
-class Small:
+class ReducedProgram:
     """minimize |R z - y|^2 + g'z + loss(A z - b) + weight * penalty(z) subject to constraints(z).
 
     R has ``rows`` rows; ``loss`` is the form of rows that are taken as they are; ``sizes`` (N,) counts the equations
@@ -336,7 +336,7 @@ class Small:
         self.face = np.zeros(0, dtype=int)
         self.near = np.zeros(penalty.size)
 
-    def solve(self, squares: Squares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
+    def solve(self, squares: ReducedSquares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
         p = self.penalty
         if self.loss is not None or not p.polyhedral:
@@ -352,7 +352,7 @@ class Small:
 
     # --- active set --------------------------------------------------------------------------------------------------
 
-    def _on_faces(self, squares: Squares, weight: float, face: np.ndarray, near: Array) -> Point | None:
+    def _on_faces(self, squares: ReducedSquares, weight: float, face: np.ndarray, near: Array) -> Point | None:
         """Return the minimum by a primal-dual active set; None where the sets of active rows cycle."""
         p = self.penalty
         A = p.dense[0]
@@ -387,11 +387,13 @@ class Small:
     # --- Clarabel ----------------------------------------------------------------------------------------------------
 
     @cached_property
-    def data(self) -> _Data:
+    def data(self) -> _ConicData:
         """Clarabel's data and solver."""
-        return _Data(self.penalty, self.rows, self.loss, self.sizes)
+        return _ConicData(self.penalty, self.rows, self.loss, self.sizes)
 
-    def _by_cones(self, squares: Squares, weight: float, A: Array | None, b: Array | None) -> tuple[Point, Array]:
+    def _by_cones(
+        self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
+    ) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
         data, p, k, n = self.data, self.penalty, self.rows, len(self.penalty.at)
         # tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
@@ -424,7 +426,7 @@ class Small:
         return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :]), s[own]
 
 
-class _Data:
+class _ConicData:
     """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
 
     Rows: R z - s = y, those of the penalty and of the loss, and what the loss gets: v = A z - b, or for norms
@@ -544,7 +546,7 @@ def by_triangle(T: Array, b: Array, transposed: bool = False) -> Array:
 
 
 def on_face(
-    squares: Squares, weight: float, p: Canonical, active: np.ndarray, near: Array
+    squares: ReducedSquares, weight: float, p: Canonical, active: np.ndarray, near: Array
 ) -> tuple[Array, Array] | None:
     """Return the minimum (N,) next to ``near`` where some rows are equations A x = b, and their multipliers, or None.
 

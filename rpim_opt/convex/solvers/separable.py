@@ -18,7 +18,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.expressions import cp
-from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, Small, Squares, Unsolved
+from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, ReducedProgram, ReducedSquares, Unsolved
 
 DECREASE = 1e-12
 """Newton ends where its model promises less, relative to the objective."""
@@ -79,9 +79,9 @@ class Rows:
         return np.concatenate([[0], np.cumsum(self.sizes)[:-1]])
 
     @cached_property
-    def squares(self) -> Squares:
+    def squares(self) -> ReducedSquares:
         """|A z - b|^2, reduced."""
-        return Squares.of_factor(self.triangle)
+        return ReducedSquares.of_factor(self.triangle)
 
     @cached_property
     def whitened(self) -> tuple[Array, Array]:
@@ -101,13 +101,15 @@ class Rows:
         """Return the argument of the loss for a residual (m,): the residual, or the norms of configurations (N,)."""
         return r if self.sizes is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
-    def alone(self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int) -> tuple[Small, Array, Array]:
+    def alone(
+        self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int
+    ) -> tuple[ReducedProgram, Array, Array]:
         """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
         sizes = None if self.sizes is None else self.sizes[which]
         places = which
         if self.sizes is not None:
             places = np.concatenate([np.arange(int(self.sizes[i])) + self.starts[i] for i in which])
-        return Small(penalty, squares, loss.some(which), sizes), self.A[places], self.b[places]
+        return ReducedProgram(penalty, squares, loss.some(which), sizes), self.A[places], self.b[places]
 
 
 @dataclass(eq=False)
@@ -121,7 +123,7 @@ class Newton:
     loss: Loss
     rows: Rows
     penalty: Canonical
-    small: Small
+    small: ReducedProgram
     weight: float
     damping: Damping | None
     kink: float
@@ -179,14 +181,14 @@ class Newton:
     def _value(self, z: Array, x: Array) -> float:
         return self._total(self._residual(z)) + self._others(z, x)
 
-    def _solved(self, z: Array, gradient: Array, H: Array, small: Small | None = None, *exact: Array) -> Point:
+    def _solved(self, z: Array, gradient: Array, H: Array, small: ReducedProgram | None = None, *exact: Array) -> Point:
         """Return the minimum of the quadratic model around z (n,), with the penalty and the constraints."""
         T = self.rows.whitened[1]
         n = T.shape[1]
         ridge = PROXIMAL * np.trace(H) + np.finfo(float).tiny
         L = np.linalg.cholesky(H + ridge * np.eye(len(H)))
         R = np.vstack([np.sqrt(0.5) * L.T @ T, np.zeros((n + 1 - len(T), n))])
-        squares = Squares(R, R @ z, T.T @ gradient).damped(self.damping)
+        squares = ReducedSquares(R, R @ z, T.T @ gradient).damped(self.damping)
         self.steps += 1
         return (small or self.small).solve(squares, self.weight, *exact)
 

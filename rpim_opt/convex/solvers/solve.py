@@ -10,7 +10,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.solvers.conic import EQUILIBRATED, Canonical, Damping, Point, Small, Squares, Unsolved
+from rpim_opt.convex.solvers.conic import (
+    EQUILIBRATED,
+    Canonical,
+    Damping,
+    Point,
+    ReducedProgram,
+    ReducedSquares,
+    Unsolved,
+)
 from rpim_opt.convex.solvers.separable import FEW_ENTRIES, TINY, Loss, Newton, OutsideDomain, Rows
 
 if TYPE_CHECKING:
@@ -25,7 +33,7 @@ GAP = 1e-8
 
 
 @dataclass(eq=False)
-class Warm:
+class WarmStart:
     """Warm start of the next solution: point, smoothing width, sizes of working sets, Clarabel's data."""
 
     structure: Structure
@@ -33,9 +41,9 @@ class Warm:
     x: Array | None = None
     width: float = 0.0
     count: int = 0
-    small: dict[Any, Small] = field(default_factory=dict)
+    small: dict[Any, ReducedProgram] = field(default_factory=dict)
     kink: float = -1.0
-    squares: Warm | None = None
+    squares: WarmStart | None = None
     lock: Any = field(default_factory=threading.RLock)
 
     @property
@@ -43,31 +51,31 @@ class Warm:
         """Penalty and constraints in canonical form."""
         return self.structure.canonical
 
-    def program(self, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None) -> Small:
+    def program(self, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None) -> ReducedProgram:
         """Return the small program with so many rows of squares, and with all rows of a loss."""
         key = rows, loss is None
         if key not in self.small:
-            self.small[key] = Small(self.penalty, rows, loss, sizes)
+            self.small[key] = ReducedProgram(self.penalty, rows, loss, sizes)
         return self.small[key]
 
-    def begin(self, z: Array | None) -> Warm:
+    def begin(self, z: Array | None) -> WarmStart:
         """Forget all but z (n,), where the next minimum is looked for, or that too."""
         with self.lock:
             self.z = self.x = z if z is not None and len(self.penalty.at) == self.penalty.size else None
             self.width, self.count, self.small = 0.0, 0, {}
         return self
 
-    def begun(self, z: Array | None) -> Warm:
+    def begun(self, z: Array | None) -> WarmStart:
         """Return another one, to begin at z (n,) or anew."""
-        return Warm(self.structure, kink=self.kink).begin(z)
+        return WarmStart(self.structure, kink=self.kink).begin(z)
 
 
 def minimum(
     loss: Loss | None,
     rows: Rows,
-    warm: Warm,
+    warm: WarmStart,
     weight: float,
-    squares: Squares | None = None,
+    squares: ReducedSquares | None = None,
     damping: Damping | None = None,
     accuracy: float = 0.0,
 ) -> Point:
@@ -83,7 +91,8 @@ def minimum(
     ========================== =====================================================
 
     A quadratic loss is None, with ``squares`` in its place. ``accuracy`` is the part of the loss that a sum over rows
-    may be above its minimum. Unsolved where no minimum is found.
+    may be above its minimum. Unsolved where no minimum is found, also by a small program of proximal Newton: then CVXPY
+    solves all rows (`Program.solve`).
     """
     with warm.lock:
         n = rows.A.shape[1]
@@ -100,7 +109,9 @@ def minimum(
         return point
 
 
-def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None, accuracy: float) -> Point:
+def _by_newton(
+    loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None, accuracy: float
+) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
     # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too, or
     # begin with an unknown active set
@@ -131,19 +142,19 @@ def _by_newton(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Dampi
 # --- losses that are no sums over entries ----------------------------------------------------------------------
 
 
-def _alone(n: int, damping: Damping | None) -> Squares:
+def _alone(n: int, damping: Damping | None) -> ReducedSquares:
     """Return the quadratic terms beside a loss that is taken as it is: the damping, or none."""
-    return Squares(np.zeros((0, n)), np.zeros(0), np.zeros(n)).damped(damping)
+    return ReducedSquares(np.zeros((0, n)), np.zeros(0), np.zeros(n)).damped(damping)
 
 
-def _all_rows(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None) -> Point:
+def _all_rows(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     """Return the minimum with all rows of the loss in Clarabel."""
     terms = _alone(rows.A.shape[1], damping)
     whole = warm.program(len(terms.y), loss.canonical, rows.sizes if loss.positive else None)
     return whole.solve(terms, weight, rows.A, rows.b)
 
 
-def _coupled(loss: Loss, rows: Rows, warm: Warm, weight: float, damping: Damping | None) -> Point:
+def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     """Return the minimum of a loss with a threshold (a maximum, CVaR, the sum of the largest) by some of its entries.
 
     Those near a kink are taken as they are and all others by their tangents, which bounds the loss from below; those
