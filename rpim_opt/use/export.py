@@ -144,7 +144,10 @@ def export_files(
         bound = accept(result, region).bound
         if bound is not None:
             what = f"Expanded uncertainty of the position reached with this geometry (U, {percent(region.confidence)})"
-            notes.append(f"{what}: at most {1e3 * bound:.3f} mm; region: {region.where}.")
+            notes.append(
+                f"{what}: at most {1e3 * bound:.3f} mm, of the reflector; region: {region.where}. Another point of the "
+                "flange and its orientation may be known less: `compensate --tool` states their uncertainty."
+            )
     if requirement is not None:
         verdict = accept(whole)
         notes.append(

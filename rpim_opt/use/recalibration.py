@@ -371,7 +371,7 @@ class Misfit:
         self.e = y - self.Q @ (self.Q.T @ y)
         squares = float(self.e @ self.e)
         # as many degrees of freedom as there are readings, less those that parameters without a prior take
-        taken = 0 if reset is None else int(np.linalg.matrix_rank(self.A[:, reset]))
+        taken = 0 if reset is None or not reset.any() else int(np.linalg.matrix_rank(self.A[:, reset]))
         freedom = max(self.m - taken, 1)
         self.fit = Fit(squares, freedom, self._p_value(squares, freedom))
 
