@@ -427,7 +427,10 @@ class Outcome:
         groups = np.array([number[flag.label] for flag in flags])
         p = problem.parameters
         width = (default_widths(p) / p.scale)[p.identified]
-        weight = self.penalty_weight / self._squares[1]
+        try:
+            weight = self.penalty_weight / self._squares[1]
+        except InputError:  # a loss with own variables has no quadratic model by which a row could be contradicted
+            return flags
         sure = contradicted(model, self.program.penalty_form, weight, width, groups)
         return tuple(flag for flag, certain in zip(flags, sure, strict=True) if certain)
 

@@ -6,6 +6,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -155,3 +156,11 @@ def test_a_noise_in_another_unit_is_not_delivered() -> None:
     verdict = ro.calibrate(wrong).verdict
     assert not verdict.delivered
     assert "in another unit" in str(verdict)
+
+
+def test_a_loss_with_own_variables_is_judged_where_rows_are_flagged() -> None:
+    slack = cp.Variable(nonneg=True)
+    priced = ro.Formulation("priced", lambda v: cp.sum_squares(v) + 500 * slack, cp.sum_squares)
+    result = ro.calibrate(ro.load("blunders").problem, priced, 1.0)
+    assert result.flagged
+    assert "Outliers: " in str(result)
