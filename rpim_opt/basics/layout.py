@@ -350,16 +350,7 @@ def _columns(
     rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], options: TableOptions
 ) -> tuple[dict[str, list[str]], dict[str, str], str]:
     """Return the columns, those of numbers with decimal points, their groups, and the decimal mark that they had."""
-    width = len(heads)
-    for number, row in enumerate(rows, start=1):  # blank cells at the end may be missing or too many
-        while len(row) > width and not row[-1]:
-            row.pop()
-        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
-        if len(row) != width and not lacks_remark:
-            what = "--columns" if options.columns else "the header"
-            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
-            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
-        row += [""] * (width - len(row))
+    _fill(rows, len(heads), options)
     columns: dict[str, list[str]] = {}
     groups: dict[str, str] = {}
     for j, (name, group) in enumerate(heads):
@@ -382,6 +373,19 @@ def _columns(
     for name, cells in numeric.items():
         columns[name] = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
     return columns, groups, mark
+
+
+def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
+    """Give every row as many cells as the header; blank ones at the end may be missing or too many."""
+    for number, row in enumerate(rows, start=1):
+        while len(row) > width and not row[-1]:
+            row.pop()
+        lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
+        if len(row) != width and not lacks_remark:
+            what = "--columns" if options.columns else "the header"
+            hint = "" if len(row) < width else "; decimal commas between commas need quotes"
+            raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
+        row += [""] * (width - len(row))
 
 
 def _is_numeric(cells: Sequence[str]) -> bool:
@@ -484,12 +488,7 @@ def _one_row_each(table: RawTable) -> RawTable:
         return table
     others = {name: [str(cell) for cell in cells] for name, cells in table.columns.items()}
     letters = [cell.lower() for cell in others.pop(axis)]
-    for name, cells in others.items():  # cells that all name their row's coordinate, P1.X
-        named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell.strip(), re.IGNORECASE)
-                 for cell, letter in zip(cells, letters, strict=True)]  # fmt: skip
-        without = [match[1] for match in named if match]
-        if len(without) == len(letters):
-            others[name] = without
+    others = {name: _without_letters(cells, letters) for name, cells in others.items()}
     points = _points(letters, others.values())
     if not points:
         accepted = "a column naming the point; x, y, z once each"
@@ -512,6 +511,17 @@ def _one_row_each(table: RawTable) -> RawTable:
         columns[_with_unit(letter, split(value)[1])] = cells
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
+
+
+def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
+    """Return cells that all name their row's coordinate, P1.X, without it; others as they are."""
+    names = []
+    for cell, letter in zip(cells, letters, strict=True):
+        named = re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell.strip(), re.IGNORECASE)
+        if named is None:
+            return cells
+        names.append(named[1])
+    return names
 
 
 def _points(letters: Sequence[str], keys: Iterable[Sequence[str]]) -> list[dict[str, int]]:

@@ -17,6 +17,8 @@ from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, 
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.problem.registration.closed_forms import register, transformed
 
@@ -115,15 +117,13 @@ def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
     turn = Rotation.from_matrix(motion[:3, :3])
     blocks = []
     for block in data.blocks:
-        columns = list(block.measurement.columns)
-        y, covariance = block.y.copy(), block.covariance
-        if columns[:3] == ["x", "y", "z"]:
-            y[:, :3] = transformed(motion, y[:, :3])
-            parts = np.kron(np.eye(covariance.shape[-1] // 3), motion[:3, :3])
-            covariance = parts @ covariance @ parts.T
-        if columns[3:] == ["qw", "qx", "qy", "qz"]:
-            y[:, 3:] = (turn * Rotation.from_quat(y[:, [4, 5, 6, 3]])).as_quat()[:, [3, 0, 1, 2]]
-        blocks.append(replace(block, y=y, covariance=covariance))
+        if block.measurement.name in (position.name, pose.name):
+            places = block.y[:, :3]
+            moves = np.hstack([transformed(motion, places) - places, np.tile(turn.as_rotvec(), (len(places), 1))])
+            parts = np.kron(np.eye(block.covariance.shape[-1] // 3), motion[:3, :3])
+            moved = block.measurement.plus(block.y, moves[:, : len(block.measurement.components)])
+            block = replace(block, y=moved, covariance=parts @ block.covariance @ parts.T)
+        blocks.append(block)
     centre = measured.mean(axis=0)
     shift = 1e3 * np.linalg.norm(transformed(motion, centre) - centre)
     text = f"displaced as a whole by {shift:.3g} mm and {np.degrees(turn.magnitude()):.3g} degrees"

@@ -245,7 +245,7 @@ def ending(ended: Ended, most: int) -> str:
 
 
 def _displaced_frames(stated: Source, registered: Source) -> list[str]:
-    """Say how far stated frames are from their registration; nothing of those at the origin, which nobody stated."""
+    """Say how far stated frames are from their registration; one at the origin was not stated."""
     p, q = stated.parameters, registered.parameters
     far = []
     for prefix in (name[:-1] for name in p.names if name.endswith("_x") and f"{name[:-1]}z" in p.names):

@@ -136,7 +136,7 @@ def kept_rows(result: Outcome) -> np.ndarray:
     return ~np.isin(result.problem.labels, list(labels))
 
 
-def residual_sizes(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, float]]:
+def residual_rms(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, float]]:
     """Return the RMS residual [SI] of rows, kept (N,), and its ratio to the stated noise, by dimension."""
     errors = {each: np.where(kept, result.errors(dimension=each), np.nan) for each in UNITS}
     return {each: (rms(error), noise_ratio(result.problem, error, each)) for each, error in errors.items()}
@@ -209,11 +209,11 @@ def worse_sentence(nominal: Array, identified: Array) -> str:
 
 def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     """Say that residuals are beyond what instrument and robot make of them; of a camera in pixels and at the arm."""
-    sizes = residual_sizes(result, kept)
-    size = sizes["length"][0]
-    ratio = max(sizes["length"][1], sizes["pixel"][1])
+    residuals = residual_rms(result, kept)
+    size = residuals["length"][0]
+    ratio = max(residuals["length"][1], residuals["pixel"][1])
     share = size / arm_length(result.problem)
-    for each, ratio_of in sizes.values():
+    for each, ratio_of in residuals.values():
         if each > COMPUTED_RMS and 0 < ratio_of < OVERSTATED:  # 0 where the dimension was not measured
             yield f"Residuals are {ratio_of:.2g} times the stated noise: it is in another unit, or far too large."
     if ratio > NOISY and share > REACH:
@@ -221,7 +221,7 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
             f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the stated noise and "
             f"{100 * share:.2g} % of the arm's length; a robot's own errors stay below {100 * REACH:g} %."
         )
-    size, ratio = sizes["angle"]
+    size, ratio = residuals["angle"]
     if ratio > NOISY and size > ANGULAR:
         yield (
             f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the stated noise; a "
@@ -347,9 +347,9 @@ def likely_causes(result: Outcome) -> list[str]:
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     kept = kept_rows(result)
-    sizes = residual_sizes(result, kept)
+    residuals = residual_rms(result, kept)
     signs = []
-    for dimension, (size, ratio) in sizes.items():
+    for dimension, (size, ratio) in residuals.items():
         unit, si = UNITS[dimension]
         if ratio > NOISY:
             signs.append(f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the stated noise")
@@ -381,7 +381,7 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = [*diagnosis.rows_without_values(problem), *diagnosis.exchanged_rows(problem)]
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
-    if max(ratio for _, ratio in sizes.values()) > HOPELESS:
+    if max(ratio for _, ratio in residuals.values()) > HOPELESS:
         return [*head, NOTHING]
     return []
 

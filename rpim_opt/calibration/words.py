@@ -17,6 +17,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
 from rpim_opt.calibration.verdict import Verdict, rms
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.robot.extensions import EXPECTED
@@ -115,7 +116,7 @@ def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
 def sentences(result: Outcome, verdict: Verdict) -> list[str]:
     """Return the sentences below the table: errors, reasons of the verdict, weight, noise and remarks."""
     errors = "No errors: the rows have neither lengths nor angles nor pixels."
-    for dimension, unit, si in (("length", "mm", 1e-3), ("angle", "mrad", 1e-3), ("pixel", "px", 1.0)):
+    for dimension, (unit, si) in UNITS.items():
         before, after = result.nominal_errors(dimension=dimension), result.errors(dimension=dimension)
         if np.isfinite(after).any():
             means = f"{np.nanmean(before) / si:.4f} {unit} before, {np.nanmean(after) / si:.4f} {unit} after"
@@ -232,8 +233,8 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         if ratio[i] > UNUSUAL:
             cause = ": an assembly or joint-zero error" if is_joint_offset(names[i]) else ""
             unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
-    sizes = {**_scales(learned), **_noise(learned), **_conditions(learned, names, z)}
-    lines = [f"{what}: {joined(parts)}." for what, parts in sizes.items() if parts]
+    estimates = {**_scales(learned), **_noise(learned), **_conditions(learned, names, z)}
+    lines = [f"{what}: {joined(parts)}." for what, parts in estimates.items() if parts]
     lines += [*_model_lines(learned), *unusual]
     if learned.left_out:
         excluded = [str(row) for row in learned.left_out]

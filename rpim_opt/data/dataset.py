@@ -328,22 +328,7 @@ class Dataset(Tabled):
             raise InputError("q and y", f"shapes {joints.shape} and {y.shape}", accepted)
         k = len(measurement.components)
         rows = np.arange(N)
-        covariance = np.array(sigma, dtype=float)
-        by_row = covariance.shape in ((N,), (N, k)) and covariance.shape not in ((k,), (k, k))
-        positive = (covariance.ndim > 1 and not by_row) or bool((covariance > 0).all())
-        if by_row:
-            covariance = covariance.reshape(N, 1, -1) ** 2 * np.eye(k)
-        elif covariance.shape in ((), (k,)):
-            covariance = covariance**2 * np.eye(k)
-        if covariance.ndim == 2:
-            covariance = covariance[None]
-        if not positive or covariance.shape[1:] != (k, k) or len(covariance) not in (1, N):
-            found = f"{sigma}" if covariance.size == 1 or not positive else f"shape {np.shape(sigma)}"
-            accepted = (
-                f"a standard deviation above zero, ({k},) of them for the components, ({N},) or ({N}, {k}) for the "
-                f"rows, or covariances ({k}, {k}) or ({N}, {k}, {k})"
-            )
-            raise InputError("sigma", found, accepted)
+        covariance = _covariances(sigma, N, k)
         block = Block(
             measurement,
             q,
@@ -373,6 +358,27 @@ class Dataset(Tabled):
         joined = np.full(int(whole.configuration.max()) + 1, len(whole))
         np.minimum.at(joined, whole.configuration, first[stop])
         return replace(whole, configuration=joined[whole.configuration])
+
+
+def _covariances(sigma: float | Array, N: int, k: int) -> Array:
+    """Return covariances (1 or N, k, k) [SI] from them or from standard deviations, as `Dataset.of` takes both."""
+    values = np.array(sigma, dtype=float)
+    shape = values.shape
+    accepted = (
+        f"a standard deviation above zero, ({k},) of them for the components, ({N},) or ({N}, {k}) for the rows, or "
+        f"covariances ({k}, {k}) or ({N}, {k}, {k})"
+    )
+    if shape in ((), (k,)):
+        deviations = values.reshape(1, 1, -1)
+    elif shape in ((k, k), (1, k, k), (N, k, k)):
+        return values.reshape(-1, k, k)
+    elif shape in ((N,), (N, k)):
+        deviations = values.reshape(N, 1, -1)
+    else:
+        raise InputError("sigma", f"shape {shape}", accepted)
+    if not (deviations > 0).all():
+        raise InputError("sigma", f"{sigma}", accepted)
+    return deviations**2 * np.eye(k)
 
 
 def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | None:

@@ -42,7 +42,7 @@ REACHED = 1e-7  # A target counts as reached when no more than this is left [m, 
 EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
-NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations that nobody measured, so that a reading has a covariance
+NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK = 2000
 TRIALS = 12
 """Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""

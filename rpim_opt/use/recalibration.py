@@ -356,9 +356,7 @@ class Misfit:
         chi^2 = e' e        it falls by  g' G^-1 g,    g = D' e,    G = D' M D
     """
 
-    def __init__(
-        self, result: Calibration, model: LinearModel, prior: Quadratic, reset: np.ndarray | None = None
-    ) -> None:
+    def __init__(self, result: Calibration, model: LinearModel, prior: Quadratic, reset: Sequence[int] = ()) -> None:
         sigma = np.sqrt(result.variance_factor)
         self.freedom = max(result.freedom, 1.0)
         self.m = len(model.b)
@@ -371,7 +369,7 @@ class Misfit:
         self.e = y - self.Q @ (self.Q.T @ y)
         squares = float(self.e @ self.e)
         # as many degrees of freedom as there are readings, less those that parameters without a prior take
-        taken = 0 if reset is None or not reset.any() else int(np.linalg.matrix_rank(self.A[:, reset]))
+        taken = int(np.linalg.matrix_rank(self.A[:, list(reset)])) if len(reset) else 0
         freedom = max(self.m - taken, 1)
         self.fit = Fit(squares, freedom, self._p_value(squares, freedom))
 
@@ -417,7 +415,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
     model = updated.program.model
     free = updated.problem.parameters.free
     prior = updated.program.penalty_form or identity(len(updated.x))
-    misfit = Misfit(result, model, prior, np.isin(free.names, released))
+    misfit = Misfit(result, model, prior, [free.names.index(name) for name in released])
     width = _widths(result, updated.problem) / free.scale
     causes: list[Cause] = []
     logs: list[float] = []

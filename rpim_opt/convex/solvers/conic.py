@@ -341,18 +341,18 @@ class ReducedProgram:
         p = self.penalty
         if self.loss is not None or not p.polyhedral:
             return self._by_cones(squares, weight, A, b)[0]
-        exact = self._on_faces(squares, weight, self.face, self.near)
+        exact = self._by_active_set(squares, weight, self.face, self.near)
         if exact is not None:
             return exact
         point, slack = self._by_cones(squares, weight, A, b)
         active = np.arange(p.zero, p.linear)
         face = active[(point.dual > slack)[active]]
-        exact = self._on_faces(squares, weight, face, point.x)
+        exact = self._by_active_set(squares, weight, face, point.x)
         return point if exact is None else replace(exact, iterations=point.iterations)
 
     # --- active set --------------------------------------------------------------------------------------------------
 
-    def _on_faces(self, squares: ReducedSquares, weight: float, face: np.ndarray, near: Array) -> Point | None:
+    def _by_active_set(self, squares: ReducedSquares, weight: float, face: np.ndarray, near: Array) -> Point | None:
         """Return the minimum by a primal-dual active set; None where the sets of active rows cycle."""
         p = self.penalty
         A = p.dense[0]

@@ -188,14 +188,18 @@ def _readings(
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
             read[name] = Reading("", "", "a temperature without a unit")
     _leave_out(read, targets)
-    # of several labels the stated key, or the one that does more than count the rows
+    _choose_label(read, table, options.key)
+    return read, rotation
+
+
+def _choose_label(read: Readings, table: Columns, key: str) -> None:
+    """Of several labels keep the stated key, or the one that does more than count the rows."""
     labels = [name for name, each in read.items() if each.stem == "label"]
     count = [str(i) for i in range(1, len(next(iter(table.values()), ())) + 1)]
-    keys = [name for name in labels if name.lower() == options.key.lower()]
+    keys = [name for name in labels if name.lower() == key.lower()]
     chosen = keys or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
     if len(labels) > 1 and len(chosen) == 1:
         read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
-    return read, rotation
 
 
 def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
