@@ -547,8 +547,11 @@ def export(
         File, Option(help="calibration.conf copied from a Universal Robot's controller; corrected file to --out.")
     ] = None,
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
-    mdh: Annotated[File, Option(help="MDH table to write: .csv, .json or .toml.")] = None,
-    robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint.")] = None,
+    mdh: Annotated[File, Option(help="DH table to write: .csv, .json or .toml; convention as --dh says.")] = None,
+    dh: Annotated[
+        str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")
+    ] = "modified",
+    robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint (modified DH).")] = None,
     corrections: Annotated[File, Option(help="CSV file for transmission errors, to subtract from commands.")] = None,
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
@@ -569,7 +572,7 @@ def export(
 
         written, notes = export_files(
             loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, camera_info=camera_info,
-            mdh=mdh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
+            mdh=mdh, dh=dh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
             tip_measured=tip_measured, marker=marker, despite_verdict=despite_verdict,
         )  # fmt: skip
     return Answer("\n".join(notes), {"notes": notes}, written=written)

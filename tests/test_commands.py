@@ -27,6 +27,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.understanding import understand
 from rpim_opt.robot.kinematics import frame_numbers, numeric_frame, numeric_link
+from rpim_opt.robot.library import read_arm
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.use.validation import validate
 from tests import SHARED
@@ -448,6 +449,22 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     assert "a robot identified from this file's nominal parameters" in capsys.readouterr().err
     assert not (tmp_path / "again.json").exists()
     assert not (tmp_path / "both").exists()
+
+
+def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch, capsys, made, tmp_path) -> None:
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
+    robot = ro.load_result(made / "results").robot
+    assert robot.mdh[:-1, 4].any()  # near parallel axes, which standard and modified tables tilt differently
+    for convention in ("standard", "modified"):
+        path = tmp_path / f"{convention}.csv"
+        assert run(monkeypatch, "export", str(made / "results"), "--mdh", str(path), "--dh", convention) == 0
+        assert f"{path.name}: {convention} DH" in capsys.readouterr().out
+        read = read_arm(path)
+        base = numeric_link(*robot.mdh[0, :2]) if convention == "standard" else np.eye(4)
+        found = base @ numeric_frame(read.base) @ ro.robot.forward_kinematics(read.robot, q) @ numeric_frame(read.tool)
+        assert np.abs(found - ro.robot.forward_kinematics(robot, q)).max() < 1e-12
+    assert run(monkeypatch, "export", str(made / "results"), "--mdh", str(tmp_path / "a.toml"), "--dh", "paul") == 2
+    assert "modified" in capsys.readouterr().err
 
 
 def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:

@@ -183,6 +183,26 @@ def without_beta(robot: Robot) -> Robot:
     return result
 
 
+def standard_table(robot: Robot) -> Array:
+    """Return the numbers (n, 5) of the same arm in the standard convention, from axis 1 to the same last frame.
+
+    They are those of Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta), in the columns of `MDH`: where
+    no axes need beta, alpha and a one row earlier; else the modified table of the inverse chain, last joint first.
+    """
+    table = robot.mdh.copy()
+    table[:, :2] = np.vstack([robot.mdh[1:, :2], np.zeros(2)])
+    if table[:-1, 4].any():
+        links = [numeric_link(theta=row[2], d=row[3]) @ numeric_link(beta=row[4]) for row in robot.mdh]
+        steps = [link @ numeric_link(*row[:2]) for link, row in zip(links, robot.mdh[1:], strict=False)]
+        near = -table[::-1]
+        near[0] = 0.0  # the last link is what follows the chain
+        inverse = Chain.about_z([np.eye(4), *np.linalg.inv(steps[::-1])], np.eye(4))
+        found = -describe(inverse, near)[0][::-1]
+        table[:-1] = np.column_stack([found[:-1, :2], found[:-1, 2:4], found[1:, 4]])
+        table[-1, 2:4] += found[-1, 2:4]
+    return table + 0.0
+
+
 def _to_axis(axis: Array) -> Array:
     """Return the smallest turn (4, 4) that takes z to a unit vector."""
     v = np.cross([0.0, 0.0, 1.0], axis)

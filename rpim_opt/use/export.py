@@ -30,12 +30,19 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
-from rpim_opt.robot.formats.tables import write_robodk, write_robot
+from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 
+CONVENTION = {
+    "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
+    "standard convention (Paul) write a .csv with --dh standard",
+    "standard": "standard DH (Paul, Hayati), Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta), from "
+    "axis 1 to the flange frame of [tool] and --tool: a and alpha of the last row are 0",
+}
+"""What is said of a table in a convention."""
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
 
@@ -79,6 +86,7 @@ def export_files(
     ur_calibration: Path | None = None,
     camera_info: Path | None = None,
     mdh: Path | None = None,
+    dh: str = "modified",
     robodk: Path | None = None,
     corrections: Path | None = None,
     marker: str | None = None,
@@ -91,8 +99,8 @@ def export_files(
 
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS) and ``ur_calibration`` (``calibration.conf``) of a
     Universal Robot and ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to
-    ``out``, of several a folder. ``mdh`` (.csv, .json, .toml), ``robodk`` (.csv, four numbers a joint) and
-    ``corrections`` are files to write, the last one the transmission errors of the whole model: ``joint``,
+    ``out``, of several a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`),
+    ``robodk`` (.csv, four numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors of the whole model: ``joint``,
     ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``. A joint stands at its angle plus the correction:
     subtract it from a command. Without transmission errors the other files are written, and a note says so. ``marker``
     is the reflector, ``frames`` are ``root``, ``tip`` and ``tip_measured`` of `export_urdf`; with ``despite_verdict`` a
@@ -127,7 +135,7 @@ def export_files(
             raise InputError("--out", f"the original, {source}", "another file: the original is not overwritten")
         writers.append((target, partial(write, source)))
     plain = [
-        (mdh, lambda target: write_robot(identified(result, marker).robot, target)),
+        (mdh, partial(_write_table, result, marker, dh)),
         (robodk, lambda target: write_robodk(identified(result, marker).robot, target)),
         (corrections, partial(_write_joint_corrections, whole)),
     ]
@@ -190,6 +198,12 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         f"without it, with {left:.3f} mm RMS on the {where} rows ({whole:.3f} mm with the whole model)."
     )
     return alone, [sentence]
+
+
+def _write_table(result: Calibration, marker: str | None, dh: str, target: Path) -> list[str]:
+    """Write a DH table; say in which convention."""
+    write_robot(identified(result, marker).robot, target, dh)
+    return [f"{target.name}: {CONVENTION[CONVENTIONS[dh.lower()]]}."]
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:

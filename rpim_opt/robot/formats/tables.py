@@ -13,13 +13,13 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, of_file
+from rpim_opt.basics.exceptions import InputError, of_file, pick
 from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
 from rpim_opt.basics.layout import read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import UNITS, accepted_units, display, split
-from rpim_opt.robot.chain import Chain, Described, describe, without_beta
+from rpim_opt.robot.chain import Chain, Described, describe, standard_table, without_beta
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
@@ -94,6 +94,7 @@ class _JointTable(Table):
 class _RobotTable(Table):
     name: str
     source: str = ""
+    convention: Literal["modified"] = "modified"
     joint: list[_JointTable] = Field(min_length=1)
     coupling: list[list[Annotated[float, Field(strict=False)]]] | None = None
     mounting: Mounting | None = None
@@ -235,6 +236,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
 
 def _from_standard(robot: Robot) -> Described:
     """Return the arm of numbers in the standard convention, with Hayati's beta behind every link."""
+    robot = replace(robot, source="converted from a DH table in the standard convention (Paul)")
     alpha, a, theta, d, beta = robot.mdh.T
     shifted = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
     if not beta.any():  # the same numbers, alpha and a one row further
@@ -267,21 +269,28 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
 
 
 @of_file
-def write_robot(robot: Robot, path: str | Path) -> None:
+def write_robot(robot: Robot, path: str | Path, convention: str = "modified") -> None:
     """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_robot` gives back exactly the same numbers.
 
-    Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere.
+    Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere. ``convention`` is
+    stated in the file; ``"standard"`` (or another word for it) writes a CSV from axis 1 to the same last frame: without
+    alpha1 and a1, which place axis 1 in the base, and with zeros for a and alpha of the last row, which are the tool's.
 
     The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV, which
     has no place for them, a coupling of joints, a mounting other than on the floor, and a payload.
     """
     path = Path(path)
     ending = _ending(path)
+    convention = pick(CONVENTIONS, convention.lower(), "--dh")
+    if convention == "standard":
+        if ending != ".csv":
+            raise InputError("--dh", "standard", "a name ending in .csv: robot.toml and its JSON are modified", path)
+        robot = replace(robot, mdh=standard_table(robot), gravity=replace(robot.gravity, masses=(), centres=()))
     content = _content(robot)
     if ending == ".json":
         write_json(path, content)
     elif ending == ".csv":
-        write_text(path, _csv(content, _in_si(robot)))
+        write_text(path, _csv(content, _in_si(robot), convention))
     else:
         joints = content.pop("joint")
         payload = content.pop("payload", None)
@@ -327,6 +336,7 @@ def _content(robot: Robot) -> dict[str, Any]:
     content: dict[str, Any] = {"name": robot.name}
     if robot.source:
         content["source"] = robot.source
+    content["convention"] = "modified"
     if not plain:
         content["coupling"] = robot.joint_map.tolist()
     gravity = robot.gravity
@@ -389,7 +399,7 @@ def toml(value: Any) -> str:
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
 
 
-def _csv(content: dict[str, Any], in_si: bool) -> str:
+def _csv(content: dict[str, Any], in_si: bool, convention: str) -> str:
     for key, what in WITHOUT_COLUMN.items():
         if key in content:
             raise InputError("robot", what, "a name ending in .toml or .json")
@@ -403,4 +413,4 @@ def _csv(content: dict[str, Any], in_si: bool) -> str:
     if any("sign" in row for row in rows):
         rows = [{"sign": 1} | row for row in rows]
     header += sorted({key for row in rows for key in row} - set(header))
-    return csv_text([*header, "convention"], ([*(row.get(key, "") for key in header), "modified"] for row in rows))
+    return csv_text([*header, "convention"], ([*(row.get(key, "") for key in header), convention] for row in rows))
