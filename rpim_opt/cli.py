@@ -202,7 +202,7 @@ class Tables(NamedTuple):
 
 
 TABLES = Tables()
-CODES = {"accepted": 0, "rejected": 1, "undecided": 4}
+CODES = {"accepted": 0, "rejected": 1, "inconclusive": 4}
 """Exit codes of an acceptance test."""
 CODELESS = ("new", "iso9283", "study", "robots")  # commands that read no folder of a calibration, which may name code
 
@@ -349,7 +349,8 @@ def calibrate(
 ) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if the test is inconclusive.
+    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if that is inconclusive: something
+    is missing for the test, or the uncertainty exceeds the error of the nominal robot.
     """
     with console.progress() as say:
         from rpim_opt.report.summary import describe, summary
@@ -379,7 +380,10 @@ def calibrate(
             f"Refitted without {', '.join(without)}." if without else "No flagged row to drop: nothing was refitted."
         )
         text = f"{refitted}\n\n{text}"
-    code = CODES[(document["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
+    verdict = "inconclusive" if document["inconclusive"] else "accepted"
+    if document["acceptance"]:
+        verdict = document["acceptance"]["verdict"]
+    code = CODES[verdict] if result.verdict.delivered else 1
     return Answer(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
 
@@ -565,17 +569,19 @@ def export(
 ) -> Answer:
     """Export the identified robot to files of other tools; all requested files are written, or none.
 
-    Exit code 1 if the robot is not delivered.
+    Exit code 1 if the robot is not delivered, or rejected by its acceptance test, and nothing is written; 4 if that is
+    inconclusive, which files and output say.
     """
     with _loaded(result) as (loaded, _):
         from rpim_opt.use.export import export_files
 
-        written, notes = export_files(
+        exported = export_files(
             loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, camera_info=camera_info,
             mdh=mdh, dh=dh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
             tip_measured=tip_measured, marker=marker, despite_verdict=despite_verdict,
         )  # fmt: skip
-    return Answer("\n".join(notes), {"notes": notes}, written=written)
+    code = CODES["inconclusive" if exported.inconclusive else "accepted"]
+    return Answer("\n".join(exported.notes), {"notes": exported.notes}, code, exported.files)
 
 
 @command

@@ -16,19 +16,19 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
-from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, judged
+from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, headline_errors, judged, of_positions
 from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty
-from rpim_opt.calibration.verdict import refuse_misread
+from rpim_opt.calibration.verdict import refuse_misread, rms
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 
-Verdict = Literal["accepted", "rejected", "undecided"]
+Verdict = Literal["accepted", "rejected", "inconclusive"]
 MOST = 3
 """Joints or rows that a reason names."""
 STATED = 1e9
@@ -39,6 +39,8 @@ STEPS = (0.1, 0.05, 0.025, 0.0125)
 """How far beside, in parts of the joint ranges."""
 LEAST = 1e-9
 """Width of the range of a joint that never moved [rad or m]."""
+ANYWHERE = Requirement(limit=1.0)
+"""The region of a result without requirement: joints within the measured ranges."""
 
 
 # --- the region, and bounds in it -------------------------------------------------------------------------------------
@@ -176,6 +178,31 @@ def distance_quantile(covariance: Array, freedom: float, probability: float) -> 
     return quantile
 
 
+def measured_workspace(result: Calibration) -> Workspace | None:
+    """Return the workspace of a result's own region; None for several robots, and without finite uncertainty."""
+    requirement = result.record.requirement or ANYWHERE
+    try:
+        region = region_of(result, requirement)
+        sampled = workspace(result, requirement, region, region.drawn())
+    except InputError:
+        return None
+    return sampled if np.isfinite(sampled.expanded).all() else None
+
+
+def inconclusive(result: Calibration, found: Workspace | None) -> str:
+    """Return a warning if U exceeds the error of the nominal robot; otherwise an empty text."""
+    name, errors, _ = headline_errors(result)
+    nominal = rms(errors)
+    if found is None or not of_positions(result) or not found.typical > nominal:
+        return ""
+    return (
+        f"Inconclusive: the median U over the region, {1e3 * found.typical:.3f} mm, is above the error of the "
+        f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. Measure more configurations (rpim-opt design "
+        "--augment), with larger wrist rotations, or state what is known of the reflector ([prior] known = "
+        '["tool_x = 95 +- 0.5 mm", ...]).'
+    )
+
+
 # --- the verdict ------------------------------------------------------------------------------------------------------
 
 
@@ -185,7 +212,7 @@ class Acceptance:
 
     The verdict is ``"accepted"`` where at every configuration of the region the bound is within the limit, and held-out
     rows bear it out; ``"rejected"`` where they miss oftener than chance allows, or the robot's repeatability at its
-    least is above the limit; ``"undecided"`` where something is lacking. ``reasons`` say why, a sentence each; empty
+    least is above the limit; ``"inconclusive"`` where something is lacking. ``reasons`` say why, a sentence each; empty
     where it is accepted.
 
     ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
@@ -214,9 +241,11 @@ class Acceptance:
     def sentences(self) -> list[str]:
         """Return the verdict and its grounds, sentence by sentence."""
         requirement = self.requirement
-        verdict = {"accepted": "Accepted", "rejected": "Rejected", "undecided": "Inconclusive"}[self.verdict]
         limit = f"limit {1e3 * requirement.limit:g} mm with {percent(requirement.confidence)} confidence"
-        lines = [f"{verdict}: {limit} at every configuration of the region.", f"Region: {requirement.where}."]
+        lines = [
+            f"{self.verdict.capitalize()}: {limit} at every configuration of the region.",
+            f"Region: {requirement.where}.",
+        ]
         workspace = self.workspace
         if workspace is not None and np.isfinite(workspace.largest):
             lines.append(
@@ -292,7 +321,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
         reasons = (*against, *lacking, f"No bound: {error}")
-        return Acceptance(requirement, "rejected" if against else "undecided", reasons, held_out=held_out)
+        return Acceptance(requirement, "rejected" if against else "inconclusive", reasons, held_out=held_out)
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
@@ -318,7 +347,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         )
     verdict: Verdict = "accepted"
     if against or lacking:
-        verdict = "rejected" if against else "undecided"
+        verdict = "rejected" if against else "inconclusive"
     return Acceptance(requirement, verdict, tuple(against or lacking), mapped, repeatability, held_out)
 
 

@@ -171,3 +171,30 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
         left_out = (*result.learned.left_out, *refitted.learned.left_out)
         refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))
     return replace(refitted, record=record)
+
+
+def sets(result: Calibration) -> dict[str, Dataset]:
+    """Return the data sets by name, validation first if present."""
+    data = {"identification": result.problem.data}
+    if result.record.validation is None:
+        return data
+    return {"validation": result.record.validation, **data}
+
+
+def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
+    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified.
+
+    Of held-out rows those count that the final fit does not exclude as outliers.
+    """
+    held = result.record.held_out
+    if held is not None:
+        kept = ~np.isin(held.label, excluded_by_fit(result))
+        return "held out", held.nominal[kept], held.error[kept]
+    name, data = next(iter(sets(result).items()))
+    return name, result.nominal_errors(data), result.errors(data)
+
+
+def of_positions(result: Calibration) -> bool:
+    """Whether positions were measured in all sets, with or without orientations."""
+    kinds = {block.measurement.name for data in sets(result).values() for block in data.blocks}
+    return kinds <= {"position", "pose"}

@@ -18,7 +18,8 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
-from rpim_opt.calibration.acceptance import Acceptance, Workspace
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, inconclusive, measured_workspace
+from rpim_opt.calibration.held_out import headline_errors
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -86,7 +87,7 @@ def page(result: Calibration) -> str:
         warnings = [" ".join(composition), *warnings]
         composition = []
     accepted = summary.acceptance(result)
-    workspace = summary.workspace(result) if accepted is None else accepted.workspace
+    workspace = measured_workspace(result) if accepted is None else accepted.workspace
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     content = Content(result, accepted, workspace, composition)
@@ -114,15 +115,15 @@ def _headline(content: Content) -> Iterator[Block]:
             U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
-    elif summary.inconclusive(result, content.map):
-        word, _, text = summary.inconclusive(result, content.map).partition(": ")
-        yield "verdict", {"kind": "undecided", "word": word, "text": text}
+    elif inconclusive(result, content.map):
+        word, _, text = inconclusive(result, content.map).partition(": ")
+        yield "verdict", {"kind": "inconclusive", "word": word, "text": text}
     elif result.verdict.delivered:
         text = "the fit gives no reason against using this robot; no acceptance limit is stated."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
     yield "notes", [*result.verdict.reasons, *result.verdict.beside(result.causes)]
-    name, nominal, identified = summary.headline_errors(result)
+    name, nominal, identified = headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:
         raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")

@@ -8,16 +8,13 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import counted, joined, listed, percent, table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.held_out import excluded_by_fit
+from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
-from rpim_opt.data.record import Requirement
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
@@ -28,8 +25,6 @@ if TYPE_CHECKING:
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")
 Unit = Literal["mm", "mrad"]
-ANYWHERE = Requirement(limit=1.0)
-"""The region of a result without requirement: joints within the measured ranges."""
 
 
 def mm(value: float) -> str:
@@ -37,14 +32,6 @@ def mm(value: float) -> str:
     if value < 10:
         return f"{value:.3f}"
     return f"{value:.2f}" if value < 100 else f"{value:.0f}"
-
-
-def sets(result: Calibration) -> dict[str, Dataset]:
-    """Return the data sets by name, validation first if present."""
-    data = {"identification": result.problem.data}
-    if result.record.validation is None:
-        return data
-    return {"validation": result.record.validation, **data}
 
 
 # --- figures -----------------------------------------------------------------------------------------------
@@ -124,38 +111,12 @@ def cells(rows: Sequence[Mapping[str, Any]], unit: Unit = "mm") -> list[list[str
     ]
 
 
-def workspace(result: Calibration) -> Workspace | None:
-    """Return the expanded uncertainty over the region; None for several robots, or a formulation without covariance."""
-    from rpim_opt.calibration.acceptance import region_of, workspace
-
-    requirement = result.record.requirement or ANYWHERE
-    try:
-        region = region_of(result, requirement)
-        sampled = workspace(result, requirement, region, region.drawn())
-    except InputError:
-        return None
-    return sampled if np.isfinite(sampled.expanded).all() else None
-
-
 def workspace_sentence(found: Workspace) -> str:
     """Return maximum and median of an expanded uncertainty in a sentence."""
     return (
         f"Expanded uncertainty of the position reached (U, {percent(found.requirement.confidence)}): at most "
         f"{mm(1e3 * found.largest)} mm (largest of {found.count} configurations, refined by a search), "
         f"median {mm(1e3 * found.typical)} mm; region: {found.requirement.where}."
-    )
-
-
-def inconclusive(result: Calibration, found: Workspace | None) -> str:
-    """Return a warning if U exceeds the error of the nominal robot; otherwise an empty text."""
-    nominal = rms(headline_errors(result)[1])
-    if found is None or not _of_positions(result) or not found.typical > nominal:
-        return ""
-    return (
-        f"Inconclusive: the median U over the region, {mm(1e3 * found.typical)} mm, is above the error of the "
-        f"nominal robot, {mm(1e3 * nominal)} mm RMS on the {headline_errors(result)[0]} rows. Measure more "
-        "configurations (rpim-opt design --augment), with larger wrist rotations, or state what is known of the "
-        'reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
 
 
@@ -171,24 +132,6 @@ def acceptance(result: Calibration) -> Acceptance | None:
 # --- sentences ---------------------------------------------------------------------------------------------
 
 
-def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
-    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified.
-
-    Of held-out rows those count that the final fit does not exclude as outliers.
-    """
-    held = result.record.held_out
-    if held is not None:
-        kept = ~np.isin(held.label, excluded_by_fit(result))
-        return "held out", held.nominal[kept], held.error[kept]
-    name, data = next(iter(sets(result).items()))
-    return name, result.nominal_errors(data), result.errors(data)
-
-
-def _of_positions(result: Calibration) -> bool:
-    kinds = {block.measurement.name for data in sets(result).values() for block in data.blocks}
-    return kinds <= {"position", "pose"}
-
-
 def headline(result: Calibration) -> str:
     """Return a sentence on the error reduction, on data not used for identification if there are any."""
     name, nominal, identified = headline_errors(result)
@@ -201,7 +144,7 @@ def headline(result: Calibration) -> str:
         "held out": f"On {n} measurements that were held out",
         "identification": f"On the {n} identification measurements (no validation data)",
     }[name]
-    what = "position error" if _of_positions(result) else "error"
+    what = "position error" if of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     change = f"rises from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
     if ratio > 1:
@@ -283,10 +226,13 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         for method, mean in methods.items():
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
+    from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
+
     accepted = acceptance(result)
-    uncertainty = workspace(result) if accepted is None else None  # an acceptance test states it, too
+    uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
+    doubt = inconclusive(result, uncertainty)
     remarks = [
-        *filter(None, [inconclusive(result, uncertainty)]),
+        *filter(None, [doubt]),
         *([] if uncertainty is None else [workspace_sentence(uncertainty)]),
         *words.weight_lines(result),
         identifiability(result),
@@ -309,6 +255,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "remarks": [*remarks, *result.verdict.beside(result.causes)],
         "likely_causes": list(result.causes),
         "lack_of_fit": lacking and lacking.content(),
+        "inconclusive": bool(doubt),
         "details": dict(record.details),
         "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
     }

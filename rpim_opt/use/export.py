@@ -10,7 +10,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -22,13 +22,12 @@ from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior_terms import prior_penalty
-from rpim_opt.calibration.acceptance import accept
+from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
-from rpim_opt.data.record import Requirement
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
@@ -43,6 +42,16 @@ CONVENTION = {
     "axis 1 to the flange frame of [tool] and --tool: a and alpha of the last row are 0",
 }
 """What is said of a table in a convention."""
+
+
+class Exported(NamedTuple):
+    """Files, sentences on what they do not hold, and whether the verdict on the robot is inconclusive."""
+
+    files: list[Path]
+    notes: list[str]
+    inconclusive: bool
+
+
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
 
@@ -92,7 +101,7 @@ def export_files(
     marker: str | None = None,
     despite_verdict: bool = False,
     **frames: Any,
-) -> tuple[list[Path], list[str]]:
+) -> Exported:
     """Export the identified robot to files of other tools; all requested files are written, or none.
 
     Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
@@ -100,14 +109,16 @@ def export_files(
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS) and ``ur_calibration`` (``calibration.conf``) of a
     Universal Robot and ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to
     ``out``, of several a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`),
-    ``robodk`` (.csv, four numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors of the whole model: ``joint``,
-    ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``. A joint stands at its angle plus the correction:
-    subtract it from a command. Without transmission errors the other files are written, and a note says so. ``marker``
-    is the reflector, ``frames`` are ``root``, ``tip`` and ``tip_measured`` of `export_urdf`; with ``despite_verdict`` a
-    robot that is not delivered is written, too, with a note in every file.
+    ``robodk`` (.csv, four numbers a joint, modified) and ``corrections`` are files to write, the last one the
+    transmission errors of the whole model: ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``.
+    A joint stands at its angle plus the correction: subtract it from a command. Without transmission errors the other
+    files are written, and a note says so. ``marker`` is the reflector, ``frames`` are ``root``, ``tip`` and
+    ``tip_measured`` of `export_urdf`; with ``despite_verdict`` a robot that is not delivered is written, too, with a
+    note in every file.
 
-    Returned are the files, and sentences on what they do not hold. Raises NotDelivered for a calibration that is not
-    delivered, InputError where there is nothing to write, or a file cannot hold what was identified.
+    A robot that is neither accepted nor rejected, or no more certain than the nominal one errs, is written with the
+    note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
+    requirement of its record, InputError where there is nothing to write, or a file cannot hold what was identified.
     """
     whole = result
     result, notes = geometry_alone(whole)
@@ -115,7 +126,17 @@ def export_files(
     if corrections and any(others) and not transmission_errors(whole):
         notes.append(f"Not written: {corrections.name}, since the calibration has no transmission errors.")
         corrections = None
-    note = result.verdict.require(despite_verdict)
+    accepted = accept(whole) if whole.record.requirement else None
+    found = accepted.workspace if accepted else measured_workspace(whole)
+    verdict, doubt = result.verdict, inconclusive(whole, found)
+    if accepted:
+        tested = " ".join(["Acceptance of the calibration, whole model:", accepted.sentences()[0], *accepted.reasons])
+        doubt = tested if accepted.verdict == "inconclusive" else ""
+        if accepted.verdict == "accepted":
+            notes.append(tested)
+        elif accepted.verdict == "rejected" and verdict.delivered:
+            verdict = replace(verdict, reasons=(tested,))
+    note = verdict.require(despite_verdict) or doubt
     frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
@@ -146,22 +167,18 @@ def export_files(
         )
         raise InputError("export", "nothing to write", accepted)
     messages = write_all(writers, note)
-    requirement = whole.record.requirement
-    if result is not whole:
-        region = requirement or Requirement(limit=1.0)
-        bound = accept(result, region).bound
-        if bound is not None:
-            what = f"Expanded uncertainty of the position reached with this geometry (U, {percent(region.confidence)})"
-            notes.append(
-                f"{what}: at most {1e3 * bound:.3f} mm, of the reflector; region: {region.where}. Another point of the "
-                "flange and its orientation may be known less: `compensate --tool` states their uncertainty."
-            )
-    if requirement is not None:
-        verdict = accept(whole)
+    if result is not whole and found is not None:
+        stays = np.linalg.norm(result.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
+        bound, confidence = float((found.expanded + stays).max()), found.requirement.confidence
         notes.append(
-            " ".join(["Acceptance of the calibration, whole model:", verdict.sentences()[0], *verdict.reasons])
+            f"Expanded uncertainty of the position reached with this geometry (U, {percent(confidence)}): at most "
+            f"{1e3 * bound:.3f} mm, of the reflector; region: {found.requirement.where}. It contains the error that "
+            f"geometry without {joined(whole.learned.extensions)} makes, at most {1e3 * stays.max():.3f} mm there. "
+            "Another point of the flange and its orientation may be known less: `compensate --tool` states their "
+            "uncertainty."
         )
-    return [target for target, _ in writers], [*filter(None, [note]), *notes, *messages]
+    told = [*filter(None, [note]), *notes, *messages]
+    return Exported([target for target, _ in writers], told, bool(doubt) and verdict.delivered)
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
@@ -189,7 +206,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         penalty = prior_penalty(None, none, none, form.matrix[:, geometry], form.c, None)
         problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[geometry]))
         alone = calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
-    alone = replace(alone, record=result.record)
+    alone = replace(alone, record=result.record, known_causes=result.causes)  # the extension is no mistake
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))

@@ -1,5 +1,6 @@
 """Transmission errors of joints as curves: found where they are, unknown beyond the measured angles, kept by files."""
 
+import csv
 import dataclasses
 
 import numpy as np
@@ -130,7 +131,7 @@ def test_a_file_holds_the_curves(rippled, tmp_path):
 
 def test_corrections_are_a_table(rippled, tmp_path):
     result, _ = rippled
-    _, said = ro.use.export_files(result, corrections=tmp_path / "joints.csv")
+    said = ro.use.export_files(result, corrections=tmp_path / "joints.csv").notes
     table = np.genfromtxt(tmp_path / "joints.csv", delimiter=",", skip_header=1)
     rows = table[(table[:, 0] == 2) & (np.abs(table[:, 1]) < 50)]
     q = np.radians(rows[:, 1])
@@ -146,13 +147,15 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert "reached with this geometry (U, 95 %): at most " in said[1]
     assert "Acceptance" not in " ".join(said)
     required = dataclasses.replace(result.record, requirement=ro.data.Requirement(limit=1e-6))
-    _, said = ro.use.export_files(dataclasses.replace(result, record=required), mdh=tmp_path / "arm.csv")
-    assert "whole model: Inconclusive: limit 0.001 mm" in said[2]
-    assert "Missing: " in said[2]
+    doubtful = ro.use.export_files(dataclasses.replace(result, record=required), mdh=tmp_path / "arm.csv")
+    assert doubtful.inconclusive
+    assert "whole model: Inconclusive: limit 0.001 mm" in doubtful.notes[0]
+    assert "Missing: " in doubtful.notes[0]
+    assert doubtful.notes[0] in next(csv.reader((tmp_path / "arm.csv").open(newline="").readlines()[1:2]))
     plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):
         ro.use.export_files(plain, corrections=tmp_path / "none.csv")
-    written, said = ro.use.export_files(plain, mdh=tmp_path / "arm.csv", corrections=tmp_path / "none.csv")
+    written, said, _ = ro.use.export_files(plain, mdh=tmp_path / "arm.csv", corrections=tmp_path / "none.csv")
     assert [file.name for file in written] == ["arm.csv"]
     assert said[0] == "Not written: none.csv, since the calibration has no transmission errors."
     assert not (tmp_path / "none.csv").exists()

@@ -121,10 +121,10 @@ def test_the_three_verdicts(result) -> None:
     bound = accept(result, Requirement(1.0)).bound
     assert accept(result, Requirement(1.001 * bound)).verdict == "accepted"
     between = accept(result, Requirement(0.8 * bound))
-    assert between.verdict == "undecided"
+    assert between.verdict == "inconclusive"
     assert "design PROBLEM --augment" in between.reasons[0]
     few = accept(result, Requirement(0.1 * bound))
-    assert few.verdict == "undecided"  # nothing shows that a better calibration would not do
+    assert few.verdict == "inconclusive"  # nothing shows that a better calibration would not do
     assert "repeatability" in few.reasons[0]
 
 
@@ -141,7 +141,7 @@ def test_the_mean_of_the_errors_does_not_decide(result) -> None:
     largest = result.errors(result.record.validation).max()
     found = accept(result, Requirement(1.2 * largest))
     assert found.bound > 1.2 * largest
-    assert found.verdict == "undecided"
+    assert found.verdict == "inconclusive"
     assert f"Held out: 40 rows, 40 of them in the region, maximum error there {1e3 * largest:.3f} mm, of" in str(found)
     assert "their 95 % prediction intervals (at least 85 % are required for this number of rows)." in str(found)
 
@@ -163,7 +163,7 @@ def test_a_region_in_which_nothing_was_measured_is_not_accepted(result) -> None:
     box = tuple((float(at) - 0.03, float(at) + 0.03) for at in far)
     found = accept(result, Requirement(1e-3, box=box))
     assert found.bound < 1e-3
-    assert found.verdict == "undecided"
+    assert found.verdict == "inconclusive"
     assert found.reasons == ("Missing: measurements in the region. No identification row is in it either.",)
 
 
@@ -186,13 +186,13 @@ def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
 )
 def test_what_is_lacking_is_said(result, change, said: str) -> None:
     found = accept(change(result), Requirement(0.01))
-    assert found.verdict == "undecided"
+    assert found.verdict == "inconclusive"
     assert any(said in reason for reason in found.reasons)
 
 
 def test_an_unmeasured_part_of_the_region_is_named(result) -> None:
     found = accept(result, Requirement(0.01, joints=((2, (-3.0, 3.0)),)))
-    assert found.verdict == "undecided"
+    assert found.verdict == "inconclusive"
     assert "joint 2 from -171.9 to 171.9 deg" in found.reasons[0]
 
 
@@ -203,12 +203,12 @@ def test_rows_that_miss_reject_only_when_chance_does_not_make_so_many(result) ->
     assert found.verdict == "rejected"
     assert "12 of" in found.reasons[0]
     one = replace(result, record=replace(result.record, validation=moved(apart, [0], 5e-3)))
-    assert accept(one, Requirement(1e-3)).verdict == "undecided"
+    assert accept(one, Requirement(1e-3)).verdict == "inconclusive"
 
 
 def test_a_penalty_without_covariance_has_no_bound(instance) -> None:
     found = accept(ro.calibrate(instance.problem, ro.lasso, 1.0), Requirement(1e-3), instance.validation)
-    assert found.verdict == "undecided"
+    assert found.verdict == "inconclusive"
     assert found.bound is None
     assert any("No bound" in reason for reason in found.reasons)
 

@@ -32,14 +32,14 @@ def expanded(count: int, largest: float, typical: float) -> Workspace:
 
 
 def test_an_acceptance_says_what_it_rests_on() -> None:
-    bare = Acceptance(LIMIT, "undecided", ("Missing: rows.",))
+    bare = Acceptance(LIMIT, "inconclusive", ("Missing: rows.",))
     assert bare.sentences() == [
         "Inconclusive: limit 0.1 mm with 95 % confidence at every configuration of the region.",
         "Region: joints within the measured ranges.",
         "Missing: rows.",
     ]
     assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "repeatability", "box")] == [None] * 4
-    free = Acceptance(LIMIT, "undecided", (), expanded(500, np.inf, 5e-5), 2e-5)
+    free = Acceptance(LIMIT, "inconclusive", (), expanded(500, np.inf, 5e-5), 2e-5)
     assert "The position reached" not in str(free)
     assert free.content()["bound_mm"] is None
     assert free.content()["typical_mm"] == pytest.approx(0.05)

@@ -15,6 +15,7 @@ from rpim_opt.calibration.verdict import worse_than_nominal
 from rpim_opt.store import load_result, save_result
 from rpim_opt.store.serialize import digest
 from tests.calibration.mistakes import IN_TABLES, coupled, joints, simulated_arm, values
+from tests.simulate import simulated
 from tests.test_cli import run
 
 
@@ -108,6 +109,25 @@ def test_python_follows_it(tmp_path: Path) -> None:
     with pytest.raises(ro.basics.NotDelivered):
         ro.use.export_files(result, mdh=tmp_path / "out.csv")
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("limit", "word"), [(2e-4, "Accepted: "), (5e-5, "Inconclusive: "), (None, "Rejected: ")])
+def test_export_follows_the_acceptance_test(monkeypatch, capsys, tmp_path: Path, limit, word: str) -> None:
+    if limit is None:  # the robot's own repeatability is above the limit
+        limit, result = 2e-4, ro.calibrate(simulated(noise=5e-4)[0])
+    else:
+        result = ro.load("position").calibrate()
+    record = replace(result.record, requirement=ro.data.Requirement(limit))
+    save_result(replace(result, record=record), tmp_path / "result.json")
+    target = tmp_path / "arm.csv"
+    arguments = ("export", str(tmp_path), "--mdh", str(target))
+    assert run(monkeypatch, *arguments) == {"A": 0, "I": 4, "R": 1}[word[0]]
+    said = capsys.readouterr()
+    assert word in said.out + said.err
+    assert target.exists() == (word[0] != "R")
+    if word[0] == "R":
+        assert run(monkeypatch, *arguments, "--despite-verdict") == 0
+    assert (word in target.read_text()) == (word[0] != "A")
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.report import report, summary
+from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
+from rpim_opt.report import report
 from rpim_opt.report.report import page
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
@@ -321,7 +322,7 @@ def test_a_robot_less_certain_than_the_nominal_one_errs_is_not_called_delivered(
     assert "Inconclusive" in text
     assert "is above the error of the nominal robot" in text
     assert "Delivered" not in text
-    assert summary.inconclusive(first, summary.workspace(first)) == ""
+    assert inconclusive(first, measured_workspace(first)) == ""
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -108,6 +109,29 @@ def test_compensation_closes_the_loop_to_the_noise(payload: float | None) -> Non
     assert np.abs(predicted - nominal)[ok].max() < 1e-7
     other = ro.use.compensate(result, q, orientation=False, payload=5.0)
     assert rms((real.on(data_at(other.q, payload)).modelled(x)[0] - nominal)[ok]) > 3 * SIGMA
+
+
+def test_uncertainty_of_exported_geometry_contains_what_files_cannot_hold(tmp_path: Path) -> None:
+    robot = arm()
+    q = np.random.default_rng(1).uniform(-2.0, 2.0, (40, 6))
+    real = ro.CalibrationProblem(robot, table(robot), data_at(q))
+    x = truth(real.parameters, 1)
+    y = real.modelled(x)[0] + SIGMA * np.random.default_rng(2).normal(size=(40, 3))
+    rigid = ro.robot.model_parameters(robot, tools={"": TOOL}).identify(GEOMETRY)
+    result = ro.calibrate(ro.CalibrationProblem(robot, rigid, ro.Dataset.of(q, y, SIGMA)), model="auto")
+    assert result.learned is not None
+    assert result.learned.extensions == ("gravity",)
+    said = " ".join(ro.use.export_files(result, mdh=tmp_path / "arm.toml").notes)
+    stated, of_gravity = (
+        float(re.search(rf"{before} ([\d.]+) mm", said)[1])
+        for before in (r"this geometry \(U, 95 %\): at most", "geometry without gravity makes, at most")
+    )
+    others = np.random.default_rng(3).uniform(q.min(axis=0), q.max(axis=0), (2000, 6))
+    alone = ro.use.geometry_alone(result)[0].forward(others)[:, :3, 3]
+    missed = 1e3 * np.linalg.norm(alone - real.on(data_at(others)).modelled(x)[0], axis=1)
+    assert np.mean(missed > stated) < 0.05  # of the geometry's own U, which takes gravity for noise, 12 %
+    assert 0.7 * stated < missed.max()
+    assert 0.7 * stated < of_gravity < stated
 
 
 def test_payloads_may_differ_by_row_and_lie_elsewhere() -> None:

@@ -210,7 +210,7 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.0005, -0.0006, 0.0002])),))
     assert "displaced as a whole by 0.80" in ro.use.validate(result, moved).mistake
     accepted = ro.calibration.accept(result, ro.data.Requirement(limit=1e-2), moved)
-    assert accepted.verdict == "undecided"
+    assert accepted.verdict == "inconclusive"
     assert "the instrument or the base moved" in str(accepted)
     assert not ro.use.validate(result, instance.validation).mistake
     rejected = ro.calibration.accept(result, ro.data.Requirement(limit=2e-4), moved)
