@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
 from types import ModuleType
@@ -144,28 +144,22 @@ def substituted(stated: Any, instead: Mapping[int, Any]) -> Any:
     return stated.copy(args, instead)
 
 
-def alike(one: Any, other: Any, pairs: dict[int, int]) -> bool:
-    """Return whether two expressions or constraints are equal up to a one-to-one renaming of variables, by ``id``."""
-    kind = type(one)
-    if issubclass(kind, cp.Expression | cp.Constraint):
-        if kind is not type(other) or one.shape != other.shape or len(one.args) != len(other.args):
-            return False
-        if isinstance(one, cp.Variable):
-            mine, its = pairs.setdefault(id(one), id(other)), pairs.setdefault(id(other), id(one))
-            return (mine, its) == (id(other), id(one)) and alike(one.attributes, other.attributes, pairs)
-        if isinstance(one, cp.Constant):
-            return alike(_numbers(one), _numbers(other), pairs)
-        own = [one.constr_id, other.constr_id] if isinstance(one, cp.Constraint) else []
-        mine, its = ([d for d in e.get_data() or [] if not (isinstance(d, int) and d in own)] for e in (one, other))
-        return alike(mine, its, pairs) and alike(one.args, other.args, pairs)
-    if isinstance(one, dict):
-        one, other = list(one.items()), list(other.items())
-    if isinstance(one, list | tuple):
-        same = type(one) is type(other) and len(one) == len(other)
-        return same and all(alike(a, b, pairs) for a, b in zip(one, other, strict=True))
-    if isinstance(one, np.ndarray):
-        return np.array_equal(one, other)
-    return bool(one == other)
+def fingerprint(stated: Any, order: dict[int, int]) -> Any:
+    """Return what expressions or constraints are made of, hashable; ``order`` numbers their variables as they come."""
+    if isinstance(stated, list | tuple):
+        return tuple(fingerprint(each, order) for each in stated)
+    if isinstance(stated, np.ndarray):
+        return stated.shape, stated.dtype.str, stated.tobytes()
+    if not issubclass(type(stated), cp.Expression | cp.Constraint):
+        return stated if isinstance(stated, Hashable) else repr(stated)  # slices
+    data: Any = stated.get_data() or []
+    if isinstance(stated, cp.Variable):
+        data = [order.setdefault(id(stated), len(order)), *stated.attributes.items()]
+    elif isinstance(stated, cp.Constant):
+        data = _numbers(stated)
+    elif isinstance(stated, cp.Constraint):  # whose number is another one at every call
+        data = [each for each in data if each is not stated.constr_id]
+    return type(stated), stated.shape, fingerprint(data, order), fingerprint(stated.args, order)
 
 
 def _numbers(constant: Any) -> list[Array]:

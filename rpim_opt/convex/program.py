@@ -128,9 +128,7 @@ class Program(Brief):
         Where they return what they returned to this program, its canonical forms and last minimum serve again.
         """
         again = pose(formulation, model)
-        if self.formulation == formulation and again.structure.like(self.structure):
-            return self.on(model)
-        return again.beginning(z)
+        return self.on(model) if again.structure is self.structure else again.beginning(z)
 
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""

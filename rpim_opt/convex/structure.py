@@ -23,9 +23,9 @@ from rpim_opt.convex.expressions import (
     SQUARES,
     Frozen,
     Term,
-    alike,
     called,
     cp,
+    fingerprint,
     listed,
     norms,
     reason,
@@ -222,20 +222,12 @@ class Structure:
         made.equations = self.n + 1
         return made
 
-    def like(self, other: Structure) -> bool:
-        """Whether another structure has the same expressions, for data of the same shape."""
-        same = (self.n, self.equations) == (other.n, other.equations) and np.array_equal(self.groups, other.groups)
-        if self._declared or not same:
-            return False
-        both = self.answers, other.answers
-        mine, its = ([a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts] for a in both)
-        pairs: dict[int, int] = {}
-        for one, another in zip(*((a.z, a.loss.variable) for a in both), strict=True):
-            pairs |= {id(one): id(another), id(another): id(one)}
-        try:
-            return alike(mine, its, pairs)
-        except ValueError:  # something that has no truth value: then they may differ
-            return False
+    @property
+    def fingerprint(self) -> Any:
+        """What the functions returned, hashable."""
+        a = self.answers
+        stated = [a.z, a.loss.variable, a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts]
+        return fingerprint(stated, {})
 
     # --- structure ---------------------------------------------------------------------------------------------
 
@@ -411,24 +403,26 @@ def structure(
         formulation = counted
     if formulation.loss in INVARIANT and formulation.loss_over == "equation":
         m = n + 1
-    groups = model.members[0]
-    p = model.parameters
-    if not formulation.ready:
-        return Structure(formulation, p, m, groups)
-    key: tuple[Any, ...] = (formulation, n, m, groups.tobytes())
+    p, groups = model.parameters, model.members[0]
+    key: tuple[Any, ...] = (n, m, groups.tobytes())
+    made = None
+    if formulation.ready:
+        key = (formulation, *key)
+    else:  # its functions may return another thing at every call
+        made = Structure(formulation, p, m, groups)
+        key = (id(formulation), made.fingerprint, *key)
     if formulation.constraints or formulation.penalty_over is not None:  # which see the parameters
         key = (*key, p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
-    made = _KEPT.get(key)
-    if made is None:
+    if key not in _KEPT:
         if len(_KEPT) >= MOST_KEPT:
             _KEPT.clear()
-        made = _KEPT[key] = Structure(formulation, p, m, groups)
-    return made
+        _KEPT[key] = made or Structure(formulation, p, m, groups)
+    return _KEPT[key]
 
 
 _KEPT: dict[Any, Structure] = {}
 MOST_KEPT = 64
-"""Structures of ready formulations that are kept for the next model of their shape."""
+"""Structures that are kept for the next model of their shape, and functions that return the same again."""
 
 
 def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formulation | None:
