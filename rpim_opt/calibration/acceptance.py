@@ -20,7 +20,6 @@ from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, he
 from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import Uncertainty
 from rpim_opt.calibration.verdict import refuse_misread, rms
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
@@ -152,7 +151,7 @@ def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: 
 
 def reaching(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
     """Return predicted positions (N, 3) [m] at configurations (N, dof), and their expanded uncertainties (N,)."""
-    prediction = Uncertainty(result, confidence).predict(q, region.marker, of="reached")
+    prediction = result.predict(q, region.marker, of="reached")
     return prediction.position, distance_quantile(prediction.covariance, result.freedom, confidence)
 
 

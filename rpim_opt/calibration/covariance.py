@@ -150,6 +150,8 @@ def require_interval(of: str) -> None:
 
 def coverage_factor(freedom: float | Array, confidence: float) -> Array:
     """Return the quantile k of Student's t at (1 + confidence) / 2, with at least one degree of freedom."""
+    if not 0 < confidence < 1:
+        raise InputError("confidence", f"{confidence}", "a probability between 0 and 1")
     return np.asarray(stdtrit(np.maximum(freedom, 1.0), (1 + confidence) / 2), dtype=float)
 
 

@@ -22,6 +22,7 @@ from rpim_opt.calibration.covariance import (
     Interval,
     NoiseTest,
     Spread,
+    coverage_factor,
     noise_covariances,
     noise_test,
     position_noise,
@@ -55,16 +56,15 @@ COVERAGE_FACTOR = 2.0
 class Prediction(NamedTuple):
     """Predicted positions (N, 3) in the instrument's frame [m] with their ``covariance`` (N, 3, 3) [m^2].
 
-    ``coverage_factor`` is k of U = k u, (N, 1) where rows have degrees of freedom of their own; ``freedom`` are these,
-    (N,) for readings of an unknown session, whose offset few sessions estimate. ``outside`` are the rows beyond the
-    measured joint ranges: there an interval may be too narrow.
+    ``coverage_factor`` is k of U = k u, (N, 1) where rows have degrees of freedom of their own: readings of an unknown
+    session, whose offset few sessions estimate. ``outside`` are the rows beyond the measured joint ranges: there an
+    interval may be too narrow.
     """
 
     position: Array
     covariance: Array
     coverage_factor: float | Array = COVERAGE_FACTOR
     outside: Outside = Outside()
-    freedom: float | Array = np.inf
 
     def __repr__(self) -> str:
         """Return one line."""
@@ -187,13 +187,14 @@ class Outcome:
         of: Interval = "reached",
         columns: Mapping[str, Array] = MappingProxyType({}),
         robot: str = "",
+        confidence: float | None = None,
     ) -> Prediction:
         """Return predicted positions of a reflector with their uncertainty; arguments as for `forward`.
 
-        Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u
-        (`Uncertainty.predict` takes the coverage factor of a confidence instead): with ``of`` ``"mean"`` of what the
-        model says, J C J'; ``"reached"`` of the position that the robot will reach, with its repeatability;
-        ``"reading"`` of what the instrument will read there. A penalty without covariance (lasso) is refused.
+        Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u, or U = k u with
+        Student's factor of a ``confidence``: with ``of`` ``"mean"`` of what the model says, J C J'; ``"reached"`` of
+        the position that the robot will reach, with its repeatability; ``"reading"`` of what the instrument will read
+        there. A penalty without covariance (lasso) is refused.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -213,12 +214,13 @@ class Outcome:
         added = noise_covariances(problem, self.variance_factor)
         if of == "reached":
             covariance = covariance + added.robot[0]
-        freedom: float | Array = self.freedom
+        factor = COVERAGE_FACTOR if confidence is None else coverage_factor(self.freedom, confidence)
         if of == "reading":
             covariance = covariance + added.reading[0]
-            if added.session[0].any():
+            if confidence is not None and added.session[0].any():
                 freedom = row_freedom(self.freedom, sessions_spread(self.learned), covariance, added.session[0])
-        return Prediction(problem.modelled(self.x)[0], covariance, COVERAGE_FACTOR, self.outside(problem.data), freedom)
+                factor = coverage_factor(freedom, confidence)[:, None]
+        return Prediction(problem.modelled(self.x)[0], covariance, factor, self.outside(problem.data))
 
     def outside(self, data: Dataset) -> Outside:
         """Return which rows are outside the measured joint ranges, where the model extrapolates."""

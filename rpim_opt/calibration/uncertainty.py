@@ -13,7 +13,7 @@ from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, position_noise
-from rpim_opt.calibration.outcome import Outcome, Prediction
+from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.terms import transmission
 
@@ -54,8 +54,7 @@ class Uncertainty(Tabled):
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        if not 0 < self.confidence < 1:
-            raise InputError("confidence", f"{self.confidence}", "a probability between 0 and 1")
+        coverage_factor(np.inf, self.confidence)
         if not self.result.linear_penalty:
             found = f"formulation '{self.result.formulation.name}'"
             raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
@@ -69,17 +68,6 @@ class Uncertainty(Tabled):
         """Return the lower and upper limits (n, 2) [SI] of the deviations' intervals."""
         half = self.coverage_factor * np.sqrt(np.diag(self.result.covariance))
         return np.column_stack([self.result.x - half, self.result.x + half])
-
-    def predict(self, q: Array, marker: str = "", **arguments: Any) -> Prediction:
-        """Return `Calibration.predict` with the coverage factor of this confidence; same arguments.
-
-        The factor is larger for readings of an unknown session, where few sessions told how far they lie apart.
-        """
-        prediction = self.result.predict(q, marker, **arguments)
-        factor: float | Array = self.coverage_factor
-        if isinstance(prediction.freedom, np.ndarray):
-            factor = coverage_factor(prediction.freedom, self.confidence)[:, None]
-        return prediction._replace(coverage_factor=factor)
 
     def _short(self) -> str:
         return f"at confidence {self.confidence:g} of {repr(self.result).strip('<>')}"

@@ -314,11 +314,11 @@ def test_intervals_of_readings_are_wide_where_few_sessions_told_how_they_differ(
     fresh = in_sessions(SEED, ["another day"] * 40)
     data = fresh.data
     uncertainty = ro.calibration.Uncertainty(automatic)
-    reading = uncertainty.predict(data.q, of="reading")
+    reading = automatic.predict(data.q, of="reading", confidence=0.95)
     assert reading.coverage_factor.shape == (len(data), 1)
     assert (reading.coverage_factor > uncertainty.coverage_factor + 0.05).all()
-    assert uncertainty.predict(data.q).coverage_factor == uncertainty.coverage_factor
-    assert uncertainty.predict(data.q, of="mean").coverage_factor == uncertainty.coverage_factor
+    assert automatic.predict(data.q, confidence=0.95).coverage_factor == uncertainty.coverage_factor
+    assert automatic.predict(data.q, of="mean", confidence=0.95).coverage_factor == uncertainty.coverage_factor
     y = data.blocks[0].y
     for scale in (0.5, 1.0, 2.0):  # at all of which some are inside and some are not
         moved = reading.position + scale * (y - reading.position)

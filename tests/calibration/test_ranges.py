@@ -64,7 +64,7 @@ def test_predictions_validation_and_commands_say_it():
     middle = measured_ranges(problem)[""].mean(axis=0)
     q = np.array([middle, [2.2, *middle[1:]]])
     assert result.predict(q).outside.rows == (1,)
-    assert ro.calibration.Uncertainty(result).predict(q).outside.joints == {1: 1}
+    assert result.predict(q, confidence=0.95).outside.joints == {1: 1}
     data = ro.Dataset.of(q, result.predict(q).position, 5e-5, label=("near", "far"))
     found = ro.use.validate(result, data)
     assert found.content()["outside"] == ["far"]

@@ -136,7 +136,7 @@ def test_predictions_propagate() -> None:
     assert found.position == pytest.approx(at(RESULT.x), abs=1e-12)
     assert found.covariance == pytest.approx(want, rel=1e-4, abs=1e-14)
     assert found.standard**2 == pytest.approx(np.einsum("nii->ni", want), rel=1e-4)
-    wide = Uncertainty(RESULT, 0.99).predict(q, of="mean")
+    wide = RESULT.predict(q, of="mean", confidence=0.99)
     assert wide.expanded == pytest.approx(Uncertainty(RESULT, 0.99).coverage_factor * wide.standard, rel=1e-12)
 
 

@@ -17,7 +17,7 @@ def covered(seeds: range) -> np.ndarray:
     hits = []
     for seed in seeds:
         problem, truth = simulated(noise=5e-5, seed=seed, configurations=25)
-        found = ro.calibration.Uncertainty(ro.calibrate(problem, ro.tikhonov, ro.reml)).predict(Q)
+        found = ro.calibrate(problem, ro.tikhonov, ro.reml).predict(Q, confidence=0.95)
         want = problem.on(ro.Dataset.of(Q, np.zeros((50, 3)), 1.0)).modelled(truth)[0]
         hits.append(np.mean(np.abs(found.position - want) <= found.expanded))
     return np.array(hits)
@@ -74,8 +74,8 @@ def test_what_active_bounds_do_is_said() -> None:
 
 def test_a_robust_fit_is_as_certain_as_one_of_the_rows_it_keeps() -> None:
     instance = ro.load("blunders")
-    robust = ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.robust, 1.0))
-    clean = ro.calibration.Uncertainty(ro.calibrate(robust.result.without_flagged().problem, ro.tikhonov, 1.0))
+    robust = ro.calibrate(instance.problem, ro.robust, 1.0)
+    clean = ro.calibrate(robust.without_flagged().problem, ro.tikhonov, 1.0)
     q = instance.problem.data.q[:20]
     assert robust.predict(q).expanded == pytest.approx(clean.predict(q).expanded, rel=0.25)
 

@@ -79,7 +79,7 @@ def figures(name: str, variant: str | None) -> dict[str, Any]:
         told["rms_mm"] = float(1e3 * np.sqrt(np.mean(errors**2)))
     if instance.validation is not None:
         try:
-            told["expanded"] = ro.calibration.Uncertainty(result).predict(instance.validation.q[:5]).expanded.tolist()
+            told["expanded"] = result.predict(instance.validation.q[:5], confidence=0.95).expanded.tolist()
         except ro.basics.RpimError as error:
             told["expanded"] = str(error)[:60]
     learned = result.learned

@@ -110,8 +110,8 @@ def test_functions_of_a_script_are_missing_and_nothing_else(tmp_path: Path) -> N
     # the kept rows' factor is a root that is squared again
     assert again.covariance == pytest.approx(result.covariance, rel=1e-13)
     q = instance.problem.data.q
-    assert ro.calibration.Uncertainty(again).predict(q).expanded == pytest.approx(
-        ro.calibration.Uncertainty(result).predict(q).expanded, rel=1e-12
+    assert again.predict(q, confidence=0.95).expanded == pytest.approx(
+        result.predict(q, confidence=0.95).expanded, rel=1e-12
     )
     assert again.flagged == result.flagged
     assert again.certificate == result.certificate
@@ -192,7 +192,7 @@ def test_forward_and_predict_are_the_model(tmp_path: Path) -> None:
     )
     predicted = result.predict(data.q)
     assert np.array_equal(predicted.position, T[:, :3, 3])
-    assert np.array_equal(predicted.standard, ro.calibration.Uncertainty(result).predict(data.q).standard)
+    assert np.array_equal(predicted.standard, result.predict(data.q, confidence=0.95).standard)
     error = data.blocks[0].y - predicted.position
     assert (
         np.array_equal(np.linalg.norm(error, axis=1), result.errors(data))
