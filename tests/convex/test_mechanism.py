@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import warnings
+from dataclasses import replace
 from functools import lru_cache, partial
 from typing import Any
 
@@ -265,6 +266,9 @@ def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.Monke
     """By every rule, but those that need the rows; they, and minimax, are refused where no memory has these."""
     monkeypatch.setattr(ro.problem.PartitionedProblem, "gathered", lambda self: None)
     problem, _ = simulated(configurations=42, noise=1e-4, seed=1)
+    p = problem.parameters
+    problem = problem.with_parameters(replace(p, tolerance=2 * p.scale))
+    penalized = FORMULATIONS[formulation].penalty is not None
     blocks = [partial(problem.data.take, rows) for rows in np.array_split(np.arange(42), 3)]
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # the cluster's own, of ports and event loops
@@ -279,13 +283,16 @@ def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.Monke
                 return client.gather(client.map(task, list(each), pure=False))
 
             parted = ro.problem.PartitionedProblem(problem.robot, problem.parameters, problem.data, blocks, compute)
-            for rule in SELECTORS:
+            for rule in list(SELECTORS)[: None if penalized else 1]:  # which nobody asks without a penalty
                 whole, found = calibrated(problem, formulation, rule), calibrated(parted, formulation, rule)
                 if whole is None or found is None:
                     assert found is None
                     assert whole is None or rule in ("leave_one_out", "k_fold", "two_step"), rule
                     continue
-                assert found.weight == pytest.approx(whole.weight, rel=1e-4), rule
+                searched = rule == "corner" and not whole.linear_penalty  # ends at an interval of 1 %
+                assert found.weight == pytest.approx(whole.weight, rel=0.01 if searched else 1e-4), rule
+                if searched:
+                    whole = ro.calibrate(problem, formulation, found.weight)
                 if np.abs(whole.z).max() < 1e3:  # without a penalty redundant parameters run away, where rounding wants
                     assert found.z == pytest.approx(whole.z, abs=1e-5), rule
 
