@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any
 
@@ -137,13 +137,27 @@ class State:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """Constants of the loop: the measurements, the formulation, and the linearization point of predicted positions."""
+    """The loop of one problem: its source of linear models, the user's formulation, and the one that is solved.
+
+    Of data in blocks these differ: ``reweigh`` makes squares of a robust loss where rows are read. ``about`` are the
+    linearization points (n,) [SI] of predicted positions in constraints.
+    """
 
     source: Source
     formulation: Formulation
-    reweigh: QuadraticModel | None = None
-    options: Options = field(default_factory=Options)
+    solved: Formulation
+    reweigh: QuadraticModel | None
+    options: Options
     about: tuple[Array | None, Array | None] = (None, None)
+
+    @classmethod
+    def of(cls, problem: Source, formulation: Formulation, options: Options) -> Loop:
+        """Return the loop of a problem."""
+        source = in_parts(problem.frozen())
+        solved, reweigh = formulation, None
+        if not source.keeps_rows:
+            solved, reweigh = in_blocks(formulation, lambda: sum(len(part.owners) for part in source.rows()))
+        return cls(source, formulation, solved, reweigh, options)
 
     @property
     def scale(self) -> Array:
@@ -156,6 +170,39 @@ class Loop:
         if reweigh is not None and before is not None:
             reweigh = reweigh.after(before)
         return around(self.source.linearize(self.scale * z, reweigh), *self.about)
+
+    def run(self, weight: float | str | Selector, start: Array | None) -> State:
+        """Return the state at the end, from deviations ``start`` (n,) [SI]."""
+        state = self.begun(weight_choice(weight, self.formulation.penalty is not None), start)
+        while not state.outcome and state.evaluations <= self.options.max_iterations:
+            iterations = len(state.history)
+            state = self.confirmed(self.advanced(self.chosen(state)))
+            if self.options.progress and len(state.history) > iterations:
+                self.options.progress(state.history[-1])
+        return self.answered(state)
+
+    def begun(self, choice: WeightChoice, start: Array | None) -> State:
+        """Return the initial state, at a feasible point."""
+        free = self.source.parameters.free
+        x = np.zeros(len(free)) if start is None else require_start(start, len(free))
+        z = free.wrapped(x) / free.scale
+        model = self.linearized(z)
+        require_finite(model.A, model.b)
+        unpenalized = self.formulation.penalty is None or (choice.settled and choice.weight == 0)
+        if model.equations < len(z) and unpenalized:
+            found = f"{model.equations} equations for {len(z)} parameters"
+            raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
+        program = pose(self.solved, model)
+        nearest = program.nearest(z)
+        if (nearest != z).any():
+            z = nearest
+            program = program.on(self.linearized(z))
+        if start is not None:
+            program.beginning(z)
+        choice = replace(choice, robust=self.reweigh is not None or program.separable)
+        objective = program.objective(z, choice.weight)
+        floor = VANISHING * abs(objective) if np.isfinite(objective) else 0.0
+        return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), floor)
 
     # --- the weight ------------------------------------------------------------------------------------------
 
@@ -343,18 +390,20 @@ def minimize(
     Positions that constraints bound are linear about a point: then it runs again about its solution until they are
     those of the solution. Where solutions jump to and fro, the next round linearizes between them.
     """
-    ended = _certified(problem, formulation, weight, start, options, (start, None))
+    loop = replace(Loop.of(problem, formulation, options), about=(start, None))
+    ended = _certified(loop, problem, loop.run(weight, start))
     if not ended.state.program.structure.predicts:
         return ended
     history = ended.state.history
     about = farthest = ended.x
     share, last = 1.0, np.inf
     for rounds in range(2, ROUNDS + 1):
-        ended = _certified(problem, formulation, weight, ended.x, options, (about, farthest))
+        loop = replace(loop, about=(about, farthest))
+        ended = _certified(loop, problem, loop.run(weight, ended.x))
         history = (*history, *ended.state.history)
         ended = replace(ended, rounds=rounds, state=replace(ended.state, history=history))
         step = ended.x - about
-        length = float(np.linalg.norm(step / problem.parameters.free.scale))
+        length = float(np.linalg.norm(step / loop.scale))
         if not ended.converged or ended.state.relative(length) <= SAME_POSITIONS:
             return ended
         if length > last / 2:
@@ -368,78 +417,22 @@ def minimize(
 
 def nearby(problem: Source, formulation: Formulation, start: Array, steps: int) -> Array:
     """Return deviations (n,) [SI] at or near a minimum at weight 1, without a certificate."""
-    loop, state = _rested(problem, formulation, 1.0, start, Options(steps, ROUGH_TOLERANCE))
-    return loop.scale * state.z
+    loop = Loop.of(problem, formulation, Options(steps, ROUGH_TOLERANCE))
+    return loop.scale * loop.run(1.0, start).z
 
 
-def _certified(
-    problem: Source,
-    formulation: Formulation,
-    weight: float | str | Selector,
-    start: Array | None,
-    options: Options,
-    about: tuple[Array | None, Array | None],
-) -> Ended:
-    """Run the loop once; certify its end by the formulation's functions and the measurements' model, asked anew."""
-    loop, state = _rested(problem, formulation, weight, start, options, about)
-    model, residual = state.program.model, None
+def _certified(loop: Loop, problem: Source, state: State) -> Ended:
+    """Certify the end of a loop by the formulation's functions and the measurements' model, asked anew."""
+    model, residual, formulation = state.program.model, None, loop.formulation
     if loop.reweigh is not None:
-        formulation, _ = in_blocks(formulation, lambda: state.program.model.equations)
+        formulation, _ = in_blocks(formulation, lambda: model.equations)
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
         anew = in_parts(problem.frozen())
-        model = around(anew.linearize(loop.scale * state.z), *about)
         if isinstance(anew, CalibrationProblem):
             residual = partial(_whitened, anew)
+        model = around(anew.linearize(loop.scale * state.z), *loop.about)
     certificate = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
     return Ended(state, loop.scale * state.z, certificate)
-
-
-def _rested(
-    problem: Source,
-    formulation: Formulation,
-    weight: float | str | Selector,
-    start: Array | None,
-    options: Options,
-    about: tuple[Array | None, Array | None] = (None, None),
-) -> tuple[Loop, State]:
-    source = in_parts(problem.frozen())
-    solved, reweigh = formulation, None
-    if not source.keeps_rows:
-        solved, reweigh = in_blocks(formulation, lambda: sum(len(part.owners) for part in source.rows()))
-    loop = Loop(source, formulation, reweigh, options, about)
-    state = begun(loop, solved, weight_choice(weight, formulation.penalty is not None), start)
-    while not state.outcome and state.evaluations <= options.max_iterations:
-        iterations = len(state.history)
-        state = loop.confirmed(loop.advanced(loop.chosen(state)))
-        if options.progress and len(state.history) > iterations:
-            options.progress(state.history[-1])
-    return loop, loop.answered(state)
-
-
-def begun(loop: Loop, formulation: Formulation, choice: WeightChoice, start: Array | None) -> State:
-    """Return the initial state, at a feasible point."""
-    free = loop.source.parameters.free
-    x = np.zeros(len(loop.scale))
-    if start is not None:
-        x = require_start(start, len(loop.scale))
-    z = free.wrapped(x) / loop.scale
-    model = loop.linearized(z)
-    require_finite(model.A, model.b)
-    unpenalized = formulation.penalty is None or (choice.settled and choice.weight == 0)
-    if model.equations < len(z) and unpenalized:
-        found = f"{model.equations} equations for {len(z)} parameters"
-        raise InputError("data", found, "at least as many equations, or a formulation with penalty and weight")
-    program = pose(formulation, model)
-    nearest = program.nearest(z)
-    if (nearest != z).any():
-        z = nearest
-        program = program.on(loop.linearized(z))
-    if start is not None:
-        program.beginning(z)
-    choice = replace(choice, robust=loop.reweigh is not None or program.separable)
-    objective = program.objective(z, choice.weight)
-    floor = VANISHING * abs(objective) if np.isfinite(objective) else 0.0
-    return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), floor)
 
 
 def damped(damping: float, gain: float, promised: float, effect: float) -> float:

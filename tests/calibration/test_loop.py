@@ -12,7 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.identify import ending
-from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State, begun
+from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State
 from rpim_opt.calibration.weight_choice import weight_choice
 from tests.simulate import simulated
 
@@ -22,7 +22,7 @@ N = len(PROBLEM.parameters.free)
 
 
 def loop(problem: Any = PROBLEM, formulation: ro.Formulation = ro.tikhonov, **how: Any) -> Loop:
-    return Loop(problem, formulation, None, Options(**how))
+    return Loop.of(problem, formulation, Options(**how))
 
 
 def state(problem: Any = PROBLEM, formulation: ro.Formulation = ro.tikhonov, weight: float = 1.0, **how: Any) -> State:
@@ -110,9 +110,9 @@ def test_data_that_are_not_finite_are_refused(part: str) -> None:
             return replace(model, **{part: np.nan * getattr(model, part)})
 
     at = loop()
-    broken = Broken(at.source, at.formulation)
+    broken = Broken(**vars(at))
     with pytest.raises(ro.InputError, match="non-finite residuals or derivatives"):
-        begun(broken, ro.tikhonov, weight_choice(1.0, True), None)
+        broken.begun(weight_choice(1.0, True), None)
 
 
 def test_a_loop_begins_at_a_point_that_meets_the_constraints() -> None:
@@ -120,15 +120,15 @@ def test_a_loop_begins_at_a_point_that_meets_the_constraints() -> None:
     boxed = ro.Formulation("boxed", penalty=cp.sum_squares, constraints=(box,))
     scale = PROBLEM.parameters.free.scale
     start = np.linspace(-2, 2, N)
-    first = begun(loop(formulation=boxed), boxed, weight_choice(1.0, True), start * scale)
+    first = loop(formulation=boxed).begun(weight_choice(1.0, True), start * scale)
     assert first.z == pytest.approx(np.clip(start, -0.5, 0.5), abs=1e-12)
     there = PROBLEM.linearize(scale * first.z)
     assert pytest.approx(there.A, rel=1e-9, abs=1e-9) == first.program.model.A
     assert first.merit == pytest.approx(first.program.objective(first.z, 1.0), rel=1e-12)
     assert first.size == pytest.approx(np.linalg.norm(there.A, axis=0), rel=1e-9)
-    inside = begun(loop(formulation=boxed), boxed, weight_choice(1.0, True), 0.1 * scale)
+    inside = loop(formulation=boxed).begun(weight_choice(1.0, True), 0.1 * scale)
     assert inside.z == pytest.approx(np.full(N, 0.1), rel=1e-12)
-    assert (begun(loop(), ro.tikhonov, weight_choice(1.0, True), None).z == 0).all()
+    assert (loop().begun(weight_choice(1.0, True), None).z == 0).all()
 
 
 @pytest.mark.parametrize(("configurations", "enough"), [(11, False), (12, True)])
@@ -138,12 +138,12 @@ def test_equations_are_as_many_as_parameters_or_there_is_a_weight(configurations
     for formulation, weight in ((ro.least_squares, 0.0), (ro.tikhonov, 0.0)):
         at = loop(few, formulation)
         if enough:
-            assert begun(at, formulation, weight_choice(weight, True), None).evaluations == 1
+            assert at.begun(weight_choice(weight, True), None).evaluations == 1
         else:
             with pytest.raises(ro.InputError, match="33 equations for 34 parameters"):
-                begun(at, formulation, weight_choice(weight, True), None)
+                at.begun(weight_choice(weight, True), None)
     for weight in (1e-3, answering(1.0)):
-        assert begun(loop(few), ro.tikhonov, weight_choice(weight, True), None).evaluations == 1
+        assert loop(few).begun(weight_choice(weight, True), None).evaluations == 1
 
 
 def test_passes_are_reported_as_they_come() -> None:
@@ -308,7 +308,7 @@ def test_a_start_outside_of_the_constraints_is_moved_inside_before_the_first_pas
     free = tight.parameters.free
     start = np.zeros(len(free))
     start[3] = 7 * free.tolerance[3]
-    at = Loop(tight.frozen(), ro.bounded)
-    x = free.scale * begun(at, ro.bounded, weight_choice(1.0, True), start).z
+    at = Loop.of(tight, ro.bounded, Options())
+    x = free.scale * at.begun(weight_choice(1.0, True), start).z
     assert (np.abs(x) <= free.tolerance * (1 + 1e-9)).all()
     assert x == pytest.approx(np.clip(start, -free.tolerance, free.tolerance))
