@@ -349,8 +349,7 @@ def calibrate(
 ) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if that is inconclusive: something
-    is missing for the test, or the uncertainty exceeds the error of the nominal robot.
+    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if the test is inconclusive.
     """
     with console.progress() as say:
         from rpim_opt.report.summary import describe, summary
@@ -380,10 +379,7 @@ def calibrate(
             f"Refitted without {', '.join(without)}." if without else "No flagged row to drop: nothing was refitted."
         )
         text = f"{refitted}\n\n{text}"
-    verdict = "inconclusive" if document["inconclusive"] else "accepted"
-    if document["acceptance"]:
-        verdict = document["acceptance"]["verdict"]
-    code = CODES[verdict] if result.verdict.delivered else 1
+    code = CODES[(document["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
     return Answer(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
 

@@ -9,7 +9,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.bayes.prior_terms import FAR, Result, default_widths, marginal, triangle_of
+from rpim_opt.bayes.prior_terms import FAR, Result, default_widths, marginal
+from rpim_opt.problem.linear import reduced_rows
 
 PRIOR_ROBOTS = 3.0
 """Degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for."""
@@ -116,7 +117,7 @@ def of_data(result: Result) -> tuple[tuple[str, ...], Array, Array]:
     own = np.eye(n)[free.of_frames] * (free.scale / default_widths(free))[free.of_frames, None]
     robot = np.flatnonzero(~free.of_frames)
     rows, values = marginal(np.vstack([R[:, :n], own]), np.append(R[:, n], np.zeros(len(own))), robot)
-    both = triangle_of(np.column_stack([rows, values]))
+    both = reduced_rows(np.column_stack([rows, values]))
     p = len(robot)
     return tuple(free.names[i] for i in robot), both[:p, :p] / free.scale[robot], both[:p, p]
 

@@ -16,6 +16,7 @@ from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
 from rpim_opt.convex.quadratic import Quadratic
+from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
 FIXED = -1
@@ -306,12 +307,12 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
         chosen = np.flatnonzero(~matching(free, without, "Prior.from_result, without"))
     if not len(chosen):
         raise InputError("Prior.from_result, without", "every parameter", "patterns that keep at least one")
-    R = triangle_of(np.vstack(parts))
+    R = reduced_rows(np.vstack(parts))
     if spread.drift is not None:  # of the precision that belongs to (R'R)^-1 + D D'
         moved = R @ (spread.drift / free.scale[:, None])
         R = np.linalg.solve(np.linalg.cholesky(np.eye(len(R)) + moved @ moved.T), R)
     rows, _ = marginal(R, np.zeros(len(free)), chosen)
-    rows = triangle_of(rows) / (free.scale[chosen] * inflate)
+    rows = reduced_rows(rows) / (free.scale[chosen] * inflate)
     return Statement(
         names=tuple(free.names[i] for i in chosen),
         dimensions=tuple(free.dimensions[i] for i in chosen),
@@ -321,9 +322,3 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
         whole=True,
         text="an earlier result",
     )
-
-
-def triangle_of(rows: Array) -> Array:
-    """Return R with R'R = rows' rows, square."""
-    n = rows.shape[1]
-    return np.asarray(np.linalg.qr(np.vstack([rows, np.zeros((max(n - len(rows), 0), n))]), mode="r"), dtype=float)

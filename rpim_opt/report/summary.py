@@ -230,9 +230,8 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
 
     accepted = acceptance(result)
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
-    doubt = inconclusive(result, uncertainty)
     remarks = [
-        *filter(None, [doubt]),
+        *filter(None, [inconclusive(result, uncertainty)]),
         *([] if uncertainty is None else [workspace_sentence(uncertainty)]),
         *words.weight_lines(result),
         identifiability(result),
@@ -255,7 +254,6 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "remarks": [*remarks, *result.verdict.beside(result.causes)],
         "likely_causes": list(result.causes),
         "lack_of_fit": lacking and lacking.content(),
-        "inconclusive": bool(doubt),
         "details": dict(record.details),
         "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
     }

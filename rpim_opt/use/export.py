@@ -45,7 +45,7 @@ CONVENTION = {
 
 
 class Exported(NamedTuple):
-    """Files, sentences on what they do not hold, and whether the verdict on the robot is inconclusive."""
+    """Files, sentences on what they do not hold, and whether the acceptance test of the robot is inconclusive."""
 
     files: list[Path]
     notes: list[str]
@@ -167,7 +167,7 @@ def export_files(
         )
         raise InputError("export", "nothing to write", accepted)
     messages = write_all(writers, note)
-    if result is not whole and found is not None:
+    if whole.learned is not None and result is not whole and found is not None:
         stays = np.linalg.norm(result.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
         bound, confidence = float((found.expanded + stays).max()), found.requirement.confidence
         notes.append(
@@ -177,8 +177,8 @@ def export_files(
             "Another point of the flange and its orientation may be known less: `compensate --tool` states their "
             "uncertainty."
         )
-    told = [*filter(None, [note]), *notes, *messages]
-    return Exported([target for target, _ in writers], told, bool(doubt) and verdict.delivered)
+    undecided = accepted is not None and accepted.verdict == "inconclusive" and verdict.delivered
+    return Exported([target for target, _ in writers], [*filter(None, [note]), *notes, *messages], undecided)
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
