@@ -75,6 +75,13 @@ def urdf_points(path: Path, q: np.ndarray) -> np.ndarray:
     return T[:, :3, 3]
 
 
+def urdf_turns(path: Path, q: np.ndarray) -> Rotation:
+    """Return the orientations of the tip."""
+    arm = ro.read_urdf(path)
+    ends = numeric_frame(arm.base), numeric_frame(arm.tool)
+    return Rotation.from_matrix((ends[0] @ ro.robot.forward_kinematics(arm.robot, q) @ ends[1])[:, :3, :3])
+
+
 def write_csv(path: Path, header: list[str], rows: np.ndarray) -> None:
     lines = [",".join(header), *(",".join(repr(float(v)) for v in row) for row in rows)]
     path.write_text("\n".join(lines) + "\n")
@@ -148,8 +155,11 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     assert "Warning" not in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "arm", "--out", "arm/results") == 0
     export = ("export", "arm/results", "--urdf", str(cell / "arm.urdf"), "--out")
+    capsys.readouterr()
     assert run(monkeypatch, *export, "corrected.urdf", "--tip-measured") == 0
+    stated_turn = re.search(r"orientation of its tip link .* ([\d.]+) mrad \(k = 2", capsys.readouterr().out)
     assert run(monkeypatch, *export, "behind.urdf") == 0
+    assert "Positions of one reflector do not determine all of it" in capsys.readouterr().out
     assert run(monkeypatch, "report", "arm/results") == 0
     assert {p.name for p in (tmp_path / "arm" / "results").iterdir()} == {"result.json", "report.html"}
     result = ro.load_result("arm/results")
@@ -158,6 +168,10 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     left = rms_mm(later[:, :3] - urdf_points(tmp_path / "corrected.urdf", later[:, 3:]))
     assert left == pytest.approx(stated, abs=1e-9)
     assert left < 0.03  # as the noise of the data; the drawing is off by more than a millimetre
+    turns = [urdf_turns(path, later[:, 3:]) for path in ("corrected.urdf", cell / "true.urdf")]
+    turned = 1e3 * (turns[0].inv() * turns[1]).magnitude().max()
+    assert stated_turn
+    assert turned < float(stated_turn[1]) < 10, turned
     # a reflector near the tip link does not move it unless it is said to be the tip
     behind, nominal = (ro.read_urdf(path) for path in ("behind.urdf", cell / "arm.urdf"))
     assert np.abs(behind.tool - nominal.tool).max() < 1e-12

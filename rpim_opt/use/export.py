@@ -25,9 +25,10 @@ from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import transmission_errors
+from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
+from rpim_opt.data.measurements.pose import pose
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
@@ -307,12 +308,32 @@ def export_urdf(
         elif free:
             option = "; where the reflector is the tip, --tip-measured moves it there" if name == "tool" else ""
             notes.append(f"URDF: its {link} link keeps its pose from the file; in {there}{option}.")
+    notes.append(_orientation(result, marker))
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, *written)
         return notes
 
     return write_all([(Path(target), write)], note)
+
+
+def _orientation(result: Calibration, marker: str | None) -> str:
+    """Say how well the orientation of the tip link is known, which positions of one reflector do not determine."""
+    problem = result.problem.sample()
+    blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
+    q = np.concatenate([block.q[:, 0] for block in blocks])
+    slopes = problem.measuring(q, pose, marker).jacobian(result.x).reshape(len(q), 6, -1)[:, 3:]
+    C = known_covariance(result)
+    if C is None or (np.abs(slopes[:, :, np.isinf(np.diag(C))]) > 0).any():
+        return "URDF: how well the orientation of its tip link is known is undetermined: check it by other means."
+    C = np.where(np.isfinite(C), C, 0.0)
+    largest = float(np.sqrt(np.einsum("nij,jk,nik->n", slopes, C, slopes).max()))
+    seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
+    rests = "" if seen else ". Positions of one reflector do not determine all of it; the rest is the prior's"
+    return (
+        "URDF: expanded uncertainty of the orientation of its tip link in the instrument's frame: "
+        f"{2e3 * largest:.2g} mrad (k = 2, largest of the measured configurations){rests}."
+    )
 
 
 def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path, target: Path) -> list[str]:
