@@ -465,6 +465,24 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     assert not (tmp_path / "both").exists()
 
 
+def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, cell, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    beside = (
+        '<link name="cam"/><joint name="c" type="fixed"><parent link="base_link"/><child link="cam"/></joint></robot>'
+    )
+    Path("two.urdf").write_text((cell / "arm.urdf").read_text().replace("</robot>", beside))
+    arguments = ("new", "arm", "--robot", "two.urdf", "--data", str(cell / "measured.csv"), "--units", "rad,m")
+    assert run(monkeypatch, *arguments) == 2
+    assert "--urdf-tip" in capsys.readouterr().err
+    assert run(monkeypatch, *arguments, "--urdf-tip", "smr") == 0
+    assert run(monkeypatch, "calibrate", "arm", "--out", "arm") == 0
+    assert run(monkeypatch, "export", "arm", "--urdf", "two.urdf", "--out", "out.urdf") == 0
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
+    known, written = ro.use.identified(ro.load_result("arm")), ro.read_urdf("out.urdf", tip="smr")
+    reached = [numeric_frame(arm.base) @ ro.robot.forward_kinematics(arm.robot, q) for arm in (known, written)]
+    assert np.abs(reached[0] - reached[1]).max() < 1e-9
+
+
 def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch, capsys, made, tmp_path) -> None:
     q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
     robot = ro.load_result(made / "results").robot

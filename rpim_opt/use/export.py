@@ -32,7 +32,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
-from rpim_opt.robot.formats.urdf import read_urdf, write_origins, write_urdf
+from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 
@@ -264,7 +264,8 @@ def export_urdf(
     the place in the frames of the file's links: of the root in the instrument's frame, of the reflector in the tip
     link's.
 
-    ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`;
+    ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`, by
+    default those that the robot was read between;
     ``despite_verdict`` as for `export_files`. InputError for several reflectors of which none is named as the tip.
 
     Examples
@@ -286,6 +287,8 @@ def export_urdf(
     if any(name.startswith(OF_JOINTS) for name in of):
         return write_all([(Path(target), partial(_write_tree, result, of, source))], note)
     arm = identified(result, marker)
+    ends = remembered_ends(source, result.problem.robot)
+    root, tip = root or ends[0], tip or ends[1]
     own = read_urdf(source, root, tip)
     p = result.problem.parameters
     known = reflectors(p.names)
