@@ -465,6 +465,19 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     assert not (tmp_path / "both").exists()
 
 
+@pytest.mark.parametrize(("turn", "said"), [(0.0, ""), (np.pi, '"ceiling"'), (np.pi / 3, "[0.0, -0.866, -0.5]")])
+def test_a_robot_that_does_not_stand_upright_is_told_its_mounting(tmp_path, turn: float, said: str) -> None:
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
+    base, tool = numeric_frame(np.array([1.0, 0.5, 2.0, turn, 0.0, 0.0])), np.array([0.03, 0.0, 0.06, 1.0])
+    write_csv(tmp_path / "a.csv", HEADER, np.hstack([(base @ ro.robot.forward_kinematics(ARM, q) @ tool)[:, :3], q]))
+    ro.robot.write_robot(ARM, tmp_path / "arm.toml")
+    options = TableOptions(units=parse_units("rad,m"))
+    made = ro.store.new_problem(tmp_path / "cell", tmp_path / "arm.toml", tmp_path / "a.csv", options=options)
+    assert '# mounting = "floor" ' in (tmp_path / "cell" / "problem.toml").read_text()
+    noted = re.search(r"z points up, .*: mounting = (.*)\.$", made.notes[1])
+    assert (noted[1] if noted else "") == said
+
+
 def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, cell, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     beside = (

@@ -41,7 +41,7 @@ from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_source, read_arm
-from rpim_opt.robot.mdh import MDH
+from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of
 from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
 
@@ -56,6 +56,8 @@ GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)",
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 FARTHEST = 50.0
 """Distance from the instrument to a base beyond which the units are likely wrong [m]."""
+UPRIGHT = 0.9
+"""Cosine of the angle between two directions of gravity above which they are the same mounting."""
 CAMERA_CLEARLY = 3.0
 """The camera is where the poses fit so many times better."""
 
@@ -327,6 +329,9 @@ def _problem_text(
         **context,
         chain=chain,
         robot=arm.robot,
+        mounting={direction: word for word, direction in MOUNTINGS.items()}.get(
+            arm.robot.gravity.direction, list(arm.robot.gravity.direction)
+        ),
         followers=[i for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading],
         kind=kind,
         rows=rows,
@@ -374,7 +379,13 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
         return arm.base, how
     if np.linalg.norm(located[:3]) > FARTHEST:
         verdict = "implausibly far away: are the units right?"
-    return None, f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
+    how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
+    down = -numeric_frame(located)[2, :3]
+    if down @ arm.robot.gravity.direction < UPRIGHT and not kind.by_camera:
+        close = [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]
+        stated = toml(close[0] if close else down.round(3).tolist())
+        how += f" If the instrument's z points up, the robot is mounted otherwise than assumed: mounting = {stated}."
+    return None, how
 
 
 def _patterns(names: Sequence[str], dof: int) -> list[str]:
