@@ -496,6 +496,9 @@ def update(
     tables: Tables = TABLES,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
+    source: Annotated[
+        Text, Option(help="Who measured what, when, with which instrument; the files by default.")
+    ] = None,
     out: Folder = None,
 ) -> Answer:
     """Recalibrate with the previous result as prior, and report which parameters changed.
@@ -508,7 +511,10 @@ def update(
 
         read = tables.read(loaded, data)
         patterns = reset.replace(",", " ").split()
-        recalibration = update(loaded, read.data, prior_inflation=prior_inflation, reset=patterns, progress=say)
+        source = source or ", ".join(file.name for file in data)
+        recalibration = update(
+            loaded, read.data, prior_inflation=prior_inflation, reset=patterns, source=source, progress=say
+        )
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
     failed = not (recalibration.explained and updated.verdict.delivered)

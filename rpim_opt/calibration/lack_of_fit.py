@@ -21,7 +21,7 @@ from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.noise import UNITS
+from rpim_opt.problem.noise import UNITS, Repeatability
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 
@@ -224,7 +224,9 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     if compared.spare < FEWEST:
         return LackOfFit(**known)
     best = compared.best
-    after = _parts(compared, best)
+    # an update keeps the repeatability of the calibration before it, which few new readings do not tell
+    kept = result.problem.repeatability if result.record.earlier and not best.extensions else None
+    after = _parts(compared, best, kept)
     total = sum(part**2 for part in _parts(compared, compared.plain).values())  # the variance of a row
     share = 0.0
     if best.extensions:
@@ -290,9 +292,9 @@ def foreseen(problem: Source) -> tuple[LackOfFit | None, list[LeftOut]]:
 # --- parts of the residuals -------------------------------------------------------------------------------------------
 
 
-def _parts(compared: Comparison, model: Candidate) -> dict[str, float]:
+def _parts(compared: Comparison, model: Candidate, known: Repeatability | None = None) -> dict[str, float]:
     """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
-    repeatability = model.evidence.repeatability(model.point.logs)
+    repeatability = known or model.evidence.repeatability(model.point.logs)
     only = replace(repeatability, instrument=0.0, joint=0.0)
     own = repeatability.orientation if compared.dimension == "angle" else repeatability.position
     squares = {"instrument": 0.0, "position": 0.0, "joint": 0.0}

@@ -155,10 +155,10 @@ def weight_lines(result: Outcome) -> list[str]:
         last = result.record.earlier[-1]
         text = f"Prior: the posterior of '{last.title}', {last.rows} rows, made {last.made or 'just now'}"
         text += f" (digest {last.digest[:12]})"
-        if last.inflate != 1:
-            text += f", its standard deviations times {last.inflate:g}"
-        if last.let_go:
-            text += f", without {joined(last.let_go)}"
+        if last.prior_inflation != 1:
+            text += f", its standard deviations times {last.prior_inflation:g}"
+        if last.released:
+            text += f", without {joined(last.released)}"
         return [f"Formulation '{name}'.", f"{text}."]
     if result.learned is not None:
         names = result.problem.parameters.free.names

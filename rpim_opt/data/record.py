@@ -106,8 +106,8 @@ class Earlier(NamedTuple):
     """The earlier calibration that served as the prior.
 
     Its title, when it was made, the digest of its file and its number of rows; the least and the largest value of every
-    joint that it measured [rad or m], by robot; the factor on its standard deviations; parameters that were let go, and
-    rows of the new data that were left out.
+    joint that it measured [rad or m], by robot; the factor on its standard deviations; parameters that were released,
+    and rows of the new data that were excluded.
     """
 
     title: str
@@ -115,9 +115,9 @@ class Earlier(NamedTuple):
     digest: str
     rows: int
     ranges: Mapping[str, list[list[float]]]
-    inflate: float = 1.0
-    let_go: tuple[str, ...] = ()
-    left_out: tuple[str, ...] = ()
+    prior_inflation: float = 1.0
+    released: tuple[str, ...] = ()
+    excluded: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, eq=False)

@@ -451,9 +451,9 @@ def _provenance(content: Content) -> Iterator[Block]:
 
 
 def _changes(each: Earlier) -> str:
-    changes = ", ".join(each.let_go) or "no identifiable combination"
-    if each.inflate != 1:
-        changes += f"; standard deviations times {each.inflate:g}"
+    changes = ", ".join(each.released) or "no detectable change"
+    if each.prior_inflation != 1:
+        changes += f"; standard deviations times {each.prior_inflation:g}"
     return changes
 
 

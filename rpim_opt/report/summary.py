@@ -167,7 +167,7 @@ def headline(result: Calibration) -> str:
             )
     if result.record.earlier:
         last = result.record.earlier[-1]
-        changed = joined(last.let_go) if last.let_go else "no identifiable combination"
+        changed = joined(last.released) if last.released else "no detectable change"
         sentence += f" The prior is a calibration of {last.rows} rows; changed since then: {changed}."
     return sentence
 

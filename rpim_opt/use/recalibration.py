@@ -45,6 +45,8 @@ STRANGE = 5.0
 """Readings that no change explains, and that miss by so many times the error before any calibration, are another's."""
 RIVAL = 0.05  # probability from which on another cause is named beside the most probable one
 SHOWN = 5  # causes that are shown
+UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "
+"""What title and source of an updated calibration say."""
 
 
 class Fit(NamedTuple):
@@ -138,6 +140,7 @@ class Update:
             "causes": [cause._asdict() for cause in self.causes],
             "readings": self.readings,
             "converged": self.result.converged,
+            "verdict": {"delivered": self.result.verdict.delivered, "reasons": list(self.result.verdict.reasons)},
             "earlier": [each._asdict() for each in self.result.record.earlier],
         }
 
@@ -169,7 +172,8 @@ class Update:
             )
         rows = [[c.name, c.kind, f"{c.gain:.1f}", f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
         head = ["may have changed", "kind", "chi-squared falls by", "p-value", "posterior"]
-        return "\n".join([*lines, "", table(head, rows[:SHOWN]), "", self.result.message])
+        verdict = [] if self.result.verdict.delivered else [str(self.result.verdict)]
+        return "\n".join([*lines, *verdict, "", table(head, rows[:SHOWN]), "", self.result.message])
 
 
 def update(
@@ -178,6 +182,7 @@ def update(
     *,
     prior_inflation: float = 1.0,
     reset: Sequence[str] = (),
+    source: str = "New measurements",
     progress: Callable[[str], None] | None = None,
 ) -> Update:
     """Recalibrate a robot: the posterior of its previous calibration is the prior of this one.
@@ -190,7 +195,7 @@ def update(
     The result has a squared penalty or none. ``data`` are new measurements of the same robot, in the same instrument's
     frame unless ``reset`` says otherwise: patterns of parameters of which the earlier result says nothing,
     ``("base_*",)`` where the instrument moved. ``prior_inflation`` is a factor on the earlier standard deviations,
-    where everything may have drifted a little; ``progress`` is called with each step in words. InputError for a result
+    where everything may have drifted a little; ``source`` says where the data come from; ``progress`` is called with each step in words. InputError for a result
     without covariance (lasso), data in blocks, and readings that cannot be this robot's.
 
     >>> import numpy as np
@@ -265,12 +270,11 @@ def update(
         {robot: ranges.tolist() for robot, ranges in result.ranges.items()}, prior_inflation, released, left_out,
     )  # fmt: skip
     excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
-    source = f"New measurements; of the earlier calibration: {record.source}" if record.source else ""
-    if record.earlier:
-        source = record.source
+    first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
     record = Record(
-        record.title, source, excluded=excluded, simulated=record.simulated, requirement=record.requirement,
-        earlier=(*record.earlier, last), terms=record.terms,
+        f"{record.title.removesuffix(UPDATED)}{UPDATED}", f"{source}{BEFORE}{first_source}" if first_source else source,
+        excluded=excluded, simulated=record.simulated, noise_assumed=record.noise_assumed,
+        requirement=record.requirement, earlier=(*record.earlier, last), reading=record.reading, terms=record.terms,
     )  # fmt: skip
     return Update(replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data))
 

@@ -273,7 +273,7 @@ def test_validation_says_what_it_knows_and_what_not() -> None:
     assert "95 % prediction intervals" in said
 
 
-def test_everything_may_be_let_go() -> None:
+def test_everything_may_be_released() -> None:
     """Nothing of the last calibration but its widths is then left."""
     data = simulated(("theta[23]", "d4", "tool_[xyz]", "base_*"), 30, 5e-5, 3)[0].data
     found = ro.use.update(calibrated(), data, reset=["*"])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -12,6 +13,8 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text
+from rpim_opt.calibration.lack_of_fit import lack_of_fit
+from rpim_opt.calibration.uncertainty import position_budget
 from rpim_opt.store.problem_file import problems_folder
 from rpim_opt.store.serialize import digest
 from tests.simulate import simulated
@@ -166,7 +169,7 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     second = ro.load_result(tmp_path / "second.json")
     last = second.record.earlier[-1]
     assert last.digest == json.loads((tmp_path / "first.json").read_text(encoding="utf-8"))["digest"]
-    assert last.let_go == ("theta4",)
+    assert last.released == ("theta4",)
     assert f"(digest {last.digest[:12]})" in second.weight_sentence()
     assert "without theta4" in second.weight_sentence()
     again = second.asked(second.problem)  # a file holds the prior: it can be solved again
@@ -188,7 +191,27 @@ def test_an_update_that_released_nothing_is_reported(monkeypatch, tmp_path) -> N
     assert run(monkeypatch, "update", str(tmp_path), validation, "--out", out) == 0
     assert run(monkeypatch, "report", out) == 0
     page = (tmp_path / "new" / "report.html").read_text(encoding="utf-8")
-    assert "changed since then: no identifiable combination" in page
+    assert "changed since then: no detectable change" in page
+
+
+def test_provenance_names_the_new_measurements_and_the_noise_is_the_one_that_counts(monkeypatch, tmp_path) -> None:
+    instance = ro.load("position")
+    stated = replace(instance.record, title="Cell", source="Tracker, May", noise_assumed=True, reading={"units": "deg"})
+    first = replace(instance, record=stated).calibrate()
+    ro.store.save_result(replace(first, record=replace(first.record, validation=None)), tmp_path / "result.json")
+    june = shutil.copy(problems_folder() / "position" / "validation.csv", tmp_path / "june.csv")
+    assert run(monkeypatch, "update", str(tmp_path), str(june), "--out", str(tmp_path / "second")) == 0
+    arguments = ("--out", str(tmp_path / "third"), "--source", "Tracker, July")
+    assert run(monkeypatch, "update", str(tmp_path / "second"), str(june), *arguments) == 0
+    second, third = (ro.load_result(tmp_path / name) for name in ("second", "third"))
+    assert second.record.source == "june.csv; of the earlier calibration: Tracker, May"
+    assert third.record.source == "Tracker, July; of the earlier calibration: Tracker, May"
+    assert [each.record.title for each in (second, third)] == ["Cell (updated)"] * 2
+    assert [each.title for each in third.record.earlier] == ["Cell", "Cell (updated)"]
+    assert third.record.noise_assumed
+    assert third.record.reading == {"units": "deg"}
+    budget = position_budget(second, second.problem.data.q)["repeatability of the robot"]
+    assert lack_of_fit(second).robot == pytest.approx(np.sqrt(np.mean(budget)), rel=0.02)
 
 
 def test_what_was_measured_before_still_counts_as_measured(tmp_path, crashed: Robot, first, updated) -> None:
