@@ -701,9 +701,9 @@ def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> E
         step = np.asarray(np.linalg.lstsq(G, rest, rcond=1e-9)[0], dtype=float)
         gain = float(rest @ rest - np.sum((rest - G @ step) ** 2))
         spare = max(len(model.A) - len(x) - len(step), 1)
-        left = float(np.sqrt(max(whole - gain, 1e-300) / whole))
+        left = float(np.sqrt(max(whole - gain, 1e-300) / max(whole, 1e-300)))
         tried.append(((float(rest @ rest) - gain) / spare, gain, Explained(addition, step, left)))
-    if not tried:
+    if not tried or not whole:
         return None
     _, gain, best = min(tried, key=lambda each: each[0])
     spare = max(len(model.A) - len(x) - len(best.coefficients), 1)

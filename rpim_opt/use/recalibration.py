@@ -195,8 +195,9 @@ def update(
     The result has a squared penalty or none. ``data`` are new measurements of the same robot, in the same instrument's
     frame unless ``reset`` says otherwise: patterns of parameters of which the earlier result says nothing,
     ``("base_*",)`` where the instrument moved. ``prior_inflation`` is a factor on the earlier standard deviations,
-    where everything may have drifted a little; ``source`` says where the data come from; ``progress`` is called with each step in words. InputError for a result
-    without covariance (lasso), data in blocks, and readings that cannot be this robot's.
+    where everything may have drifted a little; ``source`` says where the data come from; ``progress`` is called with
+    each step in words. InputError for a result without covariance (lasso), data in blocks, and readings that cannot be
+    this robot's.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
