@@ -103,7 +103,9 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
             unit.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
             count += 1
         else:
-            demands = [substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.constraints[k]]
+            demands = [
+                substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.answers.constraints[k]
+            ]
             name = name_of(function, k)
             several = len(demands) > 1
             unit = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]

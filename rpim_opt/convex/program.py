@@ -475,7 +475,7 @@ class Program(Brief):
                 price = price - duals[-1]
             return tuple(duals)
         values = canonical.duals(found.x, found.dual)
-        groups = self.structure.constraints
+        groups = self.structure.answers.constraints
         return self._by_function([[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in groups])
 
     def _by_function(self, groups: Sequence[Sequence[Array]]) -> tuple[Array, ...]:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import copy
 import threading
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -48,75 +48,66 @@ MOST_CANONICALIZED = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
 
-@dataclass(frozen=True, eq=False)
 class Answers:
-    """Expressions that a formulation's functions returned, with private copies of the user's parameters and variables.
+    """Expressions that a formulation's functions return, with private copies of the user's parameters and variables.
 
     ``loss`` and ``penalty`` are of what they get (residuals or norms, z or norms of groups), ``penalty_of_z`` and
-    ``constraints`` of z; ``live`` are loss, penalty and constraints with the user's own parameters.
+    ``constraints``, one list for every function, of z; ``live`` are loss, penalty and constraints with the user's own
+    parameters.
     """
 
-    z: cp.Variable
-    r: cp.Variable
-    loss: Term
-    penalty: Any
-    penalty_of_z: Any
-    differences: list[Array]
-    constraints: list[list[Any]]
-    own: list[cp.Variable]
-    live: tuple[Any, Any, list[list[Any]]]
-    predicts: bool
+    def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
+        from rpim_opt.convex.unknown import Unknown  # imports CVXPY
 
+        where = f"formulation '{formulation.name}'"
+        z = self.z = Unknown(parameters.names)
+        r = self.r = cp.Variable(equations, name="r")
+        seen: cp.Variable = r
+        if formulation.loss_over == "configuration":
+            seen = cp.Variable(len(np.unique(groups)))
+        self.differences: list[Array] = []
+        penalized: cp.Variable = z
+        instead: dict[int, Any] = {}
+        if formulation.penalty_over is not None:
+            self.differences = [np.asarray(D, dtype=float) for D in formulation.penalty_over(parameters)]
+            penalized = cp.Variable(len(self.differences))
+            instead = {id(penalized): cp.hstack([cp.norm(D @ z) for D in self.differences])}
+        frozen = Frozen([z, r, seen, penalized], where)
+        live_loss = scalar(called(formulation.loss, f"{where}, loss", seen), f"{where}, loss")
+        self.loss = Term(frozen(live_loss), seen)
+        live_penalty: Any = None
+        self.penalty: Any = None
+        self.penalty_of_z: Any = None
+        if formulation.penalty is not None:
+            stated = scalar(called(formulation.penalty, f"{where}, penalty", penalized), f"{where}, penalty")
+            self.penalty = Term(frozen(stated), penalized)
+            live_penalty, self.penalty_of_z = (
+                substituted(each, instead) if instead else each for each in (stated, self.penalty.expression)
+            )
+        known = given(z, parameters)
+        live = []
+        for k, constraint in enumerate(formulation.constraints):
+            name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
+            of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
+            live.append(listed(called(constraint, of, z, known), of))
+        composed = {}
+        if instead and self.penalty is not None:
+            composed["penalty"] = self.penalty_of_z
+        if seen is not r:  # norms are convex and nonnegative, as absolute values are
+            composed["loss"] = substituted(self.loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))})
+        for what, expression in composed.items():
+            if not expression.is_convex():
+                accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
+                raise InputError(f"{where}, {what}", "a program that is not convex", accepted)
+        self.constraints = [[frozen(each) for each in group] for group in live]
+        self.flat = [constraint for group in self.constraints for constraint in group]
+        self.own = {variable.id for variable in frozen.own}
+        self.live = live_loss, live_penalty, live
+        self.predicts = bool(known.asked)
 
-def answers(formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray) -> Answers:
-    """Call the functions of a formulation for so many equations."""
-    from rpim_opt.convex.unknown import Unknown  # imports CVXPY
-
-    where = f"formulation '{formulation.name}'"
-    z = Unknown(parameters.names)
-    r = cp.Variable(equations, name="r")
-    seen: cp.Variable = r
-    if formulation.loss_over == "configuration":
-        seen = cp.Variable(len(np.unique(groups)))
-    differences: list[Array] = []
-    penalized: cp.Variable = z
-    if formulation.penalty_over is not None:
-        differences = [np.asarray(D, dtype=float) for D in formulation.penalty_over(parameters)]
-        penalized = cp.Variable(len(differences))
-
-    def over_z(expression: Any) -> Any:
-        if expression is None or penalized is z:
-            return expression
-        return substituted(expression, {id(penalized): cp.hstack([cp.norm(D @ z) for D in differences])})
-
-    frozen = Frozen([z, r, seen, penalized], where)
-    live_loss = scalar(called(formulation.loss, f"{where}, loss", seen), f"{where}, loss")
-    loss = Term(frozen(live_loss), seen)
-    live_penalty = penalty = None
-    if formulation.penalty is not None:
-        live_penalty = scalar(called(formulation.penalty, f"{where}, penalty", penalized), f"{where}, penalty")
-        penalty = Term(frozen(live_penalty), penalized)
-    known = given(z, parameters)
-    live = []
-    for k, constraint in enumerate(formulation.constraints):
-        name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
-        of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
-        live.append(listed(called(constraint, of, z, known), of))
-    penalty_of_z = None if penalty is None else over_z(penalty.expression)
-    composed = {}
-    if penalized is not z and penalty is not None:
-        composed["penalty"] = penalty_of_z
-    if seen is not r:  # norms are convex and nonnegative, as absolute values are
-        composed["loss"] = substituted(loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))})
-    for what, expression in composed.items():
-        if not expression.is_convex():
-            accepted = f"CVXPY's DCP rules: nondecreasing over norms; {reason(expression)}"
-            raise InputError(f"{where}, {what}", "a program that is not convex", accepted)
-    constraints = [[frozen(each) for each in group] for group in live]
-    functions = live_loss, over_z(live_penalty), live
-    return Answers(
-        z, r, loss, penalty, penalty_of_z, differences, constraints, frozen.own, functions, bool(known.asked)
-    )
+    def owned(self, *stated: Any) -> set[int]:
+        """Return which of the functions' own variables some expressions and constraints have."""
+        return self.own & {v.id for each in stated if each is not None for v in each.variables()}
 
 
 def declared_form(function: Any, size: int) -> Quadratic | None:
@@ -175,7 +166,7 @@ class Structure:
         """The expressions; the functions are called once, whichever thread needs them first."""
         with self._lock:
             if self._called is None:
-                self._called = answers(self.formulation, self.parameters, self.equations, self.groups)
+                self._called = Answers(self.formulation, self.parameters, self.equations, self.groups)
         return self._called
 
     @property
@@ -187,16 +178,6 @@ class Structure:
     def over_norms(self) -> bool:
         """Whether the loss gets the configurations' norms."""
         return self.formulation.loss_over == "configuration"
-
-    @property
-    def constraints(self) -> list[list[Any]]:
-        """The constraints of z, one list for every function."""
-        return self.answers.constraints
-
-    @property
-    def flat(self) -> list[Any]:
-        """All constraints of z."""
-        return [constraint for group in self.constraints for constraint in group]
 
     def of_r(self, stated: Any) -> Any:
         """Return an expression of what the loss gets as one of r."""
@@ -214,10 +195,10 @@ class Structure:
         for name in ("loss_form", "loss", "loss_of_r", "joint", "inner", "by_configuration"):
             vars(made).pop(name, None)
         if self._called is not None:  # the functions of penalty and constraints are not called again
-            r = cp.Variable(self.n + 1, name="r")
-            loss = Term(cp.sum_squares(r), r)
-            live = (loss.expression, *self._called.live[1:])
-            made._called = replace(self._called, r=r, loss=loss, live=live)
+            own = made._called = copy.copy(self._called)
+            own.r = cp.Variable(self.n + 1, name="r")
+            own.loss = Term(cp.sum_squares(own.r), own.r)
+            own.live = (own.loss.expression, *own.live[1:])
         made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation")
         made.equations = self.n + 1
         return made
@@ -282,7 +263,7 @@ class Structure:
             return Canonical.box(self.penalty_form, *self.box)
         penalty = self.answers.penalty_of_z
         with self._lock:
-            return Canonical(cp.Constant(0.0) if penalty is None else penalty, self.flat, self.answers.z)
+            return Canonical(cp.Constant(0.0) if penalty is None else penalty, self.answers.flat, self.answers.z)
 
     @cached_property
     def loss(self) -> Loss | None:
@@ -301,24 +282,18 @@ class Structure:
 
     # --- values ------------------------------------------------------------------------------------------------
 
-    def _own_of(self, *stated: Any) -> set[int]:
-        """Return which of the functions' own variables some expressions and constraints have."""
-        if self._declared or not self.answers.own:
-            return set()
-        own = {variable.id for variable in self.answers.own}
-        return own & {v.id for each in stated if each is not None for v in each.variables()}
-
     @cached_property
     def inner(self) -> bool:
         """Whether loss or penalty have variables of their own: a value is a minimum over them."""
-        return not self._declared and bool(self._own_of(self.answers.loss.expression, self.answers.penalty_of_z))
+        return not self._declared and bool(self.answers.owned(self.answers.loss.expression, self.answers.penalty_of_z))
 
     @cached_property
     def joint(self) -> bool:
         """Whether the loss shares variables with penalty or constraints: then they are one program."""
         if self._declared:
             return False
-        return bool(self._own_of(self.answers.loss.expression) & self._own_of(self.answers.penalty_of_z, *self.flat))
+        a = self.answers
+        return bool(a.owned(a.loss.expression) & a.owned(a.penalty_of_z, *a.flat))
 
     def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
         """Return loss and penalty at numbers; variables of the functions' own are at their best."""
@@ -333,7 +308,7 @@ class Structure:
             penalty: Any = cp.Constant(0.0)
             if self.answers.penalty_of_z is not None:
                 penalty = substituted(self.answers.penalty_of_z, instead)
-            tied = [substituted(c, instead) for c in self.flat if self._own_of(c)]
+            tied = [substituted(c, instead) for c in self.answers.flat if self.answers.owned(c)]
             problem = cp.Problem(cp.Minimize(loss + weight * penalty), tied)
             for variable in problem.variables():
                 variable.save_value(None)
@@ -346,15 +321,15 @@ class Structure:
     def _at_best(self) -> tuple[Callable[[Array], float], Callable[[Array], float]]:
         """Loss and penalty of r and z, each with the variables of its own, which it does not share, at their best."""
         loss, best_loss, best_penalty = self.answers.loss, self.loss_of, self.penalty_of
-        if self._own_of(loss.expression):
+        if self.answers.owned(loss.expression):
             form = self.loss
             if form is not None and form.threshold is not None:
                 best_loss = lambda r: form.best(self.seen(r))[0]  # noqa: E731
             else:
                 canonical = Canonical(loss.expression, [], loss.variable)
                 best_loss = lambda r: canonical.at_best(self.seen(r))  # noqa: E731
-        if self._own_of(self.answers.penalty_of_z):
-            tied = [c for c in self.flat if self._own_of(c)]
+        if self.answers.owned(self.answers.penalty_of_z):
+            tied = [c for c in self.answers.flat if self.answers.owned(c)]
             best_penalty = Canonical(self.answers.penalty_of_z, tied, self.answers.z).at_best
         return best_loss, best_penalty
 
@@ -381,11 +356,11 @@ class Structure:
         """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""
         own = self.answers.z
         with self._lock:
-            if any(variable is not own for limit in self.flat for variable in limit.variables()):
+            if any(variable is not own for limit in self.answers.flat for variable in limit.variables()):
                 return False
             own.save_value(z)
             with np.errstate(all="ignore"):
-                return not any(np.any(limit.violation() > 0) for limit in self.flat)
+                return not any(np.any(limit.violation() > 0) for limit in self.answers.flat)
 
 
 def structure(

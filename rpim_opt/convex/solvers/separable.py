@@ -9,15 +9,14 @@ sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a kink are 
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, reduce
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.expressions import cp
+from rpim_opt.convex.expressions import Evaluation, cp, evaluation, has, is_norm
 from rpim_opt.convex.solvers.conic import Canonical, Damping, Point, ReducedProgram, ReducedSquares, Unsolved
 
 DECREASE = 1e-12
@@ -349,10 +348,6 @@ def gram(A: Array, weights: Array) -> Array:
 # --- sums over entries, read from CVXPY's expression tree ---
 
 
-class OutsideDomain(Exception):
-    """Raised outside the domain of the loss, where it has no derivative."""
-
-
 class Loss:
     """A loss f(v) that is no square, of residuals v (M,), or where ``positive`` of configurations' norms.
 
@@ -514,21 +509,17 @@ def _by_threshold(e: Any) -> Any:
     return e
 
 
-def _has(e: Any, v: Any) -> bool:
-    return v.id in {each.id for each in e.variables()}
-
-
 def _summands(e: Any, v: Any) -> Any:
     """Return the entrywise expression (M,) whose sum a scalar expression is, up to what v does not change, or None."""
     name = type(e).__name__
-    if e.size != 1 or not _has(e, v):
+    if e.size != 1 or not has(e, v):
         return None
     if name in ("Sum", "norm1", "quad_over_lin"):
         entries = {"Sum": lambda a: a, "norm1": cp.abs, "quad_over_lin": cp.square}[name](e.args[0])
         if name == "quad_over_lin" and e.args[1].is_constant():
             entries = entries / e.args[1]
         return _checked(entries, v)
-    parts = [_summands(a, v) if _has(a, v) else a for a in e.args]
+    parts = [_summands(a, v) if has(a, v) else a for a in e.args]
     if name == "MulExpression" and parts[0] is e.args[0] and v.shape == e.args[1].shape:  # weights @ entries
         return _checked(cp.multiply(cp.reshape(e.args[0], v.shape, order="C"), e.args[1]), v)
     if any(part is None for part in parts):
@@ -552,20 +543,14 @@ def entrywise(e: Any, v: Any) -> bool:
     """Return whether entry i of an expression depends on v_i alone."""
     from cvxpy.atoms.elementwise.elementwise import Elementwise
 
-    if e is v or not _has(e, v):
+    if e is v or not has(e, v):
         return True
     if e.shape != v.shape:
         return False
-    if _is_norm(e):
+    if is_norm(e):
         return all(a.shape == v.shape and entrywise(a, v) for a in e.args[0].args)
-    known = isinstance(e, Elementwise) or type(e).__name__ in AFFINE
+    known = isinstance(e, Elementwise) or type(e).__name__ in (*SCALED, "NegExpression")
     return known and all((a.shape == v.shape or a.size == 1) and entrywise(a, v) for a in e.args)
-
-
-def _is_norm(e: Any) -> bool:
-    """Whether an expression is the 2-norm, entry by entry, of several vectors (pseudo-Huber: of v and a constant)."""
-    named = type(e).__name__.startswith("Pnorm") and type(e.args[0]).__name__ == "Vstack"
-    return named and float(e.p) == 2 and e.axis == 0
 
 
 def _restricted(e: Any, v: Any, own: Any, which: np.ndarray) -> Any:
@@ -580,96 +565,7 @@ def _restricted(e: Any, v: Any, own: Any, which: np.ndarray) -> Any:
         return cp.Constant(np.squeeze(e.value) if e.size == 1 else e.value)
     if type(e).__name__ in ("Promote", "reshape"):
         return _restricted(e.args[0], v, own, which)
-    if _is_norm(e):
+    if is_norm(e):
         rows = [_restricted(a, v, own, which) + np.zeros(own.size) for a in e.args[0].args]
         return cp.norm(cp.vstack(rows), 2, axis=0)
     return e.copy([_restricted(a, v, own, which) for a in e.args])
-
-
-# --- values and slopes -------------------------------------------------------------------------------------------
-
-Evaluation = Callable[[Array], tuple[Any, Any]]
-"""Value and derivative of every entry at numbers v (M,)."""
-
-
-def evaluation(e: Any, v: Any) -> Evaluation:
-    """Return how an expression e that is `entrywise` in v is evaluated, by forward differentiation."""
-    if e is v:
-        return lambda x: (x, 1.0)
-    if not _has(e, v):
-        number = np.ravel(e.value) if e.size > 1 else np.squeeze(e.value)
-        return lambda x: (number, 0.0)
-    norm = _is_norm(e)
-    inner = [evaluation(a, v) for a in (e.args[0].args if norm else e.args)]
-    name = "norm" if norm else type(e).__name__
-    affine, atom = AFFINE.get(name), ATOMS.get(name)
-
-    moving = [k for k, a in enumerate(e.args[0].args if norm else e.args) if _has(a, v)]
-
-    def evaluated(x: Array) -> tuple[Any, Any]:
-        values, slopes = zip(*[part(x) for part in inner], strict=True)
-        if affine is not None:
-            return affine(values, slopes)
-        with np.errstate(all="ignore"):
-            value, parts = atom(e, values) if atom else _by_cvxpy(e, values)
-        return value, sum([parts[k] * slopes[k] for k in moving])
-
-    return evaluated
-
-
-def _by_cvxpy(e: Any, values: Sequence[Any]) -> tuple[Any, list[Any]]:
-    """Return value and partial derivatives of an atom, by CVXPY's sparse Jacobians."""
-    shape = np.broadcast_shapes(*(np.shape(value) for value in values))
-    full = [np.broadcast_to(np.asarray(value, dtype=float), shape) for value in values]
-    value, parts = e.numeric(full), e._grad(full)
-    if any(part is None for part in parts):
-        raise OutsideDomain
-    return value, [part.diagonal() for part in parts]
-
-
-def _product(values: Sequence[Any], slopes: Sequence[Any]) -> tuple[Any, Any]:
-    return values[0] * values[1], slopes[0] * values[1] + slopes[1] * values[0]
-
-
-AFFINE: dict[str, Callable[[Any, Any], tuple[Any, Any]]] = {
-    "AddExpression": lambda values, slopes: (sum(values), sum(slopes)),
-    "NegExpression": lambda values, slopes: (-values[0], -slopes[0]),
-    "Promote": lambda values, slopes: (values[0], slopes[0]),
-    "reshape": lambda values, slopes: (values[0], slopes[0]),
-    "DivExpression": lambda values, slopes: (values[0] / values[1], slopes[0] / values[1]),
-    "multiply": _product,
-    "MulExpression": _product,
-}
-"""Affine expressions: value and derivative, from those of what they are made of."""
-
-
-def _huber(e: Any, v: Sequence[Array]) -> tuple[Array, list[Array]]:
-    cut = np.clip(v[0], -e.M.value, e.M.value)
-    return cut * (2 * v[0] - cut), [2 * cut]
-
-
-def _maximum(_: Any, v: Sequence[Any]) -> tuple[Array, list[Array]]:
-    value: Any = reduce(np.maximum, v)
-    free: Any = True  # where none of those before is the largest
-    parts = []
-    for each in v:
-        largest = free & (each == value)
-        parts.append(largest * 1.0)
-        free = free & ~largest
-    return value, parts
-
-
-def _norm(_: Any, v: Sequence[Any]) -> tuple[Any, list[Any]]:
-    length = np.sqrt(sum(np.square(each) for each in v))
-    return length, [each / np.maximum(length, 1e-300) for each in v]
-
-
-ATOMS: dict[str, Callable[[Any, Any], tuple[Any, list[Any]]]] = {
-    "huber": _huber,
-    "abs": lambda _, v: (np.abs(v[0]), [np.sign(v[0])]),
-    "maximum": _maximum,
-    "logistic": lambda _, v: (np.logaddexp(0.0, v[0]), [1.0 / (1.0 + np.exp(-v[0]))]),
-    "exp": lambda _, v: (np.exp(v[0]), [np.exp(v[0])]),
-    "norm": _norm,
-}
-"""Atoms that losses are mostly made of: value and partial derivatives. CVXPY evaluates any other."""

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.expressions import OutsideDomain
 from rpim_opt.convex.solvers.conic import (
     EQUILIBRATED,
     Canonical,
@@ -19,7 +20,7 @@ from rpim_opt.convex.solvers.conic import (
     ReducedSquares,
     Unsolved,
 )
-from rpim_opt.convex.solvers.separable import FEW_ENTRIES, TINY, Loss, Newton, OutsideDomain, Rows
+from rpim_opt.convex.solvers.separable import FEW_ENTRIES, TINY, Loss, Newton, Rows
 
 if TYPE_CHECKING:
     from rpim_opt.convex.structure import Structure
