@@ -125,17 +125,15 @@ class Box:
     def __call__(self, z: Any, parameters: Parameters) -> list[Any]:
         """Return the CVXPY constraints."""
         lower, upper = self.bounds(parameters)
-        fixed = np.flatnonzero(lower == upper)
-        low = np.flatnonzero(np.isfinite(lower) & (lower < upper))
-        high = np.flatnonzero(np.isfinite(upper) & (lower < upper))
-        made: list[Any] = []
-        if len(fixed):
-            made.append(z[fixed] == lower[fixed])
-        if len(low):
-            made.append(z[low] >= lower[low])
-        if len(high):
-            made.append(z[high] <= upper[high])
-        return made
+        fixed, low, high = (np.flatnonzero(side) for side in box_sides(lower, upper))
+        made = [z[fixed] == lower[fixed], z[low] >= lower[low], z[high] <= upper[high]]
+        return [each for each in made if each.size]
+
+
+def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return which components (n,) of a box are fixed, and which of the others have a lower and an upper bound."""
+    fixed = lower == upper
+    return fixed, np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
 
 
 def _tolerances(parameters: Parameters) -> tuple[Array, Array]:

@@ -15,12 +15,12 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import Brief
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.convex.constraints import Box
+from rpim_opt.convex.constraints import Box, box_sides
 from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
-from rpim_opt.convex.solvers.conic import Damping, Point, ReducedSquares, Unsolved, box_sides, nearest
+from rpim_opt.convex.solvers.conic import Damping, Point, Unsolved, nearest
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
 from rpim_opt.convex.structure import Structure, structure
@@ -208,12 +208,8 @@ class Program(Brief):
         if self.structure.by_configuration is not None:
             order, sizes = self.structure.by_configuration
             A, b = A[order], b[order]
-        return Rows(A, b, sizes, self.model.triangle)
-
-    @property
-    def _squares(self) -> ReducedSquares | None:
-        """A quadratic loss, reduced to n + 1 rows."""
-        return None if self.loss_form is None else ReducedSquares.of_factor(self.squared.triangle)
+        model = self.model if self.loss_form is None else self.squared
+        return Rows(A, b, sizes, model.triangle)
 
     # --- values --------------------------------------------------------------------------------------------------
 
@@ -407,7 +403,7 @@ class Program(Brief):
         if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
             return None
         try:
-            optimum = minimum(self.structure.loss, self._rows, self._warm.begun(z), weight, self._squares)
+            optimum = minimum(self._rows, self._warm.begun(z), weight)
         except Unsolved:
             return None
         p = self.structure.canonical
@@ -447,9 +443,8 @@ class Program(Brief):
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss; where that fails, CVXPY's."""
-        of = self.structure.loss, self._rows, self._warm, weight, self._squares
         try:
-            optimum = minimum(*of, damping, accuracy)
+            optimum = minimum(self._rows, self._warm, weight, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)

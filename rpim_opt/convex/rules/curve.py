@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.program import Estimate, Program
-from rpim_opt.convex.rules.selection import Selection, least_between, on_squares, skipped, solved, weight_grid
+from rpim_opt.convex.rules.selection import Selection, choice, least_between, on_squares, skipped, solved, weight_grid
 
 SLOWEST = 1e-200
 """Squared speed below which a curve stands still."""
@@ -34,7 +36,7 @@ def l_curve(program: Program) -> Selection:
     >>> f"{result.weight:.2g}", result.selection.interior
     ('1.8e-05', True)
     """
-    failed = 0
+    failed = ""
     if program.closed_form:
         weights = weight_grid(program)
         score = _curvature(program, weights)
@@ -42,9 +44,8 @@ def l_curve(program: Program) -> Selection:
         every = weight_grid(program, GRID)
         points = _points(solved(program, every))
         finite = np.isfinite(points[:, 0])
-        failed = int(np.count_nonzero(~finite))
-        weights = every[finite]
-        score = menger(points[finite])
+        failed = skipped(int(np.count_nonzero(~finite)))
+        weights, score = every[finite], menger(points[finite])
     best = int(np.argmax(score))
     if not program.linear_penalty:  # where the last parameters vanish, a path bends like at a corner, far above noise
         peaks = np.flatnonzero((score[1:-1] >= score[:-2]) & (score[1:-1] > score[2:])) + 1
@@ -52,19 +53,16 @@ def l_curve(program: Program) -> Selection:
         best = int(sharp[0]) if len(sharp) else best
     if not score[best] > 0:
         best = 0
-    if not 0 < best < len(weights) - 1:
-        note = (
-            f"the L-curve has no corner: the weight is the {'lower' if best == 0 else 'upper'} edge of "
-            f"{weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a weight of your own, may serve better"
-            f"{skipped(failed)}"
-        )
-        return Selection(float(weights[best]), "l_curve", weights, score, interior=False, note=note)
-    weight = float(weights[best])
-    if program.closed_form:
+    no_corner = (
+        f"the L-curve has no corner: the weight is the {'lower' if best == 0 else 'upper'} edge of "
+        f"{weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a weight of your own, may serve better"
+    )
+    chosen = choice("l_curve", weights, score, best, "corner of the L-curve" + failed, no_corner + failed)
+    if chosen.interior and program.closed_form:
         refined, opposite = least_between(lambda tried: -_curvature(program, tried), weights, best)
         if -opposite > score[best]:  # the search sees one maximum of several
-            weight = refined
-    return Selection(weight, "l_curve", weights, score, interior=True, note="corner of the L-curve" + skipped(failed))
+            chosen = replace(chosen, weight=refined)
+    return chosen
 
 
 def _points(estimates: list[Estimate | None]) -> Array:

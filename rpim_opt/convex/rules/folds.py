@@ -14,10 +14,9 @@ from rpim_opt.convex.rules.scores import linear_rule
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
-    edge,
+    choice,
     on_squares,
     searched,
-    skipped,
     solved,
     weight_grid,
     with_rows,
@@ -107,16 +106,9 @@ def two_step(program: Program) -> Selection:
         score = np.sqrt(_of_squares(program)(fine) / len(program.model.b))
     else:
         score = held_out_error(program, _singly(program))(fine)
-    best = int(np.nanargmin(score))
-    failed = np.isnan(score)
-    interior = 0 < best < len(fine) - 1
     note = "the paper's two steps: residual norm, then held-out error"
-    if not interior:
-        note += (
-            "; the held-out error is smallest at an edge of the ten weights, so a wider range of weights may be better"
-        )
-    note += skipped(int(failed.sum()))
-    return Selection(float(fine[best]), "two_step", fine[~failed], score[~failed], interior, note)
+    edge = "; the held-out error is smallest at an edge of the ten weights, so a wider range of weights may be better"
+    return choice("two_step", fine, score, int(np.nanargmin(score)), note, at_edge=note + edge)
 
 
 def _least(program: Program, name: str, error: Score) -> Selection:
@@ -127,11 +119,7 @@ def _least(program: Program, name: str, error: Score) -> Selection:
         best = int(np.argmin(score))
     else:
         weights, score, best = searched(error, weight_grid(program, COARSE))
-    interior = 0 < best < len(weights) - 1
-    failed = np.isnan(score)
-    note = "smallest k-fold cross-validation error" if interior else edge(best)
-    note += skipped(int(failed.sum()))
-    return Selection(float(weights[best]), name, weights[~failed], score[~failed], interior, note)
+    return choice(name, weights, score, best, "smallest k-fold cross-validation error")
 
 
 # --- errors of what is left out --------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from rpim_opt.convex.quadratic import identity, ridge, robot_alone
 from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
-    edge,
+    choice,
     grid_of,
     least_between,
     on_squares,
@@ -43,10 +43,8 @@ def linear_rule(program: Program, name: str, score: Score, note: str, local: boo
     valleys = np.flatnonzero((scores[1:-1] <= scores[:-2]) & (scores[1:-1] < scores[2:])) + 1
     if local and len(valleys):
         best = int(valleys[np.argmin(scores[valleys])])
-    if not 0 < best < len(weights) - 1:
-        return Selection(float(weights[best]), name, weights, scores, False, edge(best))
-    weight, _ = least_between(score, weights, best)
-    return Selection(weight, name, weights, scores, True, note)
+    chosen = choice(name, weights, scores, best, note)
+    return replace(chosen, weight=least_between(score, weights, best)[0]) if chosen.interior else chosen
 
 
 @on_squares

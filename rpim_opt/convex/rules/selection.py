@@ -111,9 +111,14 @@ EDGES = {
 """What it means that a rule chooses an edge of its grid."""
 
 
-def edge(best: int) -> str:
-    """Return the note on a choice at the first or the last weight."""
-    return EDGES["lower" if best == 0 else "upper"]
+def choice(name: str, weights: Array, score: Array, best: int, note: str, at_edge: str = "") -> Selection:
+    """Return the selection of one of some weights (K,), with its note at an edge; NaN is where the solver failed."""
+    failed = np.isnan(score)
+    interior = 0 < best < len(weights) - 1
+    if not interior:
+        note = at_edge or EDGES["lower" if best == 0 else "upper"]
+    note += skipped(int(failed.sum()))
+    return Selection(float(weights[best]), name, weights[~failed], score[~failed], interior, note)
 
 
 def solved(program: Program, weights: Sequence[float] | Array) -> list[Estimate | None]:

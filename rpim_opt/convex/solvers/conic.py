@@ -13,6 +13,7 @@ import numpy as np
 from scipy.linalg import get_lapack_funcs, qr
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.convex.constraints import box_sides
 from rpim_opt.convex.expressions import cp, norms, substituted
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE
@@ -225,12 +226,6 @@ def _scales(A: Any, m: int, n: int, at: np.ndarray, linear: int, cones: list[int
     return np.divide(1.0, size, out=np.ones(m), where=size > 0), column
 
 
-def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return which components (n,) of a box are fixed, and which of the others have a lower and an upper bound."""
-    fixed = lower == upper
-    return fixed, np.isfinite(lower) & ~fixed, np.isfinite(upper) & ~fixed
-
-
 @cache
 def _settings(attempt: Attempt) -> Any:
     """Return Clarabel's settings with some that are another attempt's."""
@@ -320,23 +315,18 @@ class ReducedSquares:
     g: Array
 
     @classmethod
-    def of_rows(cls, A: Array, b: Array, g: Array | None = None) -> ReducedSquares:
-        """Return the squares of rows (m, n) and (m,), reduced by QR."""
-        n = A.shape[1]
-        T = np.linalg.qr(np.column_stack([A, b]), mode="r")
-        return cls.of_factor(np.vstack([T, np.zeros((n + 1 - len(T), n + 1))]), g)
-
-    @classmethod
-    def of_factor(cls, T: Array, g: Array | None = None) -> ReducedSquares:
+    def of_factor(cls, T: Array) -> ReducedSquares:
         """Return the squares of a QR factor (n + 1, n + 1) of [A b]."""
-        return cls(T[:, :-1], T[:, -1], np.zeros(len(T) - 1) if g is None else g)
+        return cls(T[:, :-1], T[:, -1], np.zeros(len(T) - 1))
 
     def damped(self, damping: Damping | None) -> ReducedSquares:
         """Return the squares with damping added."""
         if damping is None:
             return self
-        R = np.vstack([self.R, np.diag(damping.size)])
-        return ReducedSquares.of_rows(R, np.concatenate([self.y, damping.size * damping.centre]), self.g)
+        rows = np.column_stack([np.diag(damping.size), damping.size * damping.centre])
+        T: Any = np.linalg.qr(np.vstack([np.column_stack([self.R, self.y]), rows]), mode="r")
+        missing = np.zeros((T.shape[1] - len(T), T.shape[1]))
+        return replace(ReducedSquares.of_factor(np.vstack([T, missing])), g=self.g)
 
 
 @dataclass(frozen=True, eq=False)

@@ -60,7 +60,7 @@ PROBES = 64
 
 @dataclass(frozen=True, eq=False)
 class Rows:
-    """Equations A z ~ b, (m, n) and (m,), with the QR factor of [A b].
+    """Equations A z ~ b, (m, n) and (m,), with the QR factor of [A b], or of what a quadratic loss squares.
 
     ``sizes`` (N,) counts the equations of configurations, which stand together; None where the loss gets equations.
     """
@@ -79,7 +79,7 @@ class Rows:
 
     @cached_property
     def squares(self) -> ReducedSquares:
-        """|A z - b|^2, reduced."""
+        """|A z - b|^2, or a quadratic loss, reduced."""
         return ReducedSquares.of_factor(self.triangle)
 
     @cached_property

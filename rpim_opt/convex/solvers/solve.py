@@ -71,15 +71,7 @@ class WarmStart:
         return WarmStart(self.structure, kink=self.kink).begin(z)
 
 
-def minimum(
-    loss: Loss | None,
-    rows: Rows,
-    warm: WarmStart,
-    weight: float,
-    squares: ReducedSquares | None = None,
-    damping: Damping | None = None,
-    accuracy: float = 0.0,
-) -> Point:
+def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
     """Return the minimum of a convex program; the structure of the loss selects the solver.
 
     ========================== =====================================================
@@ -91,14 +83,13 @@ def minimum(
     any other                  all rows
     ========================== =====================================================
 
-    A quadratic loss is None, with ``squares`` in its place. ``accuracy`` is the part of the loss that a sum over rows
-    may be above its minimum. Unsolved where no minimum is found, also by a small program of proximal Newton: then CVXPY
-    solves all rows (`Program.solve`).
+    ``accuracy`` is the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is
+    found, also by a small program of proximal Newton: then CVXPY solves all rows (`Program.solve`).
     """
     with warm.lock:
-        n = rows.A.shape[1]
+        loss = warm.structure.loss
         if loss is None:
-            point = warm.program(n + 1).solve((squares or rows.squares).damped(damping), weight)
+            point = warm.program(rows.A.shape[1] + 1).solve(rows.squares.damped(damping), weight)
         elif not loss.separable:
             point = _coupled(loss, rows, warm, weight, damping)
         else:
