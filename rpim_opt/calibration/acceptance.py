@@ -395,8 +395,10 @@ def _held_out(
         )
         missed += [moved] if moved else []
     lacking: list[str] = []
-    if rows < FEWEST:
-        lacking.append(f"Missing: at least {FEWEST} held-out rows; there are {rows}.")
+    if count < FEWEST:
+        measured = any(region.rows(part.data).any() for part in result.problem.rows())
+        reason = f"Missing: at least {FEWEST} held-out rows in the region; it holds {count} of {rows}."
+        lacking.append(reason if measured else f"{reason} No identification row is in it either.")
     if beyond:
         lacking.append(
             f"Missing: valid prediction intervals. Rows outside them: {listed(beyond, MOST)}. "
@@ -413,8 +415,6 @@ def _held_out(
             lacking.append(f"Missing: valid prediction intervals. Only {share}.")
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
-        if not any(region.rows(part.data).any() for part in result.problem.rows()):
-            lacking.append("Missing: measurements in the region. No identification row is in it either.")
     if excluded:
         sentence += f". Not counted: {listed(excluded, MOST)}, excluded from the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}

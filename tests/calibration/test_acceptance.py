@@ -153,7 +153,8 @@ def test_held_out_rows_may_be_elsewhere(result) -> None:
     rows = result.problem.data.q[:, 0]
     wide = accept(result, Requirement(1e-3, joints=((1, (rows.min(), rows.min() + 1e-3)),)))
     assert wide.content()["checked"]["in_region"] == 0
-    assert wide.verdict == "accepted"  # an identification row is in it
+    assert wide.verdict == "inconclusive"  # though an identification row is in it
+    assert wide.reasons == ("Missing: at least 5 held-out rows in the region; it holds 0 of 40.",)
 
 
 def test_a_region_in_which_nothing_was_measured_is_not_accepted(result) -> None:
@@ -164,7 +165,24 @@ def test_a_region_in_which_nothing_was_measured_is_not_accepted(result) -> None:
     found = accept(result, Requirement(1e-3, box=box))
     assert found.bound < 1e-3
     assert found.verdict == "inconclusive"
-    assert found.reasons == ("Missing: measurements in the region. No identification row is in it either.",)
+    missing = (
+        "Missing: at least 5 held-out rows in the region; it holds 0 of 40. No identification row is in it either."
+    )
+    assert found.reasons == (missing,)
+
+
+@pytest.mark.parametrize(("count", "verdict"), [(1, "inconclusive"), (4, "inconclusive"), (5, "accepted")])
+def test_a_box_with_too_few_held_out_rows_decides_nothing(result, count: int, verdict: str) -> None:
+    """Nor do the rows outside it stand for those in it, though the bound is kept."""
+    region = region_of(result, Requirement(1e-3))
+    there = in_base(region.problem, result.record.validation.q)
+    box = ((-9.0, float(np.sort(there[:, 0])[count - 1]) + 1e-9), (-9.0, 9.0), (-9.0, 9.0))
+    found = accept(result, Requirement(1e-3, box=box))
+    assert found.verdict == verdict
+    assert found.content()["checked"]["in_region"] == count
+    assert found.reasons == (
+        () if count == 5 else (f"Missing: at least 5 held-out rows in the region; it holds {count} of 40.",)
+    )
 
 
 def moved(data: ro.Dataset, rows: list[int], by: float) -> ro.Dataset:
