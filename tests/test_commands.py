@@ -487,7 +487,11 @@ def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, c
     arguments = ("new", "arm", "--robot", "two.urdf", "--data", str(cell / "measured.csv"), "--units", "rad,m")
     assert run(monkeypatch, *arguments) == 2
     assert "--urdf-tip" in capsys.readouterr().err
+    assert run(monkeypatch, "new", "short", *arguments[2:], "--urdf-tip", "link_5") == 0
+    ignored = "Ignored joint values: joint_6. The robot (two.urdf, base_link to link_5) has 5 joints"
+    assert ignored in capsys.readouterr().out
     assert run(monkeypatch, *arguments, "--urdf-tip", "smr") == 0
+    assert "Ignored joint values" not in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "arm", "--out", "arm") == 0
     assert run(monkeypatch, "export", "arm", "--urdf", "two.urdf", "--out", "out.urdf") == 0
     q = np.random.default_rng(2).uniform(-2, 2, (20, 6))

@@ -27,10 +27,12 @@ from rpim_opt.basics.files import (
 )
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
-from rpim_opt.basics.units import UNITS
+from rpim_opt.basics.text import joined
+from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_board, on_board, read_board
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.tables.names import recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import identifiable
@@ -174,6 +176,13 @@ def new_problem(
         notes.append(
             "[tool] and --tool refer to the flange frame after the last joint. In it the last frame of the DH table is "
             f"at {placed(arm.tool)}: transform points of the table's frame by it."
+        )
+    known = [f"q{i}" for i in range(arm.robot.dof + 1, arm.robot.dof + 9)]
+    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in known]
+    if further:
+        notes.append(
+            f"Ignored joint values: {joined(further)}. The robot ({arm.robot.source or arm.robot.name}) has "
+            f"{arm.robot.dof} joints; if these move the tool, state another robot, or another link: --urdf-tip."
         )
     if before:
         notes.append(SHARED)
