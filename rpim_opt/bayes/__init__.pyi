@@ -1,2 +1,2 @@
 from .prior import Prior as Prior
-from .prior_terms import Stated as Stated
+from .prior_terms import ScaledPrior as ScaledPrior

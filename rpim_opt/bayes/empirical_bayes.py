@@ -12,7 +12,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
 from rpim_opt.bayes.outliers import beyond_noise, error_vectors, outlier_candidates, unexplained
-from rpim_opt.bayes.prior_terms import Stated
+from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
@@ -36,7 +36,7 @@ class Estimated:
 
     problem: Source
     learned: Learned
-    stated: Stated
+    stated: ScaledPrior
     x: Array
 
 

@@ -22,7 +22,7 @@ from rpim_opt.bayes.evidence import (
     tail_widening,
 )
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
-from rpim_opt.bayes.prior_terms import FIXED, Stated
+from rpim_opt.bayes.prior_terms import FIXED, ScaledPrior
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
@@ -153,7 +153,7 @@ class Fit:
     """
 
     problem: CalibrationProblem
-    stated: Stated
+    stated: ScaledPrior
     evidence: Evidence
     point: Point
     others: Sequence[Point]
@@ -177,7 +177,7 @@ class Fit:
         return self.point.C * np.outer(self.unit, self.unit)
 
     @property
-    def inside(self) -> Stated:
+    def inside(self) -> ScaledPrior:
         """The prior in units of the estimated scales."""
         return self.stated.inside(self.stated.scale * np.sqrt(self.point.v))
 
@@ -195,7 +195,7 @@ class Estimator:
     refit: Refit | None = None
     curves: tuple[Curve, ...] = ()
 
-    def evidence(self, problem: CalibrationProblem, x: Array, stated: Stated | None = None) -> Evidence:
+    def evidence(self, problem: CalibrationProblem, x: Array, stated: ScaledPrior | None = None) -> Evidence:
         """Return the marginal likelihood of a linearization at x (n,) [SI]."""
         free = problem.parameters.free
         stated = stated or self.prior.stated(problem.parameters)

@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes import prior_terms as terms
-from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, Stated, Statement, default_widths
+from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, ScaledPrior, Statement, default_widths
 from rpim_opt.convex.given import places
 from rpim_opt.robot.chain import ORIGIN
 from rpim_opt.robot.mdh import MDH
@@ -157,7 +157,7 @@ class Prior:
                 both[key] = theirs if mine == default else mine
         return Prior(**both)
 
-    def stated(self, parameters: Parameters, *, widened: bool = True) -> Stated:
+    def stated(self, parameters: Parameters, *, widened: bool = True) -> ScaledPrior:
         """Return the prior of a problem's identified parameters, in units of their scales; given is the whole table.
 
         Unless ``widened``, ``joint_offset`` and ``frames`` do not count: a penalty over the scales then stays what it
@@ -180,7 +180,7 @@ class Prior:
             replaced |= whole
         group, names = self._grouped(parameters, np.isfinite(own))
         geometry = np.array([_GEOMETRY.fullmatch(own_name(name)) is not None for name in free.names])
-        return Stated(
+        return ScaledPrior(
             parameters=free,
             centre=centre[identified] / free.scale,
             scale=width[identified] / free.scale,

@@ -36,7 +36,7 @@ def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, f
 
 
 @dataclass(frozen=True, eq=False)
-class Stated:
+class ScaledPrior:
     """Prior of the n identified parameters of a problem, in units of their scales.
 
     Independently of each other, with an estimated scale tau_g a group, unless a statement replaces it::
@@ -72,7 +72,7 @@ class Stated:
         informative = self.centre.any() or len(self.rows) or self.replaced.any()
         return not informative and bool((self.scale == 1).all())
 
-    def inside(self, size: Array) -> Stated:
+    def inside(self, size: Array) -> ScaledPrior:
         """Return the same for parameters whose scales have been multiplied by ``size`` (n,): ``scale`` is 1 there."""
         larger = replace(self.parameters, scale=self.parameters.scale * size)
         ones = np.ones_like(self.scale)

@@ -184,7 +184,7 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     return [p.x, p.nominal, ca.vertcat(*symbols.values(), session, y)], [residual, modelled, ca.densify(metres)]
 
 
-Stated = Mapping[str, ca.SX]
+RowSymbols = Mapping[str, ca.SX]
 """The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
 COLUMN = "column {}"  # name of the symbol of a further column among these
 
@@ -199,7 +199,7 @@ class Loads(NamedTuple):
     weighs: bool = False
     columns: tuple[str, ...] = ()
 
-    def symbols(self, dof: int, points: int) -> Stated:
+    def symbols(self, dof: int, points: int) -> RowSymbols:
         """Return the symbols of a row of some points."""
         joints = dof * points
         sizes = {
@@ -209,7 +209,7 @@ class Loads(NamedTuple):
         return {name: ca.SX.sym(name, size) for name, size in sizes.items() if size}
 
     def configuration(
-        self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: Stated, point: int = 0
+        self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: RowSymbols, point: int = 0
     ) -> Configuration:
         """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
         dof = len(joint_types)
@@ -224,7 +224,7 @@ class Loads(NamedTuple):
             weight = Statics(payload, joint_types=joint_types, q=parts["q"], nominal=nominal, gravity=self.gravity)
         return Configuration(parts["q"], torque, parts.get("approach"), weight, self.named(stated))
 
-    def named(self, stated: Stated) -> dict[str, Symbol]:
+    def named(self, stated: RowSymbols) -> dict[str, Symbol]:
         """Return the symbols of columns by name."""
         return {name: stated[COLUMN.format(name)] for name in self.columns}
 
