@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import display
+from rpim_opt.basics.units import UNITS, display
 from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
@@ -269,11 +269,13 @@ def known(text: str) -> Statement:
     """Return the statement that a combination of parameters has a known value, as of `Prior.known`."""
     from rpim_opt.convex.tolerances import combination  # texts are read where there are any
 
-    combined = combination(text)
-    row = tuple(factor / combined.sd for factor in combined.factors)
+    stated = combination(text)
+    (combined,) = stated.sums
+    row = tuple(factor / stated.limit for factor in combined.factors)
     reference = None if combined.nominal else (0.0,) * len(row)
-    dimensions = (combined.dimension,) * len(row)
-    return Statement(combined.names, dimensions, (row,), (combined.value / combined.sd,), reference, text=text.strip())
+    dimensions = (UNITS[stated.unit].dimension,) * len(row)
+    value = -combined.constant / stated.limit
+    return Statement(combined.names, dimensions, (row,), (value,), reference, text=text.strip())
 
 
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:

@@ -352,11 +352,9 @@ class Term:
             self.variable.save_value(value)
             with np.errstate(all="ignore"):
                 gradient = self.expression.grad.get(self.variable)
-        if gradient is None:
-            return None
-        if not scipy.sparse.issparse(gradient):
-            return np.atleast_1d(np.asarray(gradient, dtype=float)).ravel()
-        return np.asarray(gradient.todense()).ravel()
+        if scipy.sparse.issparse(gradient):
+            gradient = gradient.toarray()
+        return None if gradient is None else np.asarray(gradient, dtype=float).ravel()
 
 
 def term(function: Callable[[Any], Any], size: int, where: str) -> Term:

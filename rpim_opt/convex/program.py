@@ -205,8 +205,8 @@ class Program(Brief):
         """The equations in the order in which the solver has them."""
         A, b = self.rows
         sizes = None
-        if self.structure.by_configuration is not None:
-            order, sizes = self.structure.by_configuration
+        if self.structure.over_norms:
+            order, sizes = np.argsort(self.structure.groups, kind="stable"), np.bincount(self.structure.groups)
             A, b = A[order], b[order]
         model = self.model if self.loss_form is None else self.squared
         return Rows(A, b, sizes, model.triangle)
@@ -312,8 +312,7 @@ class Program(Brief):
             cp.Parameter(b.shape, name="b", value=b),
             cp.Parameter(nonneg=True, name="weight", value=self._weight(weight)),
         )
-        loss, penalty, groups = self.structure.answers.live
-        return self._written(data, (self.structure.of_r(loss), penalty, groups), None)[0]
+        return self._written(data, self.structure.answers.live, None)[0]
 
     def _written(self, data: tuple[Any, Any, Any], stated: tuple[Any, Any, Any], damping: Damping | None) -> Any:
         """Return a CVXPY problem, its variable z, and the formulation's constraints by function."""
@@ -325,7 +324,7 @@ class Program(Brief):
         groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
-        total = substituted(loss, instead) + self.model.offset
+        total = substituted(shape.of_r(loss), instead) + self.model.offset
         if penalty is not None:
             price = substituted(penalty, instead)
             if price.parameters():  # a parameter times a parameter would not be DPP
@@ -403,7 +402,7 @@ class Program(Brief):
         if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
             return None
         try:
-            optimum = minimum(self._rows, self._warm.begun(z), weight)
+            optimum = minimum(self._rows, WarmStart(self.structure).begin(z), weight)
         except Unsolved:
             return None
         p = self.structure.canonical
@@ -497,9 +496,7 @@ class Program(Brief):
         if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
             raise InputError("solver", f"{solver!r}", f"an installed solver: {installed}")
-        answers = self.structure.answers
-        functions = self.structure.loss_of_r, answers.penalty_of_z, answers.constraints
-        problem, z, groups = self._written((*self.rows, weight), functions, damping)
+        problem, z, groups = self._written((*self.rows, weight), self.structure.answers.stated, damping)
         for variable in problem.variables():
             variable.save_value(None)
         with warnings.catch_warnings():

@@ -52,8 +52,8 @@ class Answers:
     """Expressions that a formulation's functions return, with private copies of the user's parameters and variables.
 
     ``loss`` and ``penalty`` are of what they get (residuals or norms, z or norms of groups), ``penalty_of_z`` and
-    ``constraints``, one list for every function, of z; ``live`` are loss, penalty and constraints with the user's own
-    parameters.
+    ``constraints``, one list for every function, of z; ``stated`` are loss, penalty and constraints, ``live`` these
+    with the user's own parameters.
     """
 
     def __init__(self, formulation: Formulation, parameters: Parameters, equations: int, groups: np.ndarray):
@@ -102,7 +102,8 @@ class Answers:
         self.constraints = [[frozen(each) for each in group] for group in live]
         self.flat = [constraint for group in self.constraints for constraint in group]
         self.own = {variable.id for variable in frozen.own}
-        self.live = live_loss, live_penalty, live
+        self.stated: tuple[Any, ...] = (self.loss.expression, self.penalty_of_z, self.constraints)
+        self.live: tuple[Any, ...] = (live_loss, live_penalty, live)
         self.predicts = bool(known.asked)
 
     def owned(self, *stated: Any) -> set[int]:
@@ -184,20 +185,16 @@ class Structure:
         seen, r = self.answers.loss.variable, self.answers.r
         return stated if seen is r else substituted(stated, {id(seen): norms(r, self.groups)})
 
-    @cached_property
-    def loss_of_r(self) -> Any:
-        """The loss as an expression of r."""
-        return self.of_r(self.answers.loss.expression)
-
     def on_squares(self) -> Structure:
         """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
         made = copy.copy(self)
-        for name in ("loss_form", "loss", "loss_of_r", "joint", "inner", "by_configuration"):
+        for name in ("loss_form", "loss", "joint", "inner"):
             vars(made).pop(name, None)
         if self._called is not None:  # the functions of penalty and constraints are not called again
             own = made._called = copy.copy(self._called)
             own.r = cp.Variable(self.n + 1, name="r")
             own.loss = Term(cp.sum_squares(own.r), own.r)
+            own.stated = (own.loss.expression, *own.stated[1:])
             own.live = (own.loss.expression, *own.live[1:])
         made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation")
         made.equations = self.n + 1
@@ -215,15 +212,13 @@ class Structure:
     @cached_property
     def loss_form(self) -> Quadratic | None:
         """The quadratic of r that the loss is."""
-        size = len(np.unique(self.groups)) if self.over_norms else self.equations
-        form = declared_form(self.formulation.loss, size)
-        if form is None:
-            form = quadratic(self.answers.loss.expression, self.answers.loss.variable)
+        which = self.groups if self.over_norms else np.arange(self.equations)
+        form = declared_form(self.formulation.loss, int(which.max()) + 1)
+        form = form or quadratic(self.answers.loss.expression, self.answers.loss.variable)
         if form is None or not self.over_norms:
             return form
         if not form.diagonal or form.c.any():
             return None
-        which = np.unique(self.groups, return_inverse=True)[1]
         return Quadratic(form.L[which], np.zeros(len(which)), form.constant)  # p_k v_k^2 = p_k |r_k|^2
 
     @cached_property
@@ -233,8 +228,7 @@ class Structure:
             return None
         groups = self.formulation.penalty_over is not None
         form = declared_form(self.formulation.penalty, len(self.answers.differences) if groups else self.n)
-        if form is None:
-            form = quadratic(self.answers.penalty.expression, self.answers.penalty.variable)
+        form = form or quadratic(self.answers.penalty.expression, self.answers.penalty.variable)
         if form is None or not groups:
             return form
         if not form.diagonal or form.c.any():
@@ -273,13 +267,6 @@ class Structure:
         with self._lock:
             return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms)
 
-    @cached_property
-    def by_configuration(self) -> tuple[np.ndarray, np.ndarray] | None:
-        """(m,) sorts equations by configurations, (N,) how many each has; None where the loss gets no norms."""
-        if not self.over_norms:
-            return None
-        return np.argsort(self.groups, kind="stable"), np.unique(self.groups, return_counts=True)[1]
-
     # --- values ------------------------------------------------------------------------------------------------
 
     @cached_property
@@ -304,7 +291,7 @@ class Structure:
                 best_loss, best_penalty = self._at_best
                 return best_loss(r), best_penalty(z)
             instead = {id(self.answers.z): cp.Constant(z), id(self.answers.r): cp.Constant(r)}
-            loss = substituted(self.loss_of_r, instead)
+            loss = substituted(self.of_r(self.answers.loss.expression), instead)
             penalty: Any = cp.Constant(0.0)
             if self.answers.penalty_of_z is not None:
                 penalty = substituted(self.answers.penalty_of_z, instead)

@@ -64,18 +64,6 @@ class Sentence:
     places: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Combination:
-    """A linear combination of parameters: its value, or with ``nominal`` its deviation from it, and its sd [SI]."""
-
-    names: tuple[str, ...]
-    factors: tuple[float, ...]
-    value: float
-    nominal: bool
-    sd: float
-    dimension: str
-
-
 def sentence(text: str) -> Sentence:
     """Parse a constraint.
 
@@ -93,15 +81,15 @@ def sentence(text: str) -> Sentence:
     return _Reader(text, "constraint", moving[1]).movement(moving[2] or "")
 
 
-def combination(text: str) -> Combination:
-    """Parse a known value: a sum of parameters, its value or deviation, and its standard deviation.
+def combination(text: str) -> Sentence:
+    """Parse a known value: a sum that is zero ``within`` its standard deviation, which is the limit.
 
     InputError for numbers without a unit, and for a standard deviation that is not above zero.
 
     >>> from rpim_opt.convex.tolerances import combination
     >>> known = combination("a2 - 0.5 a3 = nominal + 0.2 +- 0.05 mm")
-    >>> known.names, known.factors, known.value, known.nominal, known.sd
-    (('a2', 'a3'), (1.0, -0.5), 0.0002, True, 5e-05)
+    >>> known.limit, known.sums
+    (5e-05, (Sum(names=('a2', 'a3'), factors=(1.0, -0.5), constant=-0.0002, nominal=-1),))
     """
     return _Reader(text, "prior").combination()
 
@@ -169,7 +157,7 @@ class _Reader:
         places = tuple(place.strip() for place in (where.strip() or "workspace").split(","))
         return Sentence("move", limit=limit, unit=self.unit, places=places)
 
-    def combination(self) -> Combination:
+    def combination(self) -> Sentence:
         known = self._sum()
         self._checked(known)
         patterns = [name for name in known.names if not _PARAMETER.fullmatch(name)]
@@ -188,12 +176,11 @@ class _Reader:
             raise self._wrong("no standard deviation")
         if not self.unit:
             raise self._wrong("no unit", f"one of {', '.join(units())} at the end")
-        unit = UNITS[self.unit]
         sd = self._constant(wide)
         if not sd >= SMALLEST:
-            found = f"a standard deviation of {sd / unit.si:g} {self.unit}"
+            found = f"a standard deviation of {sd / UNITS[self.unit].si:g} {self.unit}"
             raise self._wrong(found, "a positive standard deviation; [constraints] fixes parameters")
-        return Combination(known.names, known.factors, right.constant, bool(right.nominal), sd, unit.dimension)
+        return Sentence("within", (known.plus(right, -1),), sd, self.unit)
 
     def sentence(self) -> Sentence:
         sides = [self._side()]

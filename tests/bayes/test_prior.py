@@ -203,11 +203,11 @@ def test_what_is_not_identified_is_nominal_in_a_combination_and_unknown_in_a_dis
 
 def test_the_parser_reads_numbers_signs_and_units() -> None:
     said = combination("- 2*a2 + .5 a3 -1e-1d4=  -12.5mm ± 50 um")
-    assert said.names == ("a2", "a3", "d4")
-    assert said.factors == (-2.0, 0.5, -0.1)
-    assert said.value == pytest.approx(-0.0125)
-    assert said.sd == pytest.approx(5e-5)
-    assert combination("theta2 = nominal - 0.1 +- 0.05 deg").value == pytest.approx(np.radians(-0.1))
+    assert said.sums[0].names == ("a2", "a3", "d4")
+    assert said.sums[0].factors == (-2.0, 0.5, -0.1)
+    assert said.sums[0].constant == pytest.approx(0.0125)
+    assert said.limit == pytest.approx(5e-5)
+    assert combination("theta2 = nominal - 0.1 +- 0.05 deg").sums[0].constant == pytest.approx(np.radians(0.1))
 
 
 @pytest.mark.parametrize(

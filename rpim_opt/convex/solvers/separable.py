@@ -45,8 +45,6 @@ POOR = 1e-3
 """Ratio of pivots of a Hessian below which it gets secants (iteratively reweighted least squares) beside it."""
 FEWER, LEAST_SECANTS = 0.1, 1e-8
 """Factor on the secants after a full step, and their least part."""
-BLOCK = 1024
-"""Rows that are multiplied together, as a processor's cache holds them."""
 DECADES, TANGENTS, EXACT = 6, 100, 1e-15
 """Decades beyond the largest entry in which a best threshold is looked for, by how many tangents at most, and how
 exactly, relative."""
@@ -333,16 +331,9 @@ class Newton:
 
 
 def gram(A: Array, weights: Array) -> Array:
-    """Return A' diag(weights) A of A (m, n), in blocks that stay in the cache; rows of weight zero cost nothing."""
-    H = np.zeros((A.shape[1], A.shape[1]))
-    some = np.flatnonzero(weights)
-    whole = len(some) == len(weights)
-    root = np.sqrt(weights if whole else weights[some])[:, None]
-    for i in range(0, len(some), BLOCK):
-        rows = A[i : i + BLOCK] if whole else A[some[i : i + BLOCK]]
-        part = rows * root[i : i + BLOCK]
-        H += part.T @ part
-    return H
+    """Return A' diag(weights) A of A (m, n)."""
+    rows = np.sqrt(weights)[:, None] * A
+    return rows.T @ rows
 
 
 # --- sums over entries, read from CVXPY's expression tree ---

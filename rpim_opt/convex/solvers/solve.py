@@ -66,10 +66,6 @@ class WarmStart:
             self.width, self.count, self.small = 0.0, 0, {}
         return self
 
-    def begun(self, z: Array | None) -> WarmStart:
-        """Return another one, to begin at z (n,) or anew."""
-        return WarmStart(self.structure, kink=self.kink).begin(z)
-
 
 def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
     """Return the minimum of a convex program; the structure of the loss selects the solver.
