@@ -90,9 +90,7 @@ class Answers:
             name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
             of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
             live.append(listed(called(constraint, of, z, known), of))
-        composed = {}
-        if instead and self.penalty is not None:
-            composed["penalty"] = self.penalty_of_z
+        composed = {"penalty": self.penalty_of_z} if instead and self.penalty is not None else {}
         if seen is not r:  # norms are convex and nonnegative, as absolute values are
             composed["loss"] = substituted(self.loss.expression, {id(seen): cp.abs(cp.Variable(seen.size))})
         for what, expression in composed.items():
@@ -307,17 +305,16 @@ class Structure:
     @cached_property
     def _at_best(self) -> tuple[Callable[[Array], float], Callable[[Array], float]]:
         """Loss and penalty of r and z, each with the variables of its own, which it does not share, at their best."""
-        loss, best_loss, best_penalty = self.answers.loss, self.loss_of, self.penalty_of
-        if self.answers.owned(loss.expression):
-            form = self.loss
+        a, form = self.answers, self.loss
+        best_loss, best_penalty = self.loss_of, self.penalty_of
+        if a.owned(a.loss.expression):
             if form is not None and form.threshold is not None:
-                best_loss = lambda r: form.best(self.seen(r))[0]  # noqa: E731
+                least: Any = lambda v: form.best(v)[0]  # noqa: E731
             else:
-                canonical = Canonical(loss.expression, [], loss.variable)
-                best_loss = lambda r: canonical.at_best(self.seen(r))  # noqa: E731
-        if self.answers.owned(self.answers.penalty_of_z):
-            tied = [c for c in self.answers.flat if self.answers.owned(c)]
-            best_penalty = Canonical(self.answers.penalty_of_z, tied, self.answers.z).at_best
+                least = Canonical(a.loss.expression, [], a.loss.variable).at_best
+            best_loss = lambda r: least(self.seen(r))  # noqa: E731
+        if a.owned(a.penalty_of_z):
+            best_penalty = Canonical(a.penalty_of_z, [c for c in a.flat if a.owned(c)], a.z).at_best
         return best_loss, best_penalty
 
     def loss_of(self, r: Array) -> float:

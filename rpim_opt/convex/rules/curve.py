@@ -142,12 +142,8 @@ def corner(program: Program, tolerance: float = 0.01) -> Selection:
     best = left
     while end - begin > tolerance:
         on_the_right = curvature(left, right, end)
-        while on_the_right < 0 and end - begin > tolerance:
-            # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
-            end, right = right, left
-            left = (end + GOLDEN * begin) / (1 + GOLDEN)
-            on_the_right = curvature(left, right, end)
-        if curvature(begin, left, right) > on_the_right:
+        # a curve bent the other way is the flat end of the L, which has no corner: it is cut off
+        if on_the_right < 0 or curvature(begin, left, right) > on_the_right:
             best, end, right = left, right, left
             left = (end + GOLDEN * begin) / (1 + GOLDEN)
         else:

@@ -83,19 +83,14 @@ class Canonical:
         rest = len(data["b"]) - self.linear - sum(sizes)
         self.cone_sizes = sizes + ([3] * (rest // 3) if rest % 3 == 0 else [rest])  # exponential and power cones
         self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
-        self.A: Any = sparse.csr_array(
-            (A.data * self.row_scale[A.row] * self.column_scale[A.col], (A.row, A.col)), A.shape
-        )
-        self.b = data["b"] * self.row_scale
-        free = np.isposinf(self.b)  # a bound that is none
-        if free.any():
-            self.A = sparse.csr_array(sparse.diags_array(np.where(free, 0.0, 1.0)) @ self.A)
-            self.b = np.where(free, 1.0, self.b)
+        free = np.isposinf(data["b"])  # a bound that is none
+        self.row_scale[free] = 0.0
+        self.b = np.where(free, 0.0, data["b"]) * self.row_scale + free
         self.q = data["c"] * self.column_scale
+        rows, columns = (sparse.diags_array(scale) for scale in (self.row_scale, self.column_scale))
         P = data.get("P")
-        P = sparse.coo_array((self.size, self.size)) if P is None else sparse.coo_array(P)
-        values = P.data * self.column_scale[P.row] * self.column_scale[P.col]
-        self.P: Any = sparse.csc_array((values, (P.row, P.col)), P.shape)
+        self.A: Any = sparse.csr_array(rows @ A @ columns)
+        self.P: Any = sparse.csc_array((self.size, self.size) if P is None else columns @ P @ columns)
 
     @classmethod
     def box(cls, penalty: Quadratic | None, lower: Array, upper: Array) -> Canonical:

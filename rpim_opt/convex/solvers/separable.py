@@ -71,9 +71,8 @@ class Rows:
     @cached_property
     def starts(self) -> np.ndarray:
         """First equation of every configuration (N,)."""
-        if self.sizes is None:
-            return np.arange(len(self.b))
-        return np.concatenate([[0], np.cumsum(self.sizes)[:-1]])
+        sizes: Any = self.sizes
+        return np.cumsum(sizes) - sizes
 
     @cached_property
     def squares(self) -> ReducedSquares:
@@ -102,9 +101,9 @@ class Rows:
         self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int
     ) -> tuple[ReducedProgram, Array, Array]:
         """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
-        sizes = None if self.sizes is None else self.sizes[which]
-        places = which
+        sizes, places = None, which
         if self.sizes is not None:
+            sizes = self.sizes[which]
             places = np.concatenate([np.arange(int(self.sizes[i])) + self.starts[i] for i in which])
         return ReducedProgram(penalty, squares, loss.some(which), sizes), self.A[places], self.b[places]
 
