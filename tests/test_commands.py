@@ -507,7 +507,9 @@ def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch,
     for convention in ("standard", "modified"):
         path = tmp_path / f"{convention}.csv"
         assert run(monkeypatch, "export", str(made / "results"), "--mdh", str(path), "--dh", convention) == 0
-        assert f"{path.name}: {convention} DH" in capsys.readouterr().out
+        said = capsys.readouterr().out
+        assert f"{path.name}: {convention} DH" in said
+        assert ("which place axis 1 in the base" in said) == (convention == "standard")
         read = read_arm(path)
         base = numeric_link(*robot.mdh[0, :2]) if convention == "standard" else np.eye(4)
         found = base @ numeric_frame(read.base) @ ro.robot.forward_kinematics(read.robot, q) @ numeric_frame(read.tool)

@@ -220,8 +220,16 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
 
 def _write_table(result: Calibration, marker: str | None, dh: str, target: Path) -> list[str]:
     """Write a DH table; say in which convention."""
-    write_robot(identified(result, marker).robot, target, dh)
-    return [f"{target.name}: {CONVENTION[CONVENTIONS[dh.lower()]]}."]
+    robot = identified(result, marker).robot
+    write_robot(robot, target, dh)
+    convention = CONVENTIONS[dh.lower()]
+    alpha, a = robot.mdh[0, :2]
+    apart = ""
+    if convention == "standard" and (alpha or a):
+        apart = (
+            f" Not in it: alpha1 = {1e3 * alpha:.4g} mrad and a1 = {1e3 * a:.4g} mm, which place axis 1 in the base."
+        )
+    return [f"{target.name}: {CONVENTION[convention]}.{apart}"]
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
