@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
 import threading
+import warnings
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from importlib import import_module
@@ -362,6 +364,16 @@ def term(function: Callable[[Any], Any], size: int, where: str) -> Term:
     variable = cp.Variable(size)
     expression = Frozen([variable], where)(scalar(function(variable), where))
     return Term(expression, variable)
+
+
+def minimized(problem: cp.Problem, **settings: float) -> bool:
+    """Solve a problem by Clarabel, which may be inaccurate; return whether it found a minimum."""
+    for variable in problem.variables():
+        variable.save_value(None)
+    with warnings.catch_warnings(), contextlib.suppress(cp.SolverError):
+        warnings.simplefilter("ignore", UserWarning)
+        problem.solve(solver=cp.CLARABEL, **settings)
+    return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
 
 
 def norms(r: Any, group: np.ndarray) -> Any:

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from rpim_opt.basics.exceptions import Conflict
 from rpim_opt.convex.constraints import Box, Parsed, spoken
-from rpim_opt.convex.expressions import cp, substituted
+from rpim_opt.convex.expressions import cp, minimized, substituted
 from rpim_opt.convex.structure import Structure
 
 LEAST = 1e-6
@@ -43,8 +41,7 @@ def conflict(structure: Structure) -> Conflict | None:
     slacks = []
     for kind, count in (("boxes", structure.n), ("statements", len(parsed))):
         slack = cp.Variable(max(count, 1), nonneg=True)
-        loosened = _units(structure, z, **{kind: slack})
-        _solved(cp.sum(slack), [demand for unit in loosened for statement in unit for demand in statement.demands])
+        minimized(cp.Problem(cp.Minimize(cp.sum(slack)), _demands(_units(structure, z, **{kind: slack}))))
         slacks.append(np.zeros(count) if slack.value is None else np.asarray(slack.value)[:count])
     by_box, by_statement = slacks
     bounds = {parameters.names[i]: float(by_box[i] * parameters.scale[i]) for i in np.flatnonzero(by_box > LEAST)}
@@ -53,22 +50,14 @@ def conflict(structure: Structure) -> Conflict | None:
     return Conflict(bounds, names, statements)
 
 
-def _solved(objective: Any, demands: Sequence[Any]) -> cp.Problem | None:
-    """Return a problem after Clarabel, which may be inaccurate; None where it fails."""
-    problem = cp.Problem(cp.Minimize(objective), list(demands))
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UserWarning)
-        try:
-            problem.solve(solver=cp.CLARABEL)
-        except cp.SolverError:
-            return None
-    return problem
+def _demands(units: list[list[Stated]]) -> list[Any]:
+    return [demand for unit in units for stated in unit for demand in stated.demands]
 
 
 def _possible(units: list[list[Stated]]) -> bool:
     """Whether all can be met at once."""
-    problem = _solved(0, [demand for unit in units for stated in unit for demand in stated.demands])
-    return problem is None or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
+    problem = cp.Problem(cp.Minimize(0), _demands(units))
+    return minimized(problem) or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
 def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:

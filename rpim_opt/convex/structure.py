@@ -27,6 +27,7 @@ from rpim_opt.convex.expressions import (
     cp,
     fingerprint,
     listed,
+    minimized,
     norms,
     reason,
     scalar,
@@ -44,6 +45,8 @@ from rpim_opt.robot.parameters import Parameters
 
 INVARIANT = (SQUARES, NORM2)
 """Losses that declare to see only the length of the residual: [A b] may be replaced by its QR factor."""
+TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
+"""Clarabel's tolerances for variables of the functions' own."""
 MOST_CANONICALIZED = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
@@ -284,38 +287,32 @@ class Structure:
         """Return loss and penalty at numbers; variables of the functions' own are at their best."""
         if not self.inner:
             return self.loss_of(r), self.penalty_of(z)
+        a, v, form = self.answers, self.seen(r), self.loss
+        if form is not None and form.threshold is not None and not (self.joint or a.owned(a.penalty_of_z)):
+            return form.best(v)[0], self.penalty_of(z)
         with self._lock:
-            if not self.joint:
-                best_loss, best_penalty = self._at_best
-                return best_loss(r), best_penalty(z)
-            instead = {id(self.answers.z): cp.Constant(z), id(self.answers.r): cp.Constant(r)}
-            loss = substituted(self.of_r(self.answers.loss.expression), instead)
-            penalty: Any = cp.Constant(0.0)
-            if self.answers.penalty_of_z is not None:
-                penalty = substituted(self.answers.penalty_of_z, instead)
-            tied = [substituted(c, instead) for c in self.answers.flat if self.answers.owned(c)]
-            problem = cp.Problem(cp.Minimize(loss + weight * penalty), tied)
-            for variable in problem.variables():
-                variable.save_value(None)
-            problem.solve(solver=cp.CLARABEL)
-            if problem.status not in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE):
+            problem, parameters = self._over_own
+            for parameter, number in zip(parameters, (z, v, weight if self.joint else 1.0), strict=True):
+                parameter.value = number
+            if not minimized(problem, **TIGHT):
                 return float("inf"), 0.0
-            return float(loss.value), float(penalty.value)
+            for variable, number in ((a.z, z), (a.loss.variable, v)):  # not what the solver leaves of them
+                variable.save_value(number)
+            penalty: Any = 0.0 if a.penalty_of_z is None else a.penalty_of_z.value
+            return float(a.loss.expression.value), float(penalty)
 
     @cached_property
-    def _at_best(self) -> tuple[Callable[[Array], float], Callable[[Array], float]]:
-        """Loss and penalty of r and z, each with the variables of its own, which it does not share, at their best."""
-        a, form = self.answers, self.loss
-        best_loss, best_penalty = self.loss_of, self.penalty_of
-        if a.owned(a.loss.expression):
-            if form is not None and form.threshold is not None:
-                least: Any = lambda v: form.best(v)[0]  # noqa: E731
-            else:
-                least = Canonical(a.loss.expression, [], a.loss.variable).at_best
-            best_loss = lambda r: least(self.seen(r))  # noqa: E731
+    def _over_own(self) -> tuple[cp.Problem, list[cp.Parameter]]:
+        """The program of the functions' own variables, its parameters z, what the loss gets, and the weight."""
+        a = self.answers
+        fixed = a.z, a.loss.variable
+        at, weight = [cp.Parameter(variable.size) for variable in fixed], cp.Parameter(nonneg=True)
+        total: Any = a.loss.expression if a.owned(a.loss.expression) else 0.0
         if a.owned(a.penalty_of_z):
-            best_penalty = Canonical(a.penalty_of_z, [c for c in a.flat if a.owned(c)], a.z).at_best
-        return best_loss, best_penalty
+            total = total + weight * a.penalty_of_z
+        tied = [constraint for constraint in a.flat if a.owned(constraint)]
+        same = [variable == parameter for variable, parameter in zip(fixed, at, strict=True)]
+        return cp.Problem(cp.Minimize(total), [*tied, *same]), [*at, weight]
 
     def loss_of(self, r: Array) -> float:
         """Return the loss of a residual (m,)."""

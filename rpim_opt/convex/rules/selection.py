@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import wraps
@@ -14,7 +13,7 @@ from scipy.optimize import minimize_scalar
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import Tabled, counted
-from rpim_opt.convex.expressions import cp
+from rpim_opt.convex.expressions import cp, minimized
 from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.quadratic import Ridge, ridge
 from rpim_opt.problem.linear import LinearModel
@@ -185,10 +184,7 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     # of a positively homogeneous penalty the largest is max { -g'z : penalty(z) <= 1 }, g the loss's slope at nominal
     answers = program.structure.answers
     problem = cp.Problem(cp.Minimize(slope @ answers.z), [answers.penalty_of_z <= 1])
-    answers.z.save_value(None)
-    with contextlib.suppress(cp.SolverError):
-        problem.solve(solver=cp.CLARABEL)
-    value: Any = problem.value
+    value: Any = problem.value if minimized(problem) else 0.0
     if problem.status != cp.OPTIMAL or not value < 0:
         return weights
     return np.geomspace(np.clip(weights[0], LEAST * -value, MOST * -value), -value, count)

@@ -154,23 +154,6 @@ class Canonical:
         """Return the objective at x (N,)."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
 
-    def at_best(self, fixed: Array) -> float:
-        """Return the least objective at a fixed variable; infinite where there is none."""
-        from scipy import sparse
-
-        rest = np.setdiff1d(np.arange(self.size), self.at)
-        x = np.zeros(self.size)
-        x[self.at] = fixed
-        if len(rest):
-            P = sparse.csc_matrix(sparse.triu(sparse.csc_array(self.P)[rest][:, rest]))
-            q = self.q[rest] + (sparse.csr_array(self.P) @ x)[rest]
-            A = sparse.csc_matrix(sparse.csc_array(self.A)[:, rest])
-            try:
-                x[rest] = Clarabel(self.linear_cones).solve(P, q, A, self.b - self.A @ x).x
-            except Unsolved:
-                return float("inf")
-        return self.value(x)
-
     def duals(self, x: Array, z: Array) -> dict[int, Array]:
         """Return the multipliers of the stated constraints by their id, from those of all rows (m,)."""
         raw = SimpleNamespace(status="Solved", solve_time=0.0, iterations=0, obj_val=0.0)
