@@ -29,6 +29,7 @@ from rpim_opt.calibration.uncertainty import known_covariance, transmission_erro
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.measurements.pose import pose
+from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
@@ -167,18 +168,24 @@ def export_files(
             "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections, one or several"
         )
         raise InputError("export", "nothing to write", accepted)
-    messages = write_all(writers, note)
+    undecided = accepted is not None and accepted.verdict == "inconclusive" and verdict.delivered
     if whole.learned is not None and result is not whole and found is not None:
         stays = np.linalg.norm(result.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
-        bound, confidence = float((found.expanded + stays).max()), found.requirement.confidence
+        bound, required = float((found.expanded + stays).max()), found.requirement
+        less = (
+            f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at "
+            f"most {1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It contains the error that "
+            f"geometry without {joined(whole.learned.extensions)} makes, at most {1e3 * stays.max():.3f} mm there."
+        )
+        if accepted and bound > required.limit:
+            less += f" It is above the limit of {1e3 * required.limit:g} mm, within which only the whole model is."
+            undecided = True
+        note = " ".join(filter(None, [note, less]))
         notes.append(
-            f"Expanded uncertainty of the position reached with this geometry (U, {percent(confidence)}): at most "
-            f"{1e3 * bound:.3f} mm, of the reflector; region: {found.requirement.where}. It contains the error that "
-            f"geometry without {joined(whole.learned.extensions)} makes, at most {1e3 * stays.max():.3f} mm there. "
             "Another point of the flange and its orientation may be known less: `compensate --tool` states their "
             "uncertainty."
         )
-    undecided = accepted is not None and accepted.verdict == "inconclusive" and verdict.delivered
+    messages = write_all(writers, note)
     return Exported([target for target, _ in writers], [*filter(None, [note]), *notes, *messages], undecided)
 
 
@@ -186,7 +193,8 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     """Return the calibration without the model extensions selected by evidence, and a sentence on the loss of accuracy.
 
     Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
-    measurements are calibrated once more. A calibration to which nothing was added is returned as it is.
+    rows are calibrated once more, also those that only the extension explains. A calibration to which nothing was added
+    is returned as it is.
 
     Examples
     --------
@@ -199,7 +207,11 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         return result, []
     form = result.program.penalty_form
     if not result.record.earlier or form is None:
-        alone = calibrate(result.stated, result.formulation)
+        stated = result.stated.without({row.label for row in result.learned.left_out})
+        alone = calibrate(stated, result.formulation)
+        if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.learned.left_out:
+            again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
+            alone = replace(again, learned=replace(alone.learned, left_out=()))
     else:  # beside the prior of earlier results with that prior's rows, extensions at zero
         free = np.array(result.problem.parameters.free.names)
         geometry = ~np.isin(free, result.learned.added)

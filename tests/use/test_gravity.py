@@ -132,6 +132,26 @@ def test_uncertainty_of_exported_geometry_contains_what_files_cannot_hold(tmp_pa
     assert np.mean(missed > stated) < 0.05  # of the geometry's own U, which takes gravity for noise, 12 %
     assert 0.7 * stated < missed.max()
     assert 0.7 * stated < of_gravity < stated
+    # the file says so itself, and that no limit below holds for it
+    required = replace(result, record=replace(result.record, requirement=ro.data.Requirement(9e-4 * stated)))
+    assert ro.use.export_files(required, mdh=tmp_path / "arm.toml").inconclusive
+    assert f"at most {stated:.3f} mm" in (tmp_path / "arm.toml").read_text()
+    assert "above the limit" in (tmp_path / "arm.toml").read_text()
+
+
+def test_exported_geometry_is_fitted_to_the_rows_that_only_gravity_explains() -> None:
+    robot = arm()
+    q = np.random.default_rng(1).uniform(-2.0, 2.0, (40, 6))
+    q[:, 1:3] *= 0.1  # hanging, but for two configurations
+    q[:2, 1:3] = [[1.5, 0.0], [-1.5, 0.1]]
+    real = ro.CalibrationProblem(robot, table(robot), data_at(q))
+    y = real.modelled(truth(real.parameters, 1))[0] + SIGMA * np.random.default_rng(2).normal(size=(40, 3))
+    rigid = ro.robot.model_parameters(robot, tools={"": TOOL}).identify(GEOMETRY)
+    result = ro.calibrate(ro.CalibrationProblem(robot, rigid, ro.Dataset.of(q, y, SIGMA)), model="auto")
+    assert result.learned is not None
+    assert not result.learned.left_out
+    assert ro.calibrate(result.stated).learned.left_out  # the geometry alone takes them for outliers
+    assert ro.use.geometry_alone(result)[0].problem.labels == result.problem.labels
 
 
 def test_payloads_may_differ_by_row_and_lie_elsewhere() -> None:
