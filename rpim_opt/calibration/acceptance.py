@@ -301,7 +301,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
 
     >>> import rpim_opt as ro
     >>> result = ro.load("position").calibrate()
-    >>> box = ((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9))
+    >>> box = ((0.0, 0.8), (-0.7, 0.7), (0.0, 1.0))
     >>> print(ro.calibration.accept(result, ro.data.Requirement(2e-4, box=box)).sentences()[0])
     Accepted: limit 0.2 mm with 95 % confidence at every configuration of the region.
     """

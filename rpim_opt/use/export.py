@@ -331,7 +331,7 @@ def export_urdf(
         elif free:
             option = "; where the reflector is the tip, --tip-measured moves it there" if name == "tool" else ""
             notes.append(f"URDF: its {link} link keeps its pose from the file; in {there}{option}.")
-    notes.append(_orientation(result, marker))
+    notes += _orientation(result, marker)
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, *written)
@@ -340,23 +340,28 @@ def export_urdf(
     return write_all([(Path(target), write)], note)
 
 
-def _orientation(result: Calibration, marker: str | None) -> str:
-    """Say how well the orientation of the tip link is known, which positions of one reflector do not determine."""
+def _orientation(result: Calibration, marker: str | None) -> list[str]:
+    """Say how well the orientation of the tip link is known, which positions of one reflector do not determine.
+
+    Nothing where no identified parameter turns it.
+    """
     problem = result.problem.sample()
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
     slopes = problem.measuring(q, pose, marker).jacobian(result.x).reshape(len(q), 6, -1)[:, 3:]
     C = known_covariance(result)
     if C is None or (np.abs(slopes[:, :, np.isinf(np.diag(C))]) > 0).any():
-        return "URDF: how well the orientation of its tip link is known is undetermined: check it by other means."
+        return ["URDF: the orientation of its tip link is undetermined: check it by other means."]
     C = np.where(np.isfinite(C), C, 0.0)
     largest = float(np.sqrt(np.einsum("nij,jk,nik->n", slopes, C, slopes).max()))
+    if not largest:
+        return []
     seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
     rests = "" if seen else ". Positions of one reflector do not determine all of it; the rest is the prior's"
-    return (
+    return [
         "URDF: expanded uncertainty of the orientation of its tip link in the instrument's frame: "
         f"{2e3 * largest:.2g} mrad (k = 2, largest of the measured configurations){rests}."
-    )
+    ]
 
 
 def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path, target: Path) -> list[str]:
