@@ -120,8 +120,12 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
-    if np.mean(~kept) > EXCLUDED:
-        reasons.append(f"{(~kept).sum()} of {len(kept)} rows are outliers, more than {EXCLUDED:.0%}.")
+    out = set(np.array(result.problem.labels)[~kept].tolist())
+    if result.learned is not None:  # these are no rows of the problem any more
+        out |= {row.label for row in result.learned.left_out}
+    rows = len(out.union(result.problem.labels))
+    if len(out) > EXCLUDED * rows:
+        reasons.append(f"{len(out)} of {rows} rows are outliers, more than {EXCLUDED:.0%}.")
     reasons += [*_worse(result), *_computed(result), *causes]
     return Verdict(tuple(dict.fromkeys(reasons)))
 
@@ -400,7 +404,7 @@ def _explanations(result: Outcome, problem: CalibrationProblem) -> list[str]:
     ordered = _in_table_order(result, problem)
     better = better_reading(ordered)
     read = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
-    rows = list(diagnosis.rows_without_values(problem))
+    rows = [*diagnosis.rows_without_values(problem), *diagnosis.filled_rows(ordered.data)]
     if read:
         return [*rows, *read]
     causes = [*rows, *diagnosis.exchanged_rows(problem)]

@@ -63,10 +63,16 @@ SEVERAL = 0.85
 """Several joint zeros moved, if that leaves less than this part of what one move leaves."""
 LOOSE = 1e-3
 """A joint's random error [rad, m] that no gear in order has: a tenth of that is usual."""
+FLAT_TURN = 0.05
+"""Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
+FILLED = 1e-3
+"""A point that is at least so far from the one before [m] is another one."""
 COPIES = 0.2
 """Part of the rows that may repeat others."""
 MOST_ROUNDS = 20
 """Of telling rows of one reflector from those of another, and of fitting one joint's values."""
+TWO_KINDS, STARTS = 0.4, 30
+"""Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 PLACES, SPANS = 40, 12
@@ -253,6 +259,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     own = dict(zip(fitted.parameters.free.names, x, strict=True))
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
     warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation), *rows_without_values(problem)]
+    warnings += filled_rows(data)
     better = better_reading(problem)
     if better is not None:
         warnings.append(better.sentence)
@@ -381,6 +388,32 @@ def copied_rows(data: Dataset) -> Iterator[str]:
             )
 
 
+def filled_rows(data: Dataset) -> Iterator[str]:
+    """Report rows that were not measured, but filled in: means of their neighbours, or joint values of the row before.
+
+    The data are in the order of the table.
+    """
+    for block in data.blocks:
+        q, y = block.q[:, 0], block.y[:, :3]
+        if y.shape[1] < 3 or len(y) < 3:
+            continue
+        labels = np.array(data.label)[block.row]
+        moves = np.linalg.norm(np.diff(y, axis=0), axis=1)
+        middle = np.linalg.norm(y[1:-1] - (y[:-2] + y[2:]) / 2, axis=1) < EXACT
+        between = labels[1:-1][middle & (np.minimum(moves[:-1], moves[1:]) > FILLED)].tolist()
+        if between:
+            yield (
+                f"{_rows(between, 'is', 'are')} exactly half way between the points before and after: interpolated, "
+                "not measured; leave out what was filled in ([exclude])."
+            )
+        again = labels[1:][(q[1:] == q[:-1]).all(axis=1) & (moves > FILLED)].tolist()
+        if again:
+            yield (
+                f"{_rows(again, 'has', 'have')} the joint values of the row before at another point: the log was not "
+                "updated; leave such rows out ([exclude])."
+            )
+
+
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:
     """Report excluded rows that are consecutive, if the labels are in numerical order."""
     numbers = {label: [int(part) for part in re.findall(r"\d+", label)] for label in (*labels, *left_out)}
@@ -394,8 +427,8 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
         if len(run) >= TOGETHER and len(at) * (1 - (1 - share) ** 2) ** (len(run) - 1) < CHANCE_RUNS:
             yield (
                 f"rows {ordered[run[0]]} to {ordered[run[-1]]} were excluded as outliers and are consecutive: "
-                "did the instrument or the robot's base move there? Calibrate the two parts separately, or "
-                "register the second one again."
+                "did the instrument or the robot's base move there, or was a column filled in or shifted? Correct the "
+                "rows, calibrate the two parts separately, or register the second one again."
             )
 
 
@@ -444,19 +477,38 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
         made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
         remedy = "export more decimals, or state the rounding as their noise"
         causes.append((f"measured values are rounded to {unit.max(initial=0.0):.4g} mm", made, remedy))
+    levers = np.sqrt(np.sum((slopes @ problem.robot.joint_map) ** 2, axis=0) / len(problem.data))[turning]
+    commanded = ""
     for name, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        decimals = decimals_of(angles / size)
-        if decimals is not None:
-            digits = (angles / size * 10.0**decimals).round().astype(int)
-            step = float(np.gcd.reduce(digits, axis=None)) / 10.0**decimals  # half degrees are rounded as well
-            what = f"joint values are rounded to {step:g} {name}"
-            causes.append((what, size * step / np.sqrt(12) * arm, "export them with more decimals"))
+        steps = np.array([_step(column) for column in angles.T / size])
+        each = size * steps / np.sqrt(12) * levers
+        made = float(np.linalg.norm(each))
+        of = ", ".join(f"q{i + 1}" for i, part in zip(np.flatnonzero(turning), each, strict=True) if 10 * part > made)
+        what = f"joint values are rounded to {steps.max(initial=0.0):g} {name} ({of})"
+        causes.append((what, made, "export them with more decimals"))
+        if made > ALIKE[1] * error and steps.all():
+            commanded = (
+                f"joint values are multiples of {steps.max():g} {name}, but rounding is excluded, which would "
+                f"contribute {three_digits(1e3 * made)} mm: they are the commanded values, and the arm stops "
+                f"{three_digits(1e3 * error)} mm beside them; log the measured ones."
+            )
     for what, made, remedy in causes:
         if ALIKE[0] * made < error < ALIKE[1] * made:
+            commanded = ""
             yield (
                 f"{what}: that alone contributes {three_digits(1e3 * made)} mm, the residual RMS is "
                 f"{three_digits(1e3 * error)} mm: {remedy}."
             )
+    if commanded:
+        yield commanded
+
+
+def _step(values: Array) -> float:
+    """Return the step of the decimal grid that values are on, up to 4 decimals; 0 where they are on none."""
+    decimals = decimals_of(values)
+    if decimals is None:
+        return 0.0
+    return float(np.gcd.reduce((values * 10.0**decimals).round().astype(int))) / 10.0**decimals
 
 
 def decimals_of(values: Array) -> int | None:
@@ -629,9 +681,15 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
         if sizes.min() >= FEWEST // 2 and misfit(named) < BETTER * whole:
             far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()
             others = [problem.data.label[i] for i in points.row[named.marker != sizes.argmax()]]
+            instead = "."
+            round_axis = np.column_stack([np.hypot(*fit.tools[:2, :2].T), fit.tools[:2, 2]])
+            if count == 2 and 1e3 * np.abs(np.diff(round_axis, axis=0)).max() < FLAT_TURN * far:
+                angles = np.degrees(np.arctan2(fit.tools[:2, 1], fit.tools[:2, 0]))
+                turn = abs((angles[1] - angles[0] + 180) % 360 - 180)
+                instead = f", or correct joint {len(points.robot.mdh)}, which may be {turn:.0f} deg off in them."
             yield (
                 f"the rows are of {count} reflectors, up to {three_digits(far)} mm apart: {_rows(others, 'is', 'are')} "
-                "not of the first; name each row's reflector in a column `marker`."
+                f"not of the first; name each row's reflector in a column `marker`{instead}"
             )
             return
 
@@ -737,7 +795,13 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     several = _explained(model, x, changes)
     if several is not None and (best is None or several.left < SEVERAL * best.left):
         best = several
-    if best is not None and abs(best.coefficients[0]) <= best.addition.largest:
+    kinds = _two_kinds(problem, x)
+    if kinds is not None and best is not None:  # what changed at a row is named by itself where that is enough
+        enough = MOVED if kinds.consecutive else kinds.left / MOVED
+        kinds = None if best.left <= enough else kinds
+    if kinds is not None:
+        yield _said_of_kinds(problem, kinds)
+    elif best is not None and abs(best.coefficients[0]) <= best.addition.largest:
         what, remedy = best.addition.said(best.coefficients)
         yield f"{what} (that leaves {100 * best.left:.0f} % of the residuals): {remedy}."
 
@@ -805,6 +869,73 @@ def _changes(
     for when, share in shares.items():
         if np.count_nonzero(share) >= least * len(some):
             yield Addition(A[:, some] * share[:, None], partial(say, when, share))
+
+
+class Kinds(NamedTuple):
+    """Which rows (N,) are of the smaller kind, and which part of the residuals two calibrations leave."""
+
+    second: np.ndarray
+    left: float
+
+    @property
+    def consecutive(self) -> bool:
+        """Whether the rows of the smaller kind follow each other."""
+        rows = np.flatnonzero(self.second)
+        return bool(np.ptp(rows) == len(rows) - 1)
+
+
+def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
+    """Return the rows that have other parameters than the rest, where that leaves far smaller residuals; or None.
+
+    Two linear fits with the prior and the rows of each are found in turn, from random halves. Each kind of rows has
+    its own parameters, and each row a degree of freedom for its choice.
+    """
+    model = problem.with_repeatability(None).linearize(x)
+    A, b, owners, N = model.A, model.b, problem.owners, len(problem.data)
+    squares = model.svd[1] ** 2
+    rank = float(np.sum(squares / (1 + squares)))
+    spare = len(b) - 2 * rank - N
+    if spare < rank:
+        return None
+
+    def errors(of: np.ndarray) -> Array:
+        z = np.linalg.solve(A[of].T @ A[of] + np.eye(A.shape[1]), A[of].T @ b[of])
+        return np.bincount(owners, (b - A @ z) ** 2, N).astype(float)
+
+    rng = np.random.default_rng(0)
+    best, second = np.inf, np.zeros(N, dtype=bool)
+    for _ in range(STARTS):
+        now = rng.random(N) < 0.5
+        for _ in range(MOST_ROUNDS):
+            both = np.array([errors(~now[owners]), errors(now[owners])])
+            left = float(both.min(axis=0).sum())
+            if left < best:
+                best, second = left, both[1] < both[0]
+            before, now = now, both[1] < both[0]
+            if (now == before).all():
+                break
+    whole = float(errors(np.ones(len(b), dtype=bool)).sum())
+    left = float(np.sqrt(best / spare / (whole / (len(b) - rank))))
+    if second.sum() > N / 2:
+        second = ~second
+    return Kinds(second, left) if left < TWO_KINDS and second.sum() >= FEWEST else None
+
+
+def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
+    """Return the sentence on rows of two kinds; whether the smaller one agrees with the nominal robot."""
+    rows, label = np.flatnonzero(kinds.second), problem.data.label
+    named = _rows([label[i] for i in rows], "fits", "fit")
+    if kinds.consecutive:
+        named = f"rows {label[rows[0]]} to {label[rows[-1]]} fit"
+    what = f"{named} other parameters than the rest (two calibrations leave {100 * kinds.left:.0f} % of the residuals)"
+    points = points_of(problem)
+    part = None if points is None else points.take(np.isin(points.row, rows))
+    if part is not None and len(part.row) >= FEWEST and misfit(part) * part.extent < EXACT:
+        return f"{what} and agree with the nominal robot: were they computed, not measured? Leave them out ([exclude])."
+    return (
+        f"{what}: are they of another arm, tool or load, or were their joint values computed for another configuration "
+        "of wrist or elbow? Calibrate the two groups separately, or leave one out ([exclude])."
+    )
 
 
 def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
@@ -893,6 +1024,19 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
     remedy = "check the instrument's zero and the reflector's radius"
     offset = "measured distances are {} mm too long"
     yield Addition(along[:, [1]], lambda c: (offset.format(three_digits(1e3 * c[0])), remedy), SMALL)
+    if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
+        flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
+        radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
+        turn = np.column_stack([-y[:, 1], y[:, 0], np.zeros(len(y))])
+        rise = np.column_stack([-y[:, :2] * y[:, [2]] / np.maximum(flat, 1e-9), flat])
+        sines = np.hstack([y[:, :2] / np.maximum(flat, 1e-9), flat / radius, y[:, [2]] / radius])
+        parts = [rise, *(sines[:, [k]] * (turn if k < 2 else rise) for k in range(4))]
+        circles = np.column_stack([np.sum(of_axis * each, axis=1) for each in parts])
+        said = (
+            "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of its circles)"
+        )
+        remedy = "measure in both faces, and have it checked"
+        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), remedy), SMALL)
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is {{}} too long", "check its scale")
         if i != j:

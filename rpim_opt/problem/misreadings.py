@@ -203,8 +203,10 @@ def _of_positions() -> Iterator[Misreading]:
             remedy = f"multiply column {axis} by {factor:g} or name its unit"
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
 
-    def from_angles(points: Points) -> Points:
-        azimuth, elevation = np.radians(points.y[:, :2].T / 1e-3)  # degrees were read as millimetres
+    def from_angles(degrees: float, zenith: bool, points: Points) -> Points:
+        azimuth, elevation = np.radians(degrees * points.y[:, :2].T / 1e-3)  # angles were read as millimetres
+        if zenith:
+            elevation = np.pi / 2 - elevation
         flat = np.cos(elevation)
         directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
         return replace(points, y=points.y[:, [2]] * directions)
@@ -216,8 +218,12 @@ def _of_positions() -> Iterator[Misreading]:
 
     what = "columns x, y, z that are radius, angle and height (cylindrical coordinates)"
     yield Misreading(what, "convert them to x, y, z", from_cylinder)
-    remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
-    yield Misreading("columns x, y, z that are azimuth, elevation and distance", remedy, from_angles)
+    for (degrees, unit), zenith in product(((1.0, ""), (0.9, " in gon")), (False, True)):
+        what = f"columns x, y, z that are azimuth, {'zenith angle' if zenith else 'elevation'} and distance{unit}"
+        remedy = "name the columns azimuth_deg, elevation_deg, distance_mm"
+        if zenith or unit:
+            remedy = f"convert the angles to azimuth and elevation in degrees, and {remedy}"
+        yield Misreading(what, remedy, partial(from_angles, degrees, zenith))
     remedy = "change the sign of one coordinate, or exchange two"
     yield Misreading("the measured frame mirrored (left-handed)", remedy, mirrored)
 

@@ -294,6 +294,68 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),
 }
+
+
+def of_two_kinds(q: np.ndarray) -> np.ndarray:
+    """Return joint values whose every third row was read with other zeros of all joints."""
+    return q + 4e-3 * np.where(np.arange(len(q)) % 3, 0, 1)[:, None] * (-1) ** np.arange(q.shape[1])
+
+
+def filled_by_controller(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Fill every third row with the position that the nominal robot computes."""
+    computed = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
+    return values(lambda y: np.where(np.arange(len(y))[:, None] % 3, y, computed))(problem)
+
+
+def commanded(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Write commanded degrees; the joints stop half a milliradian beside them."""
+    rng = np.random.default_rng(6)
+    whole = joints(lambda q: np.radians(np.degrees(q).round()))(problem)
+    reached = joints(lambda q: q + 5e-4 * rng.normal(size=q.shape))(whole)
+    return values(lambda y: reached.modelled(np.zeros(len(problem.parameters.free)))[0])(whole)
+
+
+def of_worn_circles(y: np.ndarray) -> np.ndarray:
+    """Return positions by an instrument whose vertical circle has an index error of 5 mrad, and an eccentric one."""
+    radius, azimuth = np.linalg.norm(y, axis=1), np.arctan2(y[:, 1], y[:, 0])
+    elevation = np.arcsin(y[:, 2] / radius) + 5e-3
+    azimuth += 3e-3 * np.sin(azimuth + 0.7)
+    flat = radius * np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.sin(elevation)])
+
+
+def to_zenith(y: np.ndarray) -> np.ndarray:
+    """Return azimuth and zenith angle [gon], read as millimetres, and distance."""
+    radius, azimuth = np.linalg.norm(y, axis=1), np.arctan2(y[:, 1], y[:, 0])
+    return np.column_stack([azimuth / np.pi * 0.2, np.arccos(y[:, 2] / radius) / np.pi * 0.2, radius])
+
+
+def tenths(q: np.ndarray) -> np.ndarray:
+    return np.radians(np.degrees(q).round(1))
+
+
+def of_joint_rows(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Change the joint values (N, dof) of all rows."""
+    return joints(lambda q: change(q[:, 0])[:, None])
+
+
+IN_TABLES |= {
+    "every third row with other zeros": (of_joint_rows(of_two_kinds), "fit other parameters than the rest"),
+    "every third row computed": (filled_by_controller, "were they computed, not measured?"),
+    "joints 1 to 3 rounded": (
+        of_joint_rows(lambda q: np.where(np.arange(q.shape[1]) < 3, tenths(q), q)),
+        "(q1, q2, q3)",
+    ),
+    "commanded degrees": (commanded, "they are the commanded values"),
+    "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
+    "zenith angles in gon": (values(to_zenith), "azimuth, zenith angle and distance in gon"),
+    "the last joint half a turn off in rows": (
+        of_joint_rows(
+            lambda q: q + np.pi * np.outer(np.arange(len(q)) % 3 == 1, np.arange(q.shape[1]) == q.shape[1] - 1)
+        ),
+        "which may be 180 deg off in them",
+    ),
+}
 ROBOTS = ("ur5e", "irb120", "iiwa7")
 OTHER = {"ur5e": "ur10e", "irb120": "irb140", "iiwa7": "fr3"}
 

@@ -51,6 +51,9 @@ QUICK = {
         "joint 5 frozen",
         "distances too long",
         "joint 2 slipped halfway",
+        "every third row with other zeros",
+        "joints 1 to 3 rounded",
+        "the last joint half a turn off in rows",
     ],
     "irb120": [
         "joint 5 shuffled",
@@ -60,11 +63,15 @@ QUICK = {
         "values a row too low",
         "two rows exchanged",
         "joints rounded to 0.1 degrees",
+        "every third row computed",
+        "commanded degrees",
     ],
     "iiwa7": [
         "a column in centimetres",
         "joint 2 from 90 degrees and joint 3 reversed",
         "tracker moved by 300 mm",
+        "worn circles of the instrument",
+        "zenith angles in gon",
     ],
 }
 
@@ -249,6 +256,46 @@ def test_computed_positions_are_not_delivered_rounded_either(monkeypatch, capsys
 def test_joints_rounded_to_half_degrees_are_named() -> None:
     wrong = joints(lambda q: np.radians((2 * np.degrees(q)).round() / 2))(simulated_arm("ur5e"))
     assert "joint values are rounded to 0.5 deg" in likely_causes(ro.calibrate(wrong))[-1]
+
+
+def interpolated(y: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    y[rows] = (y[rows - 1] + y[rows + 1]) / 2
+    return y
+
+
+def repeated(q: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    q[rows] = q[rows - 1]
+    return q
+
+
+@pytest.mark.parametrize(
+    ("wrong", "rows", "said"),
+    [
+        (
+            lambda rows: values(lambda y: interpolated(y, rows)),
+            [3, 9, 15, 31],
+            "rows P4, P10, P16, P32 are exactly half",
+        ),
+        (
+            lambda rows: joints(lambda q: repeated(q, rows)),
+            [5, 17, 29],
+            "rows P6, P18, P30 have the joint values of the",
+        ),
+    ],
+)
+def test_rows_that_were_filled_in_are_named(wrong, rows: list[int], said: str) -> None:
+    found = inspect(wrong(np.array(rows))(simulated_arm("irb120"))).warnings
+    assert any(said in text for text in found), found
+
+
+def test_a_robot_without_many_of_its_rows_is_not_delivered() -> None:
+    rows = np.arange(1, COUNT - 1, 3)
+    wrong = values(
+        lambda y: y + 0.3 * np.isin(np.arange(len(y)), rows)[:, None] * np.sin(np.arange(3 * len(y))).reshape(-1, 3)
+    )
+    result = ro.calibrate(wrong(simulated_arm("irb120")))
+    assert not result.verdict.delivered
+    assert any("rows are outliers, more than 25%" in text for text in result.verdict.reasons), result.verdict
 
 
 @pytest.mark.parametrize("rows", [np.arange(COUNT) % 3 == 0, np.random.default_rng(3).random(COUNT) < 0.5])
