@@ -52,6 +52,9 @@ PRECISIONS = np.linspace(-14.0, 8.0, 200)
 MOST_WIDENED = 100.0
 """Upper bound on the factor of tails on a local variance: where data contradict them, nothing else bounds it."""
 
+FACTORS = np.geomspace(1.0, 30.0, 100)
+"""Factors on the covariance of deviations that are compared for what the model lacks."""
+
 
 class Spectrum(NamedTuple):
     """Prior variances of Fourier coefficients that represent Gaussian processes with Matern covariance (3/2).
@@ -617,3 +620,32 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
     own = C[np.ix_(heavy, heavy)]
     L = np.linalg.cholesky(np.eye(len(B)) - own * np.outer(B, B))
     return np.asarray(np.linalg.solve(L, (C[:, heavy] * B).T).T, dtype=float)
+
+
+# --- what ranges of joints add to covariances -------------------------------------------------------------------
+
+
+def extrapolation(point: Point, prior: Hierarchy, halves: Sequence[np.ndarray]) -> Array:
+    """Return D (p, p), where D D' widens the covariance C for what the model lacks outside of the measured ranges.
+
+    What a model lacks repeats from row to row, so that C, which takes it for chance, is too small; inside the measured
+    ranges the noise covers it. Each of some halves (m,) of the equations predicts the other one with errors e of
+    covariance I + k X C X', C as that half alone leaves it; the factor k on C >= 1, one for all halves, has the largest
+    product of their likelihoods: D D' = (k - 1) C.
+    """
+    X = np.vstack([part.X.reshape(-1, len(point.v)) for part in point.parts])
+    y = np.concatenate([part.y.ravel() for part in point.parts])[:, None]
+    own = np.where(prior.replaced, 0.0, 1 / point.v)
+    value = np.zeros(len(FACTORS))
+    for half in halves:
+        inside, beyond = X[half], X[~half]
+        L, d = _factored(inside.T @ inside + prior.rows.T @ prior.rows, own)
+        Y = _half_solved(L, d, beyond.T)
+        mean = _half_solved(L, d, inside.T @ y[half] + prior.rows.T @ prior.values[:, None])
+        spread, V = np.linalg.eigh(Y @ Y.T)
+        told = spread > 1e-6
+        along = (V.T @ (Y @ (y[~half] - Y.T @ mean)))[told, 0]
+        variances = 1 + FACTORS[:, None] * spread[told]
+        value += np.sum(np.log(variances) + along**2 / spread[told] / variances, axis=1)
+    L, d = _factored(point.C, np.zeros(len(own)))
+    return np.sqrt(FACTORS[np.argmin(value)] - 1) * L / d[:, None]

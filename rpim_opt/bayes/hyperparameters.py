@@ -18,6 +18,7 @@ from rpim_opt.bayes.evidence import (
     Linearized,
     Point,
     Spectrum,
+    extrapolation,
     scale_covariance,
     tail_widening,
 )
@@ -96,10 +97,10 @@ class Learned(Brief):
     (s, s) that of the logarithms of both. ``local`` (n,) are local scales of deviations over those of their groups, 1
     without heavy tails; ``stated`` (n,) the stated scales [SI]. ``trials`` are the models that were compared, the
     selected one first, ``value`` is -2 ln of the restricted likelihood at the end, ``freedom`` the degrees of freedom
-    of the variance of a reading (Satterthwaite). D D' of ``drift`` (n, k) is what the uncertainty of hyperparameters
-    and heavy tails add to the covariance [SI]. ``left_out`` are outliers that were excluded, the worst first, ``added``
-    parameters of model extensions, ``notes`` sentences on how far the marginal likelihood decides, and ``curves`` the
-    joints' transmission errors, None without them.
+    of the variance of a reading (Satterthwaite). D D' of ``drift`` (n, k) is what the uncertainty of hyperparameters,
+    heavy tails and what the model lacks outside of the measured ranges add to the covariance [SI]. ``left_out`` are
+    outliers that were excluded, the worst first, ``added`` parameters of model extensions, ``notes`` sentences on how
+    far the marginal likelihood decides, and ``curves`` the joints' transmission errors, None without them.
     """
 
     sizes: Mapping[str, Size]
@@ -373,8 +374,19 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         freedom=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
         covariance=covariance[np.ix_(plain, plain)],
         stated=fit.problem.parameters.free.scale,
-        drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, widening]),
+        drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, widening, *_beyond(fit)]),
         notes=tuple(notes),
         curves=None if prior.spectrum is None else Transmitted(*values[sizes:noise], gain=gain),
         **more,
     )
+
+
+def _beyond(fit: Fit) -> list[Array]:
+    """Return what the model lacks as halves of the joints' ranges tell (p, p); curves have a prior of their own."""
+    if fit.evidence.prior.spectrum is not None:
+        return []
+    order = np.concatenate([stack.index.ravel() for stack in fit.evidence.data.stacks])
+    q = fit.problem.joint_values[fit.problem.owners[order]]
+    lower = (q <= np.median(q, axis=0)).T
+    halves = [half for below in lower for half in (below, ~below) if half.any() and not half.all()]
+    return [extrapolation(fit.point, fit.evidence.prior, halves)]

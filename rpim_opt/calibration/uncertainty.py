@@ -28,8 +28,9 @@ class Uncertainty(Tabled):
         prior      sigma^2 S V diag(w / (s^2 + w)^2) V' S            what the penalty holds back: its bias, in the mean
         total      noise + prior = sigma^2 S (A'A + w)^-1 S          if deviations are as large as the penalty expects
 
-    Where hyperparameters were estimated, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), and
-    by how much Student's tails are wider than the normals that stand for them (`Learned.drift`).
+    Where hyperparameters were estimated, ``prior`` holds besides what is not known of them (Kass and Steffey 1989), by
+    how much Student's tails are wider than the normals that stand for them, and what the model lacks, as far as halves
+    of the joints' ranges miss more of each other than chance would (`Learned.drift`).
 
     It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty; other penalties
     (lasso) are refused. Intervals do not know of the active bounds of parameters in ``result.actively_constrained``.

@@ -12,11 +12,13 @@ from scipy.stats import multivariate_normal
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import (
+    FACTORS,
     NOISE_SD,
     Evidence,
     Hierarchy,
     Linearized,
     Spectrum,
+    extrapolation,
 )
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
@@ -348,3 +350,28 @@ def test_a_gibbs_sampler_agrees() -> None:
     # of the normals that stand for the tails alone 0.77 of the sampler's, some 0.6
     assert abs(np.mean(over)) < 0.06
     assert np.abs(over).max() < 0.2
+
+
+def test_what_halves_miss_of_each_other_widens_the_covariance() -> None:
+    """Equations of one model add nothing; where it differs between halves, the factor is the likeliest, densely."""
+    rng = np.random.default_rng(4)
+    m, p = 60, 5
+    X = rng.normal(size=(m, p))
+    one, every = np.ones((m, 1, 1)), np.ones((m, 1), dtype=bool)
+    prior = hierarchy([-1] * p, [False] * p, ())
+    half = np.arange(m) < m // 2
+    for lack in (0.0, 1.5):
+        y = X @ rng.normal(size=p) + lack * half * X[:, 0] + rng.normal(size=m)
+        data = Linearized(X, y, [Stack(np.arange(m)[:, None], one, every, ~every, np.zeros((m, 1, 0)))])
+        point = Evidence(data, prior, ()).at(np.zeros(0))
+        D = extrapolation(point, prior, [half, ~half])
+        value = np.zeros(len(FACTORS))
+        for inside in (half, ~half):
+            C = np.linalg.inv(X[inside].T @ X[inside] + np.eye(p))
+            error = y[~inside] - X[~inside] @ C @ X[inside].T @ y[inside]
+            for i, factor in enumerate(FACTORS):
+                V = np.eye(m // 2) + factor * X[~inside] @ C @ X[~inside].T
+                value[i] += np.linalg.slogdet(V)[1] + error @ np.linalg.solve(V, error)
+        factor = FACTORS[np.argmin(value)]
+        assert (factor > 2) == (lack > 0)
+        np.testing.assert_allclose(D @ D.T, (factor - 1) * point.C, rtol=1e-6, atol=1e-12)
