@@ -18,7 +18,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
-from rpim_opt.problem.registration.global_start import described, explained, search
+from rpim_opt.problem.registration.global_start import JointMapping, described, explained, search
 from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import forward_kinematics
@@ -405,15 +405,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         return None
     mapping = None if explained(points) else search(points)
     if mapping is not None:
-        words = described(mapping.joint_types, mapping.sign, mapping.zero)
-        remedy = "write sign and theta_deg of these joints in robot.toml"
-        if mapping.mirrored:
-            words = f"the measured frame mirrored (left-handed), or {words}"
-            remedy = (
-                f"change the sign of one coordinate (or exchange two), or {remedy}; a known direction in the "
-                "instrument's frame, up for instance, tells which"
-            )
-        return Better(words, remedy, mapping.nominal, mapping.left)
+        return _of_mapping(mapping)
     present = float(misfits([points])[0])  # with zeros fitted, as of every other reading
     if not np.isfinite(present):
         return None
@@ -430,7 +422,38 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                     chain, left = [*chain, *second], size
     if left < BETTER * present and (left <= LEFT or points.seen):
         return _told(points, chain, present, left)
-    return None if points.seen else _sibling(points)
+    if points.seen:
+        return None
+    behind = _mapping_behind(points) if present > WRONG and not points.lengths else None
+    return behind or _sibling(points)
+
+
+def _of_mapping(mapping: JointMapping) -> Better:
+    """Return signs and zeros of joints in words, and a mirrored frame that explains the data as well."""
+    words = described(mapping.joint_types, mapping.sign, mapping.zero)
+    remedy = "write sign and theta_deg of these joints in robot.toml"
+    if mapping.mirrored:
+        words = f"the measured frame mirrored (left-handed), or {words}"
+        remedy = (
+            f"change the sign of one coordinate (or exchange two), or {remedy}; a known direction in the "
+            "instrument's frame, up for instance, tells which"
+        )
+    return Better(words, remedy, mapping.nominal, mapping.left)
+
+
+def _mapping_behind(points: Points) -> Better | None:
+    """Return signs and zeros of joints behind a mirrored frame, or behind a unit that makes the points as wide."""
+    width = replace(points, y=forward_kinematics(points.robot, points.q)[:, :3, 3]).extent
+    factor = min(LENGTHS, key=lambda each: abs(np.log(each * points.extent / width)))
+    behind = [Misreading("the measured frame mirrored (left-handed)", "change the sign of one coordinate", mirrored)]
+    if abs(np.log(factor * points.extent / width)) < abs(np.log(points.extent / width)):
+        behind.append(_scaled(f"measured lengths {LENGTHS[factor][0]}", LENGTHS[factor][1], factor))
+    for each in behind:
+        mapping = search(each.change(points))
+        if mapping is not None:
+            found = _of_mapping(mapping)
+            return found._replace(what=f"{each.what} and {found.what}", remedy=f"{each.remedy}; {found.remedy}")
+    return None
 
 
 def sibling(problem: CalibrationProblem) -> Better | None:

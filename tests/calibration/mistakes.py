@@ -348,6 +348,14 @@ IN_TABLES |= {
     ),
     "commanded degrees": (commanded, "they are the commanded values"),
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
+    "mirrored, and joint 1 reversed": (
+        both(values(lambda y: y * [1, -1, 1]), flipped(0)),
+        "the measured frame mirrored",
+    ),
+    "inches, joint 2 from 90 degrees and joint 3 reversed": (
+        both(values(lambda y: y / 25.4), shifted(1, 90), flipped(2)),
+        "measured lengths in inches, not mm and ",
+    ),
     "zenith angles in gon": (values(to_zenith), "azimuth, zenith angle and distance in gon"),
     "the last joint half a turn off in rows": (
         of_joint_rows(

@@ -54,6 +54,8 @@ QUICK = {
         "every third row with other zeros",
         "joints 1 to 3 rounded",
         "the last joint half a turn off in rows",
+        "mirrored, and joint 1 reversed",
+        "inches, joint 2 from 90 degrees and joint 3 reversed",
     ],
     "irb120": [
         "joint 5 shuffled",
