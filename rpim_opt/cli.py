@@ -130,6 +130,7 @@ Noise = Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)]
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or its folder.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
+Decimal = Annotated[str, Option(help="Decimal mark, a comma or a point.")]
 Sheet = Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")]
 Key = Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")]
 TimeTolerance = Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")]
@@ -191,13 +192,15 @@ class Tables(NamedTuple):
     key: Key = ""
     time_tolerance: TimeTolerance = None
     sheet: Sheet = ""
+    decimal: Decimal = ""
     measurement: Type = None
 
     def read(self, result: "Calibration", sources: list[Path]) -> "Measured":
         """Return the measurements of tables."""
         from rpim_opt.use.reading import read_measurements
 
-        options = console.table_options(self.units, key=self.key, within=self.time_tolerance, sheet=self.sheet)
+        given = {"key": self.key, "within": self.time_tolerance, "sheet": self.sheet, "decimal": self.decimal}
+        options = console.table_options(self.units, **given)
         return read_measurements(result, sources, self.measurement, options)
 
 
@@ -257,7 +260,7 @@ def new(
     constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = "",
     encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = "",
     separator: Annotated[str, Option(help="Column separator: comma, semicolon, tab, bar, space.")] = "",
-    decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = "",
+    decimal: Decimal = "",
     measurement: Annotated[Text, Option(help="position, pose, cable, distance, ...; guessed from columns.")] = None,
     validation: Annotated[list[Path] | None, Option(help="A table for validation; several are joined.")] = None,
     hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead: 0.25.")] = None,
@@ -591,6 +594,7 @@ def compensate(
     result: Result,
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
     units: Units = "",
+    decimal: Decimal = "",
     position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
     tool: Annotated[Text, Option(help="TCP in the DH table's flange frame [mm, deg]: x,y,z,roll,pitch,yaw.")] = None,
     marker: Marker = None,
@@ -614,7 +618,7 @@ def compensate(
         from rpim_opt.use.compensation import compensate
         from rpim_opt.use.reading import read_commands
 
-        read, left_out = read_commands(loaded, targets, console.table_options(units))
+        read, left_out = read_commands(loaded, targets, console.table_options(units, decimal=decimal))
         say("compensating")
         compensation = compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,

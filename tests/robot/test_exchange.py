@@ -697,6 +697,12 @@ def test_tables_come_back_to_the_last_bit(tmp_path: Path, ending: str, coupled: 
         assert equal(ro.read_robot(path), robot)
 
 
+def test_limits_of_a_sheet_may_be_minimum_and_maximum(tmp_path: Path) -> None:
+    header = "alpha [deg],a [mm],theta [deg],d [mm],min [deg],max [deg],convention"
+    (tmp_path / "r.csv").write_text(f"{header}\n0,100,0,300,-170,165,modified\n")
+    assert np.degrees(ro.read_robot(tmp_path / "r.csv").limits) == pytest.approx(np.array([[-170, 165]]))
+
+
 def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
     ro.robot.write_robot(UR10, tmp_path / "ur10.csv")
     lines = (tmp_path / "ur10.csv").read_text().splitlines()

@@ -116,6 +116,7 @@ def test_times_of_tables() -> None:
     assert seconds("t [ms]", ["0", "1500"]).tolist() == [0.0, 1.5]
     assert np.ptp(seconds("stamp", ["1700000000000000000", "1700000001000000000"])) == pytest.approx(1.0)
     assert np.ptp(seconds("date", ["2026-03-01 10:00", "2026-03-01T10:01:00+00:00"])) == 60
+    assert np.ptp(seconds("Datum", ["2026-03-01 10:00:00.5", "01.03.2026 10:01:00,500"])) == 60
     for text in ("noon", "1_000"):  # which is no number in any other column, either
         with pytest.raises(InputError, match=f"column 'time', row 2: found '{text}'"):
             seconds("time", ["0", text])

@@ -25,6 +25,7 @@ from rpim_opt.data.tables.understanding import Understood, row_stems
 from rpim_opt.robot.mdh import Robot
 
 TIME = re.compile(r"[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|zeit|zeitstempel|date|datum|t)", re.IGNORECASE)
+GERMAN = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})[ T]\s*")
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
@@ -303,7 +304,7 @@ def time_column(names: Iterable[str]) -> str | None:
 
 
 def seconds(name: str, cells: Sequence[Any]) -> Array:
-    """Return times (N,) [s] of a column's numbers, in the unit of its name, or of its dates (ISO 8601).
+    """Return times (N,) [s] of a column's numbers, in the unit of its name, or of its dates (ISO 8601, DIN 1355).
 
     Numbers without a unit are seconds, or, where that would be after the year 5000, what since 1970 is in our time.
     Dates without a zone are UTC.
@@ -314,11 +315,11 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
     if dates:
         for i, text in enumerate(texts):
             with suppress(ValueError):
-                date = datetime.fromisoformat(text)
+                date = datetime.fromisoformat(GERMAN.sub(r"\3-\2-\1 ", text).replace(",", "."))
                 times[i] = date.replace(tzinfo=date.tzinfo or UTC).timestamp()
     if np.isnan(times).any():
         i = int(np.isnan(times).argmax())
-        accepted = "numbers, or dates as 2026-05-31T12:00:00"
+        accepted = "numbers, or dates as 2026-05-31T12:00:00 or 31.05.2026 12:00:00"
         raise InputError(f"column '{name}', row {i + 1}", f"'{texts[i]}'", accepted)
     if dates:
         return times

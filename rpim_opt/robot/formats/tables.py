@@ -37,7 +37,7 @@ INDEX_BEFORE = re.compile(r"[_\s(\[{]*i\s*[-\u2212]\s*1[)\]}]*", re.IGNORECASE)
 INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
 """Of the joint itself, ``d(i)``, ``theta_i``: that tells no convention."""
 SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
-         "r": "a"}  # fmt: skip
+         "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper"}  # fmt: skip
 """Other names of columns."""
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")
 """Columns of the joints' own names."""
