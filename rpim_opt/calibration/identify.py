@@ -44,6 +44,8 @@ LEVEL = 1e-9
 FAR = 1000.0
 """Deviations in prior standard deviations beyond which a fit without a penalty is called divergent."""
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
+CONTRADICTED = 5.0
+"""Standard deviations from a known value from which on the data contradict it."""
 ZERO = 0.1
 """Standard deviation [rad] of a joint's zero that was found from the data."""
 
@@ -184,7 +186,7 @@ def calibrate(
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
     notes += [mapping.sentence] if mapping else []
-    message = " ".join([ending(ended, max_iterations), *notes])
+    message = " ".join([ending(ended, max_iterations), *notes, *_contradicted(prior or Prior(), problem, ended.x)])
     LOGGER.info(message)
     return Calibration(
         problem=problem,
@@ -260,6 +262,20 @@ def _displaced_frames(stated: Source, registered: Source) -> list[str]:
         f"Deviations refer to registered frames, far from the stated ones: {joined(far)}. The flange frame is "
         "that of the DH table after the last joint; that of a data sheet may be rotated."
     ]
+
+
+def _contradicted(prior: Prior, problem: Source, x: Array) -> list[str]:
+    """Say which known combinations the identified deviations x (n,) [SI] are far from."""
+    lines = []
+    for statement in prior.statements:
+        rows, values, _ = statement.on(problem.parameters)
+        apart = np.abs(rows @ (x / problem.parameters.free.scale) - values).max(initial=0.0)
+        if not statement.whole and apart > CONTRADICTED:
+            lines.append(
+                f"The data contradict {statement.where}: the identified value is {apart:.0f} of its standard "
+                "deviations away."
+            )
+    return lines
 
 
 def mapped_as(

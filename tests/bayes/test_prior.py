@@ -271,3 +271,9 @@ def test_priors_together_say_both_or_contradict() -> None:
         _ = both & Prior(tails=4.0)
     with pytest.raises(ro.InputError, match="'d5_mm' as 1 and 2"):
         _ = both & Prior(centre={"d5_mm": 2.0})
+
+
+def test_a_known_value_that_the_data_contradict_is_named() -> None:
+    for text, apart in (("tool_x = nominal + 8 +- 0.5 mm", True), ("tool_x = nominal - 1 +- 0.5 mm", False)):
+        message = ro.calibrate(ro.load("position").problem, prior=Prior.known(text)).message
+        assert (f"The data contradict prior '{text}': the identified value is " in message) == apart
