@@ -1,7 +1,8 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
-What is canonicalized lives as long as its `Structure`: a calibration long, or of a ready formulation until `MOST_KEPT`
-others came. Warm starts and Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
+What is canonicalized lives as long as its `Structure`, until `MOST_KEPT` others came. Functions of a user are called
+for every program; where they return what they returned before, the structure of that serves again. Warm starts and
+Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
 """
 
 from __future__ import annotations
