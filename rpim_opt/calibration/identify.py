@@ -44,7 +44,7 @@ LEVEL = 1e-9
 FAR = 1000.0
 """Deviations in prior standard deviations beyond which a fit without a penalty is called divergent."""
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
-CONTRADICTED = 5.0
+CONTRADICTED = 3.0
 """Standard deviations from a known value from which on the data contradict it."""
 ZERO = 0.1
 """Standard deviation [rad] of a joint's zero that was found from the data."""

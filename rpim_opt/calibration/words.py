@@ -167,7 +167,8 @@ def weight_lines(result: Outcome) -> list[str]:
         return [f"Formulation '{name}' has no penalty and needs no weight."]
     if result.selection is None:
         return [f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."]
-    rule = ": ".join(filter(None, [selector(result), result.selection.note]))
+    note = result.selection.note or ("" if result.selection.interior else "at an edge of the weights that it tried")
+    rule = ": ".join(filter(None, [selector(result), note]))
     return [f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."]
 
 

@@ -146,7 +146,10 @@ def require_same_arm(
         if robot.joint_types == joint_types:
             other = [str(i + 1) for i in np.flatnonzero((robot.joint_map != joint_map).any(axis=1))]
             found = f"a sign or coupling of joint {joined(other)}"
-            accepted = "joints as in the file: turn the axes of reversed joints there, and calibrate with that file"
+            accepted = (
+                "joints as in the file: correct the signs in the table if the controller counts as the file does, or "
+                "turn the axes in the file, and calibrate again"
+            )
         raise InputError("joints of the robot", found, accepted, file)
     deviation = np.abs(robot.mdh - table)
     deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))

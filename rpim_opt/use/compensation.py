@@ -27,6 +27,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.global_start import described
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -65,9 +66,10 @@ class Compensation:
     ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where the position
     error and its expanded uncertainty (k = 2) together exceed ``limit`` [m], infinite where none is stated. A row that
     would be ``"ok"`` is ``"extrapolated"`` beyond the measured joint ranges, where no measurement checked the model;
-    ``outside`` are all rows there. ``note`` says why a robot is not delivered that is used all the same, ``point``
-    which point is moved, with its place in the flange frame. ``beside`` (N,) [m] is how far a stated position is from
-    that of the nominal robot at the joint values stated beside it, NaN where there are none.
+    ``outside`` are all rows there. ``note`` says why a robot is not delivered that is used all the same, and how joints
+    count whose signs or zeros were estimated; ``point`` which point is moved, with its place in the flange frame.
+    ``beside`` (N,) [m] is how far a stated position is from that of the nominal robot at the joint values stated beside
+    it, NaN where there are none.
     """
 
     robot: Robot
@@ -126,7 +128,7 @@ class Compensation:
                 f"{1e3 * self.beside[far[0]]:.0f} mm (row {self.label[far[0]]}); the commands reach the positions. Are "
                 "they of another tool (--tool), or not in the robot's base frame?"
             )
-        return "\n".join([*lines, *filter(None, [self.point]), *self.outside.sentences()])
+        return "\n".join([*lines, *filter(None, [self.note, self.point]), *self.outside.sentences()])
 
     @property
     def missed(self) -> list[str]:
@@ -239,6 +241,13 @@ def compensate(
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status
     """
     note = result.verdict.require(despite_verdict)
+    mapping = result.mapping
+    if mapping is not None:
+        note = (
+            f"{note} Joint values of targets and commands count as in the calibrated table: "
+            f"{described(mapping.joint_types, mapping.sign, mapping.zero)} against the robot file. If the controller "
+            "counts as the file does, correct the table's columns and calibrate again before using these commands."
+        ).strip()
     arm = pick(result.problem.arms, robot, "robot")
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:

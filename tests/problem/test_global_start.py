@@ -144,6 +144,9 @@ def test_what_is_found_goes_into_the_mapping() -> None:
     assert (result.problem.robot.joint_map == np.diag(sign)).all()
     assert np.allclose(result.problem.robot.mdh[:, 2] - problem.robot.mdh[:, 2], zero)
     assert "joint 3 reversed (sign = -1), zero of joint 2 +90.0 deg" in result.message
+    commands = ro.use.compensate(result, problem.data.q[:3], orientation=False)
+    for said in (str(commands), commands.csv()):  # or a controller that counts otherwise turns joint 3 the wrong way
+        assert "joint 3 reversed (sign = -1), zero of joint 2 +90.0 deg against the robot file" in said
 
 
 def test_a_result_keeps_its_mapping(tmp_path) -> None:
