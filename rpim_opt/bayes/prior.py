@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import fits
 from rpim_opt.bayes import prior_terms as terms
 from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, ScaledPrior, Statement, default_widths
-from rpim_opt.convex.given import places
+from rpim_opt.convex.arguments import places
 from rpim_opt.robot.chain import ORIGIN
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, overlay, own_name

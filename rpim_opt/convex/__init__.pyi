@@ -1,5 +1,7 @@
 from . import constraints as constraints
 from . import select as select
+from .arguments import Arguments as Arguments
+from .arguments import arguments_of as arguments_of
 from .constraints import in_ball as in_ball
 from .constraints import within_tolerance as within_tolerance
 from .formulation import Formulation as Formulation
@@ -12,8 +14,6 @@ from .formulation import minimax as minimax
 from .formulation import robust as robust
 from .formulation import sum_of_norms as sum_of_norms
 from .formulation import tikhonov as tikhonov
-from .given import Given as Given
-from .given import given as given
 from .program import Estimate as Estimate
 from .program import Program as Program
 from .program import pose as pose

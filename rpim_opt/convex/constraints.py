@@ -13,8 +13,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import UNITS, display
+from rpim_opt.convex.arguments import Arguments, arguments_of, every_movement, places, problem_of, whole
 from rpim_opt.convex.expressions import cp
-from rpim_opt.convex.given import Given, every_movement, given, places, problem_of, whole
 from rpim_opt.problem.workspace import bounding
 from rpim_opt.robot.parameters import Parameters
 
@@ -367,7 +367,7 @@ class Parsed:
 
     def loosened(self, z: Any, parameters: Parameters, by: Any = None) -> list[Any]:
         """Return the CVXPY constraints with limits that are larger by a number or expression [SI]."""
-        E, f, size = self._sums(given(z, parameters))
+        E, f, size = self._sums(arguments_of(z, parameters))
         count, together, n = E.shape
         E, f = E / size[:, None, None], f / size[:, None]
         value = E.reshape(count * together, n) @ z + f.ravel()
@@ -385,12 +385,12 @@ class Parsed:
 
     def price(self, multipliers: Array, parameters: Parameters) -> float:
         """Return the shadow price: the decrease of the objective per unit of loosening of all limits [1 / SI]."""
-        size = self._sums(given(None, parameters))[2]
+        size = self._sums(arguments_of(None, parameters))[2]
         return float(np.abs(multipliers) @ (1 / np.tile(size, len(multipliers) // len(size))))
 
     def slack(self, z: Array, parameters: Parameters) -> float:
         """Return the slack of z (n,) [SI]; for an equality the negative violation."""
-        E, f, _ = self._sums(given(None, parameters))
+        E, f, _ = self._sums(arguments_of(None, parameters))
         value = E @ z + f
         if self.demanded.kind == "most":
             return float(-np.max(value))
@@ -398,11 +398,11 @@ class Parsed:
 
     def scale(self, parameters: Parameters) -> float:
         """Return the change [SI] of the constrained quantity for deviations of the prior scale."""
-        return float(np.max(self._sums(given(None, parameters))[2]))
+        return float(np.max(self._sums(arguments_of(None, parameters))[2]))
 
     def names(self, parameters: Parameters) -> list[str]:
         """Return the identified parameters in the constraint."""
-        used = np.any(self._sums(given(None, parameters))[0], axis=(0, 1)).tolist()
+        used = np.any(self._sums(arguments_of(None, parameters))[0], axis=(0, 1)).tolist()
         return [name for name, own in zip(parameters.names, used, strict=True) if own]
 
     def require_near(self, parameters: Parameters) -> None:
@@ -416,7 +416,7 @@ class Parsed:
     def _wrong(self, found: str, accepted: str) -> InputError:
         return InputError(f"constraint {self.name}", found, accepted)
 
-    def _sums(self, p: Given) -> tuple[Array, Array, Array]:
+    def _sums(self, p: Arguments) -> tuple[Array, Array, Array]:
         """Return sums E z + f [SI], (K, k, n) and (K, k), of which k together are to be small, and sizes (K,) of E."""
         if self.demanded.kind == "move":
             known = {place.name: place for place in self.where}
@@ -443,7 +443,7 @@ class Parsed:
             raise self._wrong("no identified parameter", "identified parameters: " + ", ".join(p.names[:24]))
         return E, f, size
 
-    def _rows(self, found: Sum, p: Given) -> Iterator[tuple[Array, float]]:
+    def _rows(self, found: Sum, p: Arguments) -> Iterator[tuple[Array, float]]:
         """Yield a sum as a row (n,) and a number [SI], one for every identified parameter that its pattern matches.
 
         Parameters that are not identified are nominal.

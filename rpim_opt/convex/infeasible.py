@@ -15,7 +15,7 @@ LEAST = 1e-6
 """Slacks below this are the solver's accuracy."""
 
 
-class Stated(NamedTuple):
+class Condition(NamedTuple):
     """CVXPY constraints of z, by a name that their user knows."""
 
     name: str
@@ -50,17 +50,17 @@ def conflict(structure: Structure) -> Conflict | None:
     return Conflict(bounds, names, statements)
 
 
-def _demands(units: list[list[Stated]]) -> list[Any]:
+def _demands(units: list[list[Condition]]) -> list[Any]:
     return [demand for unit in units for stated in unit for demand in stated.demands]
 
 
-def _possible(units: list[list[Stated]]) -> bool:
+def _possible(units: list[list[Condition]]) -> bool:
     """Whether all can be met at once."""
     problem = cp.Problem(cp.Minimize(0), _demands(units))
     return minimized(problem) or problem.status not in (cp.INFEASIBLE, cp.INFEASIBLE_INACCURATE)
 
 
-def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
+def _irreducible(units: list[list[Condition]]) -> list[list[Condition]]:
     """Leave out, one after the other, what is not needed for the contradiction."""
     left = list(units)
     for unit in units:
@@ -70,26 +70,26 @@ def _irreducible(units: list[list[Stated]]) -> list[list[Stated]]:
     return left
 
 
-def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[list[Stated]]:
+def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any = 0) -> list[list[Condition]]:
     """Return what every constraint function demands, bound by bound.
 
     Loosened by slacks of boxes [scales], and of statements in words [scales of each].
     """
     parameters, stated = structure.parameters, structure.formulation
-    units: list[list[Stated]] = []
+    units: list[list[Condition]] = []
     count = 0
     for k, function in enumerate(stated.constraints):
-        unit: list[Stated] = []
+        unit: list[Condition] = []
         if isinstance(function, Box):
             more = boxes + np.zeros(structure.n)
             for sign, side in zip("><", function.bounds(parameters), strict=True):
                 for i in np.flatnonzero(np.isfinite(side)):
                     bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
                     demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
-                    unit.append(Stated(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
+                    unit.append(Condition(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
         elif isinstance(function, Parsed):
             by = None if isinstance(statements, int) else function.scale(parameters) * statements[count]
-            unit.append(Stated(function.name, tuple(function.loosened(z, parameters, by))))
+            unit.append(Condition(function.name, tuple(function.loosened(z, parameters, by))))
             count += 1
         else:
             demands = [
@@ -97,7 +97,7 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
             ]
             name = name_of(function, k)
             several = len(demands) > 1
-            unit = [Stated(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
+            unit = [Condition(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
         units.append(unit)
     return units
 

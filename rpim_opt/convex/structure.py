@@ -18,6 +18,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.convex.arguments import arguments_of
 from rpim_opt.convex.constraints import Box, Ready
 from rpim_opt.convex.expressions import (
     NORM2,
@@ -36,7 +37,6 @@ from rpim_opt.convex.expressions import (
     term,
 )
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.given import given
 from rpim_opt.convex.quadratic import Quadratic, identity, quadratic
 from rpim_opt.convex.robust_loss import QuadraticModel, separable
 from rpim_opt.convex.solvers.conic import Canonical
@@ -88,7 +88,7 @@ class Answers:
             live_penalty, self.penalty_of_z = (
                 substituted(each, instead) if instead else each for each in (stated, self.penalty.expression)
             )
-        known = given(z, parameters)
+        known = arguments_of(z, parameters)
         live = []
         for k, constraint in enumerate(formulation.constraints):
             name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))

@@ -7,7 +7,7 @@ from typing import Any
 
 import cvxpy as cp
 
-from rpim_opt.convex.given import index_of
+from rpim_opt.convex.arguments import index_of
 
 
 class Unknown(cp.Variable):

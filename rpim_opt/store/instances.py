@@ -19,9 +19,9 @@ from rpim_opt.basics.units import UNITS
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.calibration import identify
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.convex.arguments import arguments_of
 from rpim_opt.convex.constraints import Box, Parsed
 from rpim_opt.convex.formulation import Formulation
-from rpim_opt.convex.given import given
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import on_board
@@ -276,7 +276,7 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
         from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
 
         z = Unknown(parameters.names)
-        constraint(z, given(z, parameters))
+        constraint(z, arguments_of(z, parameters))
         if isinstance(constraint, Parsed):
             constraint.require_near(parameters)
     return formulation

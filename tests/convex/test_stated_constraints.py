@@ -158,7 +158,7 @@ def test_a_contradiction_is_named() -> None:
 def test_names_in_a_script_say_the_same() -> None:
     """`z` and `x` by name, as a statement would have it."""
 
-    def by_hand(z: ro.convex.Unknown, p: ro.convex.Given) -> list[cp.Constraint]:
+    def by_hand(z: ro.convex.Unknown, p: ro.convex.Arguments) -> list[cp.Constraint]:
         deviations = p.x
         return [
             270e-3 + deviations["a3"] + 302e-3 + deviations["d4"] <= 572.05e-3,

@@ -61,7 +61,7 @@ class Deviations:
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class Given(Identified):
+class Arguments(Identified):
     """The identified parameters as the argument of a constraint function, with z (n,) and quantities affine in it.
 
     Other arguments as for `Parameters`; ``asked`` notes that positions were used, which are linear about some point.
@@ -97,12 +97,12 @@ class Given(Identified):
         return cp.reshape(flat @ self.z, (count, 3), order="C") + prediction.position
 
 
-def whole(p: Given) -> Parameters:
+def whole(p: Arguments) -> Parameters:
     """Return all parameters of the problem; of a table alone those that it has."""
     return p if p.problem is None else p.problem.parameters
 
 
-def problem_of(p: Given) -> CalibrationProblem:
+def problem_of(p: Arguments) -> CalibrationProblem:
     """Return the problem that predicts positions for some parameters; InputError if there is none."""
     if p.problem is None:
         found = "parameters without a problem"
@@ -111,7 +111,7 @@ def problem_of(p: Given) -> CalibrationProblem:
     return p.problem
 
 
-def every_movement(p: Given, q: Array) -> Predicted:
+def every_movement(p: Arguments, q: Array) -> Predicted:
     """Return displacements (M, 3) [m] of every reflector by the robot's parameters, and their slopes (M, 3, n) by z.
 
     Deviations of frames (base, reflector) do not count: they say where things stand, not how the robot is.
@@ -122,14 +122,14 @@ def every_movement(p: Given, q: Array) -> Predicted:
     return Predicted(np.concatenate([each.position for each in movements]), slope * p.scale)
 
 
-def given(z: Any, parameters: Parameters) -> Given:
+def arguments_of(z: Any, parameters: Parameters) -> Arguments:
     """Return the argument of constraint functions: the parameters with z (n,), and the problem of a linear model.
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("paper_arm").problem.parameters.free
-    >>> len(ro.convex.given(ro.convex.Unknown(parameters.names), parameters).x)
+    >>> len(ro.convex.arguments_of(ro.convex.Unknown(parameters.names), parameters).x)
     26
     """
-    if isinstance(parameters, Given):
+    if isinstance(parameters, Arguments):
         return replace(parameters, z=z)
-    return Given(**{each.name: getattr(parameters, each.name) for each in fields(parameters)}, z=z)
+    return Arguments(**{each.name: getattr(parameters, each.name) for each in fields(parameters)}, z=z)
