@@ -16,7 +16,7 @@ from rpim_opt.problem.noise import Repeatability, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
 """Prior medians of the robot's repeatability [m, rad, rad], and of the factor on the instrument's noise."""
-CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5), "transmission waves": (1.5e-4, 0.4)}
+CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5), "transmission waves": (1.5e-4, 0.05)}
 """Hyperparameters of transmission errors: prior median [rad], and standard deviation of the natural logarithm.
 
 That of the waves is narrow: part of a joint's range hardly distinguishes them from its offset and eccentricity.
