@@ -73,6 +73,8 @@ MOST_ROUNDS = 20
 """Of telling rows of one reflector from those of another, and of fitting one joint's values."""
 TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
+OUTLYING, OUTLYING_ROUNDS = 10, 3
+"""One of so many rows may be an outlier of the one calibration; rounds in which these are found."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 PLACES, SPANS = 40, 12
@@ -914,8 +916,11 @@ def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
             before, now = now, both[1] < both[0]
             if (now == before).all():
                 break
-    whole = float(errors(np.ones(len(b), dtype=bool)).sum())
-    left = float(np.sqrt(best / spare / (whole / (len(b) - rank))))
+    kept = np.ones(N, dtype=bool)  # a few gross errors are outliers, and no kind of rows
+    for _ in range(OUTLYING_ROUNDS):
+        one = errors(kept[owners])
+        kept = one <= np.sort(one)[N - N // OUTLYING - 1]
+    left = float(np.sqrt(best / spare / (errors(kept[owners])[kept].sum() / (kept[owners].sum() - rank))))
     if second.sum() > N / 2:
         second = ~second
     return Kinds(second, left) if left < TWO_KINDS and second.sum() >= FEWEST else None
