@@ -373,7 +373,8 @@ def minimized(problem: cp.Problem, **settings: float) -> bool:
     with warnings.catch_warnings(), contextlib.suppress(cp.SolverError):
         warnings.simplefilter("ignore", UserWarning)
         problem.solve(solver=cp.CLARABEL, **settings)
-    return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+        return problem.status in (cp.OPTIMAL, cp.OPTIMAL_INACCURATE)
+    return False  # the status is that of the solution before
 
 
 def norms(r: Any, group: np.ndarray) -> Any:

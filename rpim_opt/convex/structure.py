@@ -300,7 +300,7 @@ class Structure:
             for variable, number in ((a.z, z), (a.loss.variable, v)):  # not what the solver leaves of them
                 variable.save_value(number)
             penalty: Any = 0.0 if a.penalty_of_z is None else a.penalty_of_z.value
-            return float(a.loss.expression.value), float(penalty)
+            return np.asarray(a.loss.expression.value).item(), np.asarray(penalty).item()  # of a perspective it is (1,)
 
     @cached_property
     def _over_own(self) -> tuple[cp.Problem, list[cp.Parameter]]:

@@ -234,6 +234,16 @@ def test_some_rows_of_many_give_the_minimum_of_all(loss: Any, over: str) -> None
         assert estimate.objective <= best.objective + 1e-7 * max(abs(best.objective), 1.0)
 
 
+def test_loss_and_constraint_may_share_a_slack_on_many_rows() -> None:
+    problem, _ = simulated(configurations=600, noise=1e-4, seed=1)
+    slack = cp.Variable(nonneg=True)
+    mine = ro.Formulation(
+        "mine", lambda r: cp.sum(cp.huber(r, 1.5)) + 5 * slack, cp.sum_squares, (lambda z, p: cp.norm(z) <= 2 + slack,)
+    )
+    result = ro.calibrate(problem, mine, 1.0)
+    assert result.converged, result.message
+
+
 @pytest.mark.parametrize("formulation", ["robust", "sum_of_norms"])
 @pytest.mark.parametrize("rule", ["reml", "l_curve", "corner", "gcv", "quasi_optimality"])
 def test_storage_decides_nothing(formulation: str, rule: str, monkeypatch: pytest.MonkeyPatch) -> None:
