@@ -115,8 +115,8 @@ def _headline(content: Content) -> Iterator[Block]:
             U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
-    elif inconclusive(result, content.map):
-        word, _, text = inconclusive(result, content.map).partition(": ")
+    elif doubt := inconclusive(result, content.map):
+        word, _, text = doubt.partition(": ")
         yield "verdict", {"kind": "inconclusive", "word": word, "text": text}
     elif result.verdict.delivered:
         text = "the fit gives no reason against using this robot; no acceptance limit is stated."

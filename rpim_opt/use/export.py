@@ -22,7 +22,7 @@ from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior_terms import prior_penalty
-from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
@@ -164,22 +164,13 @@ def export_files(
     ]
     writers += [(target, write) for target, write in plain if target]
     if not writers:
-        accepted = (
-            "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections, one or several"
-        )
-        raise InputError("export", "nothing to write", accepted)
+        options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
+        raise InputError("export", "nothing to write", f"{options}, one or several")
     undecided = accepted is not None and accepted.verdict == "inconclusive" and verdict.delivered
     if whole.learned is not None and result is not whole and found is not None:
-        stays = np.linalg.norm(result.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
-        bound, required = float((found.expanded + stays).max()), found.requirement
-        less = (
-            f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at "
-            f"most {1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It contains the error that "
-            f"geometry without {joined(whole.learned.extensions)} makes, at most {1e3 * stays.max():.3f} mm there."
-        )
-        if accepted and bound > required.limit:
-            less += f" It is above the limit of {1e3 * required.limit:g} mm, within which only the whole model is."
-            undecided = True
+        limit = found.requirement.limit if accepted else np.inf
+        less, above = _of_geometry(result, joined(whole.learned.extensions), found, limit)
+        undecided |= above
         note = " ".join(filter(None, [note, less]))
         notes.append(
             "Another point of the flange and its orientation may be known less: `compensate --tool` states their "
@@ -187,6 +178,21 @@ def export_files(
         )
     messages = write_all(writers, note)
     return Exported([target for target, _ in writers], [*filter(None, [note]), *notes, *messages], undecided)
+
+
+def _of_geometry(alone: Calibration, extensions: str, found: Workspace, limit: float) -> tuple[str, bool]:
+    """Return the uncertainty of geometry without extensions as sentences, and whether it is above the limit [m]."""
+    stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
+    bound, required = float((found.expanded + stays).max()), found.requirement
+    text = (
+        f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at most "
+        f"{1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It contains the error that geometry "
+        f"without {extensions} makes, at most {1e3 * stays.max():.3f} mm there."
+    )
+    above = bound > limit
+    if above:
+        text += f" It is above the limit of {1e3 * limit:g} mm, within which only the whole model is."
+    return text, above
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:

@@ -21,8 +21,6 @@ FEWEST = {True: 4, False: 6}  # points that a view of a plane, and of points in 
 FLAT = 1e-6  # third singular value of a board's points over the first, below which they are in a plane
 LEAST_VIEWS = 3  # views that show focal lengths and centre
 UNCERTAIN = 3.0  # by how much a view's pose is less certain than its points would be alone
-NEAREST = 1e-6  # depth of a point before the camera [m] that is counted with at least
-MOST_STEPS, SMALLEST_STEP = 100, 1e-10  # of a view's pose [rad, m]
 
 
 def camera_blocks(data: Dataset) -> list[Block]:
@@ -111,36 +109,20 @@ def _linear(points: Array, xy: Array) -> Array:
 
 
 def _refined(T: Array, points: Array, xy: Array) -> tuple[Array, float]:
-    """Return the pose that fits best near a first one, and its sum of squares, by Levenberg-Marquardt."""
-    axes = np.eye(3)
-    there = transformed(T, points)
-    r = _missed(there, xy)
-    damping = 1e-3
-    for _ in range(MOST_STEPS):
-        depth = np.maximum(there[:, 2:], NEAREST)[:, :, None]
-        turns = np.cross(axes, (there - T[:3, 3])[:, None])
-        moves = np.concatenate([turns, np.broadcast_to(axes, turns.shape)], axis=1).transpose(0, 2, 1)  # (P, 3, 6)
-        J = ((moves[:, :2] - there[:, :2, None] / depth * moves[:, 2:]) / depth).reshape(-1, 6)
-        H = J.T @ J
-        step = -np.linalg.lstsq(H + damping * np.diag(np.diag(H)), J.T @ r)[0]
+    """Return the pose that fits best near a first one, and its sum of squares."""
+
+    def pose_at(step: Array) -> Array:
         turn = scipy.spatial.transform.Rotation.from_rotvec(step[:3]).as_matrix()
-        other = rigid(turn @ T[:3, :3], T[:3, 3] + step[3:])
-        trial = transformed(other, points)
-        left = _missed(trial, xy)
-        fall = float(r @ r - left @ left)
-        if fall <= 0:
-            damping *= 10
-        else:
-            T, there, r = other, trial, left
-            damping /= 10
-        if np.abs(step).max() < SMALLEST_STEP:
-            break
-    return T, float(r @ r)
+        return rigid(turn @ T[:3, :3], T[:3, 3] + step[3:])
 
+    def residual(step: Array) -> Array:
+        there = transformed(pose_at(step), points)
+        return (there[:, :2] / np.maximum(there[:, 2:], 1e-6) - xy).ravel()
 
-def _missed(there: Array, xy: Array) -> Array:
-    """Return by how much points in the camera's frame (P, 3) are seen elsewhere than in directions xy, (2P,)."""
-    return np.asarray((there[:, :2] / np.maximum(there[:, 2:], NEAREST) - xy).ravel(), dtype=float)
+    solution = scipy.optimize.least_squares(
+        residual, np.zeros(6), method="lm", x_scale="jac", xtol=1e-10, ftol=1e-15, gtol=1e-15
+    )
+    return pose_at(solution.x), float(2 * solution.cost)
 
 
 def rows_by_view(data: Dataset, block: Block) -> Iterator[np.ndarray]:
