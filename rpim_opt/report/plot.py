@@ -317,8 +317,7 @@ COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "
 SHAPES = "osD^v<>"
 CLOSE, VERY_CLOSE = 3.0, 1.6
 """Ratios of a logarithmic axis's ends below which it has ticks between 1, 2 and 5, and at every tenth."""
-MANY_DOTS = 1000
-"""Dots beyond which they are one picture in a vector graphic."""
+MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
 """Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
 LINE_HEIGHT = 1.25  # distance of names over their size

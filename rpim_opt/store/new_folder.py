@@ -58,10 +58,8 @@ GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)",
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 FARTHEST = 50.0
 """Distance from the instrument to a base beyond which the units are likely wrong [m]."""
-UPRIGHT = 0.9
-"""Cosine of the angle between two directions of gravity above which they are the same mounting."""
-CAMERA_CLEARLY = 3.0
-"""The camera is where the poses fit so many times better."""
+UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
+CAMERA_CLEARLY = 3.0  # The camera is where the poses fit so many times better.
 
 
 @dataclass(frozen=True)

@@ -163,88 +163,47 @@ class Observation(Table):
 class ProblemTable(Table):
     """The keys of ``problem.toml``."""
 
-    title: str
-    """What was calibrated."""
-    source: str = ""
-    """Where every figure comes from, and its licence."""
-    robot: str = "robot.toml"
-    """File of the robot (.toml, .urdf, .csv, .json), or the name of a ready one."""
-    urdf_base: str | None = None
-    """Link where the chain starts."""
-    urdf_tip: str | None = None
-    """Link where the chain ends."""
-    mounting: Mounting | None = None
-    """floor, ceiling, wall, or the direction of gravity in the base frame."""
-    payload: PayloadTable | None = None
-    """Mass at the flange and its centre."""
-    celsius: float | None = Field(default=None, alias="temperature_C")
-    """Temperature at which the lengths are nominal [degC]."""
-    measurement: str = "position"
-    """Measurement type; one of your own is mine:height, the Measurement `height` in mine.py (--allow-code)."""
-    terms: list[str] = Field(default_factory=list)
-    """Terms of your own: mine:droop is the Term `droop` in mine.py (--allow-code)."""
-    identification: str | None = None
-    """Table of the identification data."""
-    validation: str | None = None
-    """Table of the validation data."""
-    held_out: bool = False
-    """Validation data were drawn from the same table: once they have validated, all rows are used."""
-    noise_assumed: bool = False
-    """The measurement noise is a guess, which results and reports say."""
-    raw: dict[str, str] = Field(default_factory=dict)
-    """Files from which `new` made the tables: name = SHA-256."""
-    observation: list[Observation] = Field(default_factory=list)
-    """Several measurement types, a table each."""
-    target: str | dict[str, Any] | None = None
-    """Board of a camera: a table, or columns, rows and spacing."""
-    exclude: dict[str, str] = Field(default_factory=dict)
-    """Rows to leave out: label = reason."""
-    identify: list[Name] | Literal["auto"]
-    """Patterns of the parameters to identify, or auto."""
-    formulation: str = "tikhonov"
-    """Name of a ready formulation."""
-    selector: str = "learned"
-    """learned (prior scales), the name of a selection rule, or a number."""
-    model: Model = "geometry"
-    """auto: model extensions by evidence; geometry: none."""
-    repeatability: str | dict[str, Any] = "robot"
-    """Variance components to estimate (robot, free, level, declared), or the repeatability."""
-    noise: dict[str, Any] = Field(default_factory=dict)
-    """Measurement noise of rows that state none."""
-    scale: dict[Name, Any] = Field(default_factory=dict)
-    """Prior standard deviations, by kind, pattern or name."""
-    tolerance: dict[Name, Any] = Field(default_factory=dict)
-    """Largest deviations of the formulation bounded."""
-    prior: PriorTable = PriorTable()
-    """What is known besides the scales."""
-    constraints: Constraints = Constraints()
-    """Constraints on parameters and positions."""
-    known_distance: list[DistanceTable] = Field(default_factory=list)
-    """Known distances between touched points or planes."""
-    known_angle: list[AngleTable] = Field(default_factory=list)
-    """Known angles between touched planes."""
-    base: dict[str, Any] | Literal["auto"] = Field(default_factory=dict)
-    """Start of the base frame, or auto (registration)."""
-    tool: dict[str, Any] = Field(default_factory=dict)
-    """Start of the tool frame; of several reflectors by marker."""
-    published: dict[str, dict[str, float]] = Field(default_factory=dict)
-    """Mean errors [mm] that the source prints."""
-    reference: dict[str, list[float]] = Field(default_factory=dict)
-    """Figures that a run must reproduce: [value, tolerance]."""
-    simulation: dict[str, Any] = Field(default_factory=dict)
-    """How the tables were simulated."""
-    record: dict[str, Any] = Field(default_factory=dict)
-    """Who measured, when, with what."""
-    reading: dict[str, str] = Field(default_factory=dict)
-    """How the tables are to be read where the joints or frames need another reading."""
-    acceptance: dict[str, Any] = Field(default_factory=dict)
-    """Tolerance, confidence and region of the acceptance test."""
-    variant: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Overlays of any key, by name."""
-    chain: dict[str, dict[str, Any]] = Field(default_factory=dict)
-    """Chains of one URDF, by name: overlays of any key."""
-    shared: list[Name] | dict[str, list[Name]] = Field(default_factory=list)
-    """Patterns of what chains share besides the origins of the URDF's joints; or by chain, what it shares."""
+    title: str  # What was calibrated.
+    source: str = ""  # Where every figure comes from, and its licence.
+    robot: str = "robot.toml"  # File of the robot (.toml, .urdf, .csv, .json), or the name of a ready one.
+    urdf_base: str | None = None  # Link where the chain starts.
+    urdf_tip: str | None = None  # Link where the chain ends.
+    mounting: Mounting | None = None  # floor, ceiling, wall, or the direction of gravity in the base frame.
+    payload: PayloadTable | None = None  # Mass at the flange and its centre.
+    celsius: float | None = Field(None, alias="temperature_C")  # Temperature at which lengths are nominal [degC].
+    measurement: str = "position"  # Measurement type; mine:height is `height` in mine.py (--allow-code).
+    terms: list[str] = Field([])  # Terms of your own: mine:droop is the Term `droop` in mine.py (--allow-code).
+    identification: str | None = None  # Table of the identification data.
+    validation: str | None = None  # Table of the validation data.
+    held_out: bool = False  # Validation data are rows of the same table: once they have validated, all rows are used.
+    noise_assumed: bool = False  # The measurement noise is a guess, which results and reports say.
+    raw: dict[str, str] = Field({})  # Files from which `new` made the tables: name = SHA-256.
+    observation: list[Observation] = Field([])  # Several measurement types, a table each.
+    target: str | dict[str, Any] | None = None  # Board of a camera: a table, or columns, rows and spacing.
+    exclude: dict[str, str] = Field({})  # Rows to leave out: label = reason.
+    identify: list[Name] | Literal["auto"]  # Patterns of the parameters to identify, or auto.
+    formulation: str = "tikhonov"  # Name of a ready formulation.
+    selector: str = "learned"  # learned (prior scales), the name of a selection rule, or a number.
+    model: Model = "geometry"  # auto: model extensions by evidence; geometry: none.
+    repeatability: str | dict[str, Any] = "robot"  # Components: robot, free, level, declared; or stated.
+    noise: dict[str, Any] = Field({})  # Measurement noise of rows that state none.
+    scale: dict[Name, Any] = Field({})  # Prior standard deviations, by kind, pattern or name.
+    tolerance: dict[Name, Any] = Field({})  # Largest deviations of the formulation bounded.
+    prior: PriorTable = PriorTable()  # What is known besides the scales.
+    constraints: Constraints = Constraints()  # Constraints on parameters and positions.
+    known_distance: list[DistanceTable] = Field([])  # Known distances between touched points or planes.
+    known_angle: list[AngleTable] = Field([])  # Known angles between touched planes.
+    base: dict[str, Any] | Literal["auto"] = Field({})  # Start of the base frame, or auto (registration).
+    tool: dict[str, Any] = Field({})  # Start of the tool frame; of several reflectors by marker.
+    published: dict[str, dict[str, float]] = Field({})  # Mean errors [mm] that the source prints.
+    reference: dict[str, list[float]] = Field({})  # Figures that a run must reproduce: [value, tolerance].
+    simulation: dict[str, Any] = Field({})  # How the tables were simulated.
+    record: dict[str, Any] = Field({})  # Who measured, when, with what.
+    reading: dict[str, str] = Field({})  # How tables are to be read where joints or frames need another reading.
+    acceptance: dict[str, Any] = Field({})  # Tolerance, confidence and region of the acceptance test.
+    variant: dict[str, dict[str, Any]] = Field({})  # Overlays of any key, by name.
+    chain: dict[str, dict[str, Any]] = Field({})  # Chains of one URDF, by name: overlays of any key.
+    shared: list[Name] | dict[str, list[Name]] = Field([])  # What chains share besides joints, or by chain.
 
 
 @dataclass(frozen=True, eq=False)

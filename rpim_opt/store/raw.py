@@ -28,8 +28,7 @@ from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_source, read_arm
 
-CLEARLY = 3.0
-"""The right reading of orientations leaves so many times less than another one."""
+CLEARLY = 3.0  # The right reading of orientations leaves so many times less than another one.
 USUAL = "extrinsic xyz"
 READINGS = {
     "quaternion": ORDERS,

@@ -49,8 +49,7 @@ SHARED = ("weight", "selection", "converged", "message", "history", "certificate
 """What a calibration and its file hold under the same name."""
 RELATIVE = 1e-4
 """Standard deviations of hardly identifiable directions differ by that much from one processor to another."""
-ABSOLUTE = 1e-6
-"""Largest difference of a small figure [mm, deg] and the one that follows from the data."""
+ABSOLUTE = 1e-6  # Largest difference of a small figure [mm, deg] and the one that follows from the data.
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sum_squares": SQUARES, "sum": SUM, "max": LARGEST, "norm1": NORM1, "norm2": NORM2, "huber": huber,
     "prior_penalty": prior_penalty,
@@ -200,58 +199,32 @@ class RowErrors(NamedTuple):
 class Stored:
     """The primary content of a result file in SI, from which everything else follows."""
 
-    formulation: str
-    """Name of the formulation."""
-    definition: dict[str, Any]
-    """Its loss, penalty and constraints."""
-    forms: Forms | None
-    """Quadratic forms of a script's loss and penalty."""
-    weight: float
-    """Regularization weight."""
-    selection: Selection | None
-    """Choice of the weight with its evidence."""
-    converged: bool
-    """Whether the certificate holds."""
-    message: str
-    """How the iteration ended."""
-    history: tuple[Iteration, ...]
-    """Objective, step, weight and damping of every iteration."""
-    x: Array
-    """Deviations of the identified parameters [SI]."""
-    certificate: Certificate
-    """Optimality gap and violation."""
-    inliers: StoredInliers | None
-    """Equations that a script's loss downweighted or left out."""
-    active_bounds: tuple[ActiveBound, ...]
-    """Parameters at an active bound."""
-    shadow_prices: tuple[ShadowPrice, ...]
-    """Multipliers of the constraints."""
-    robots: dict[str, Robot]
-    """Nominal robots."""
-    terms: dict[str, list[OwnTerm]]
-    """Terms of a script's own, without their functions."""
-    transmission: tuple[Curve, ...]
-    """Transmission errors of the joints."""
-    origins: dict[str, tuple[Carried, ...]]
-    """Origins of a URDF's joints that displace the robots' rows."""
-    model: Parameters
-    """All parameters: nominal, prior scale, tolerance, identified."""
-    data: dict[str, Dataset]
-    """Identification and validation data."""
-    repeatability: Repeatability | None
-    """Repeatability of the robot."""
-    learned: Learned | None
-    """Estimated prior scales and noise with their evidence."""
-    record: Record
-    """Title, source, files and excluded rows."""
-    causes: tuple[str, ...]
-    """Likely mistakes in the data."""
-    rows: dict[str, list[RowErrors]]
-    """Errors of every row [mm], nominal and identified."""
-    mapping: JointMapping | None = None
-    """Signs and offsets of joints that the global start found."""
-    digest: str = ""
-    """SHA-256 of the content."""
+    formulation: str  # Name of the formulation.
+    definition: dict[str, Any]  # Its loss, penalty and constraints.
+    forms: Forms | None  # Quadratic forms of a script's loss and penalty.
+    weight: float  # Regularization weight.
+    selection: Selection | None  # Choice of the weight with its evidence.
+    converged: bool  # Whether the certificate holds.
+    message: str  # How the iteration ended.
+    history: tuple[Iteration, ...]  # Objective, step, weight and damping of every iteration.
+    x: Array  # Deviations of the identified parameters [SI].
+    certificate: Certificate  # Optimality gap and violation.
+    inliers: StoredInliers | None  # Equations that a script's loss downweighted or left out.
+    active_bounds: tuple[ActiveBound, ...]  # Parameters at an active bound.
+    shadow_prices: tuple[ShadowPrice, ...]  # Multipliers of the constraints.
+    robots: dict[str, Robot]  # Nominal robots.
+    terms: dict[str, list[OwnTerm]]  # Terms of a script's own, without their functions.
+    transmission: tuple[Curve, ...]  # Transmission errors of the joints.
+    origins: dict[str, tuple[Carried, ...]]  # Origins of a URDF's joints that displace the robots' rows.
+    model: Parameters  # All parameters: nominal, prior scale, tolerance, identified.
+    data: dict[str, Dataset]  # Identification and validation data.
+    repeatability: Repeatability | None  # Repeatability of the robot.
+    learned: Learned | None  # Estimated prior scales and noise with their evidence.
+    record: Record  # Title, source, files and excluded rows.
+    causes: tuple[str, ...]  # Likely mistakes in the data.
+    rows: dict[str, list[RowErrors]]  # Errors of every row [mm], nominal and identified.
+    mapping: JointMapping | None = None  # Signs and offsets of joints that the global start found.
+    digest: str = ""  # SHA-256 of the content.
 
 
 def content(result: Calibration) -> dict[str, Any]:

@@ -32,12 +32,10 @@ from rpim_opt.store.statements import place_fixtures
 Columns = dict[str, list[str]]
 MOST = 1_000_000
 """Configurations of a table."""
-TORQUE = 20.0
-"""Simulated joint torques are uniform up to this [Nm]."""
+TORQUE = 20.0  # Simulated joint torques are uniform up to this [Nm].
 DIGITS, EXACT_DIGITS, CAMERA_DIGITS = 4, 9, 5
 """Of joint values in degrees or millimetres; where the noise is in them none may come from rounding."""
-PREFIXES = ("", "to_")
-"""What precedes the columns of the points of a row."""
+PREFIXES = ("", "to_")  # What precedes the columns of the points of a row.
 Place = Annotated[list[float], Field(min_length=3, max_length=3)]
 Pixels = Annotated[int, Field(gt=0)]
 

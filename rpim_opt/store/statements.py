@@ -27,8 +27,7 @@ from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import JOINT_OFFSET, Parameters, is_joint_offset
 
-MEASURED = "measured"
-"""The place that every problem has: the configurations of its identification data."""
+MEASURED = "measured"  # The place that every problem has: the configurations of its identification data.
 FIELDS = {
     "by": "Measured by",
     "when": "Measured",
@@ -44,8 +43,7 @@ FIELDS = {
     "notes": "Notes",
 }
 """Keys of ``[record]``, and what a report calls them."""
-LONGEST_TEXT = 1000
-"""Characters of a text that somebody may want to read."""
+LONGEST_TEXT = 1000  # Characters of a text that somebody may want to read.
 
 
 def _joints(robot: Robot) -> dict[str, tuple[str, ...]]:

@@ -45,8 +45,7 @@ STRANGE = 5.0
 """Readings that no change explains, and that miss by so many times the error before any calibration, are another's."""
 RIVAL = 0.05  # probability from which on another cause is named beside the most probable one
 SHOWN = 5  # causes that are shown
-UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "
-"""What title and source of an updated calibration say."""
+UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
 
 
 class Fit(NamedTuple):

@@ -182,17 +182,18 @@ def files() -> str:
     """Return the page of the keys of every file."""
     text = "# Files\n\nA key that holds a quantity ends in its unit: `a_mm`, `theta_deg`. Unknown keys are refused."
     for name, (source, owner, what) in FILES.items():
-        module = ast.parse((PACKAGE / source).read_text(encoding="utf-8"))
-        classes = {node.name: node for node in module.body if isinstance(node, ast.ClassDef)}
-        text += f"\n\n## {name}\n\n{what}\n\n{_table(('key', 'value', 'what'), *_keys(classes[owner]))}"
+        code = (PACKAGE / source).read_text(encoding="utf-8")
+        classes = {node.name: node for node in ast.parse(code).body if isinstance(node, ast.ClassDef)}
+        rows = _keys(classes[owner], code.splitlines())
+        text += f"\n\n## {name}\n\n{what}\n\n{_table(('key', 'value', 'what'), *rows)}"
     return text + "\n"
 
 
-def _keys(owner: ast.ClassDef) -> Iterator[tuple[str, str, str]]:
-    """Yield key, type and description of every field of a class."""
+def _keys(owner: ast.ClassDef, lines: list[str]) -> Iterator[tuple[str, str, str]]:
+    """Yield key, type and description (a comment behind it, or the text below) of every field of a class."""
     for field, below in zip(owner.body, [*owner.body[1:], None], strict=True):
         if isinstance(field, ast.AnnAssign) and isinstance(field.target, ast.Name):
-            text = ""
+            text = lines[(field.end_lineno or field.lineno) - 1].partition("  # ")[2]
             if isinstance(below, ast.Expr) and isinstance(below.value, ast.Constant):
                 text = " ".join(str(below.value.value).split())
             yield f"`{field.target.id}`", f"`{ast.unparse(field.annotation)}`", text
