@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, wraps
 from importlib import import_module
+from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
@@ -20,13 +21,13 @@ import typer
 from typer import Argument, Option
 from typer.core import TyperGroup
 
-from rpim_opt import __version__
+import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
+from rpim_opt.basics.files import inside, refused, sha256_of
+from rpim_opt.basics.text import listed, progress_bar, table
 from rpim_opt.report import console
 
 if TYPE_CHECKING:
-    from rpim_opt.calibration.result import Calibration
-    from rpim_opt.store.instances import Instance
     from rpim_opt.use.reading import Measured
 
 HELP = """Robot calibration by convex optimization.
@@ -40,8 +41,6 @@ acceptance inconclusive.
 
 def _others() -> dict[str, Any]:
     """Return commands that other packages have, as entry points by name."""
-    from importlib.metadata import entry_points
-
     return {each.name: each for each in entry_points(group="rpim_opt.commands")}
 
 
@@ -89,7 +88,7 @@ ABORT: Any = (KeyboardInterrupt, typer.Abort)
 
 def _version(asked: bool) -> None:
     if asked:
-        typer.echo(f"rpim-opt {__version__}")
+        typer.echo(f"rpim-opt {ro.__version__}")
         raise typer.Exit
 
 
@@ -104,20 +103,14 @@ def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]
     return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
 
 
-def _shipped() -> Iterable[str]:
-    """Return the problems that come with the package; folders are the shell's own."""
-    folder = import_module("rpim_opt.store.problem_file").problems_folder()
-    return sorted(path.parent.name for path in folder.glob("*/problem.toml"))
-
-
 Text = str | None
 Number = float | None
 File = Path | None
 Choice = bool | None
-SHIPPED = _completed(_shipped)
+SHIPPED = _completed(lambda: sorted(path.parent.name for path in ro.store.problems_folder().glob("*/problem.toml")))
 FORMULATIONS = _completed(lambda: import_module("rpim_opt.convex.formulation").FORMULATIONS)
 SELECTORS = _completed(lambda: ["learned", *import_module("rpim_opt.convex.select").SELECTORS])
-ROBOTS = _completed(lambda: import_module("rpim_opt.robot.library").robots())
+ROBOTS = _completed(lambda: ro.robots())
 MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
 Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
@@ -153,9 +146,7 @@ Json = Annotated[bool, Option("--json", help="One JSON document on stdout, error
 
 def _with_code(context: typer.Context, allowed: bool) -> None:
     if allowed:
-        from rpim_opt.store.own_code import allow_code
-
-        context.with_resource(allow_code())
+        context.with_resource(ro.store.allow_code())
 
 
 Code = Annotated[bool, Option("--allow-code", help="Allow running the folder's Python files.", callback=_with_code)]
@@ -195,18 +186,16 @@ class Tables(NamedTuple):
     decimal: Decimal = ""
     measurement: Type = None
 
-    def read(self, result: "Calibration", sources: list[Path]) -> "Measured":
+    def read(self, result: "ro.calibration.Calibration", sources: list[Path]) -> "Measured":
         """Return the measurements of tables."""
-        from rpim_opt.use.reading import read_measurements
-
-        given = {"key": self.key, "within": self.time_tolerance, "sheet": self.sheet, "decimal": self.decimal}
-        options = console.table_options(self.units, **given)
-        return read_measurements(result, sources, self.measurement, options)
+        stated = {"key": self.key, "within": self.time_tolerance, "sheet": self.sheet, "decimal": self.decimal}
+        options = console.table_options(self.units, **stated)
+        return ro.use.read_measurements(result, sources, self.measurement, options)
 
 
 TABLES = Tables()
-CODES = {"accepted": 0, "rejected": 1, "inconclusive": 4}
-"""Exit codes of an acceptance test."""
+CODES = {"accepted": 0, "rejected": 1, "inconclusive": 4}  # exit codes of an acceptance test
+FAILURES = {NoSolutionFound: 3, NotDelivered: 1}  # exit codes of errors; of any other one of ours 2
 CODELESS = ("new", "iso9283", "study", "robots")  # commands that read no folder of a calibration, which may name code
 
 
@@ -276,21 +265,16 @@ def new(
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
-        from rpim_opt.basics.files import refused
-        from rpim_opt.store.raw import understand_tables
-
         options = console.table_options(
             units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, prefix=prefix,
             constants=tuple(console.listed_words(constants)), encoding=encoding, separator=separator, decimal=decimal,
             within=time_tolerance,
         )  # fmt: skip
         if dry_run:
-            found = understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)
+            found = ro.store.understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)
             return Answer(found, found.content())
-        from rpim_opt.store.new_folder import new_problem
-
         with refused(folder):
-            made = new_problem(
+            made = ro.store.new_problem(
                 folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
                 understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
@@ -304,20 +288,16 @@ def new(
 def inspect(problem: Problem, variant: Variant = None) -> Answer:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
-        from rpim_opt.basics.text import listed
         from rpim_opt.calibration.lack_of_fit import foreseen
-        from rpim_opt.problem.design import observe
-        from rpim_opt.problem.diagnosis import inspect
-        from rpim_opt.store.instances import load
 
         say("reading the problem")
-        instance = load(problem, variant)
+        instance = ro.load(problem, variant)
         say("inspecting")
         whole = instance.problem
         apart = instance.validation
         validation = {} if apart is None else {name: apart.of_robot(name) for name in {*apart.robot}}
-        parts = {name: inspect(whole.alone(name), validation.get(name)) for name in whole.arms}
-        together = observe(whole) if len(parts) > 1 else None
+        parts = {name: ro.problem.inspect(whole.alone(name), validation.get(name)) for name in whole.arms}
+        together = ro.problem.observe(whole) if len(parts) > 1 else None
         say("analysing the residuals of a quick fit")
         lacking, outliers = foreseen(whole)
     document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
@@ -356,10 +336,9 @@ def calibrate(
     """
     with console.progress() as say:
         from rpim_opt.report.summary import describe, summary
-        from rpim_opt.store.instances import load
 
         say("reading the problem")
-        instance = load(problem, variant)
+        instance = ro.load(problem, variant)
         requirement = console.required(limit, box, instance.record.requirement)
         instance = replace(instance, record=replace(instance.record, requirement=requirement))
         result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
@@ -370,10 +349,8 @@ def calibrate(
             say("calibrating without outliers")
             result = result.without_flagged()
         if use_validation or (use_validation is None and instance.held_out and result.verdict.delivered):
-            from rpim_opt.calibration.held_out import refit_all
-
             say("calibrating from all rows")
-            result = refit_all(result)
+            result = ro.calibration.refit_all(result)
         say("computing the summary")
         document = summary(result, instance.published)
     text = describe(result, document)
@@ -393,15 +370,12 @@ def report(
 ) -> Answer:
     """Write the calibration report: one self-contained HTML page, ready to be signed."""
     with _loaded(result) as (loaded, say):
-        from rpim_opt.basics.files import inside, refused
-        from rpim_opt.report.report import write_report
-
         say("writing the report")
         if out is None:
             folder = result if result.is_dir() else result.parent
             out = inside(folder, "report.html", "the file", folder)
         with refused(out):
-            write_report(loaded, out)
+            ro.report.write_report(loaded, out)
     return Answer("", {}, written=[out])
 
 
@@ -425,10 +399,8 @@ def validate(
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
-        from rpim_opt.use.validation import validate
-
         read = tables.read(loaded, data)
-        validation = validate(loaded, read.data, register)
+        validation = ro.use.validate(loaded, read.data, register)
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
     failed = within is False or validation.mistake or validation.worse
@@ -450,7 +422,6 @@ def accept(
     Exit code 0 if it is accepted, 1 if it is rejected, 4 if inconclusive: then it says what is missing.
     """
     with _loaded(result) as (loaded, say):
-        from rpim_opt.calibration.acceptance import accept
         from rpim_opt.calibration.held_out import registered
 
         left_out, notes, measured = (), (), None
@@ -463,7 +434,7 @@ def accept(
         elif register:
             raise InputError("--register", "no --data", "new measurements to register")
         say("searching for the maximum uncertainty")
-        acceptance = accept(loaded, console.required(limit, box, loaded.record.requirement), measured)
+        acceptance = ro.calibration.accept(loaded, console.required(limit, box, loaded.record.requirement), measured)
     return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], left_out=left_out, notes=notes)
 
 
@@ -476,11 +447,9 @@ def iso9283(
     out: Table = None,
 ) -> Answer:
     """Compute pose accuracy AP and repeatability RP from repeated approaches, as ISO 9283 defines them."""
-    from rpim_opt.use.iso9283 import read_approaches
-
     console.require_positive("--limit", limit)
     console.require_positive("--repeatability", repeatability)
-    performance = read_approaches(table, units)
+    performance = ro.use.read_approaches(table, units)
     if limit is not None and performance.accuracy is None:
         raise InputError("--limit", "a table without commands", "command_x_mm, command_y_mm, command_z_mm in it")
     accuracy, within = _against(limit, "AP_p", performance.accuracy or 0.0)
@@ -509,13 +478,10 @@ def update(
     Exit code 1 if errors on the new measurements stay unexplained, or the robot is not delivered.
     """
     with _loaded(result) as (loaded, say):
-        from rpim_opt.basics.files import sha256_of
-        from rpim_opt.use.recalibration import update
-
         read = tables.read(loaded, data)
         patterns = reset.replace(",", " ").split()
         source = source or ", ".join(file.name for file in data)
-        recalibration = update(
+        recalibration = ro.use.update(
             loaded, read.data, prior_inflation=prior_inflation, reset=patterns, source=source, progress=say
         )
         updated = recalibration.result
@@ -537,10 +503,9 @@ def monitor(
     """
     with _loaded(result) as (loaded, _):
         from rpim_opt.report.page import written_checks
-        from rpim_opt.use.monitoring import monitor
 
         read = tables.read(loaded, checks)
-        monitoring = monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
+        monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
         written = written_checks(monitoring, out, loaded.record.title)
     return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read.left_out, read.notes)
 
@@ -578,9 +543,7 @@ def export(
     inconclusive, which files and output say.
     """
     with _loaded(result) as (loaded, _):
-        from rpim_opt.use.export import export_files
-
-        exported = export_files(
+        exported = ro.use.export_files(
             loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, camera_info=camera_info,
             mdh=mdh, dh=dh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
             tip_measured=tip_measured, marker=marker, despite_verdict=despite_verdict,
@@ -615,12 +578,11 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
-        from rpim_opt.use.compensation import compensate
         from rpim_opt.use.reading import read_commands
 
         read, left_out = read_commands(loaded, targets, console.table_options(units, decimal=decimal))
         say("compensating")
-        compensation = compensate(
+        compensation = ro.use.compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
@@ -639,7 +601,6 @@ def simulate(
     out: Annotated[File, Option(help="Folder for the tables; the problem's own by default.")] = None,
 ) -> Answer:
     """Simulate the tables of a problem, and write its true parameters."""
-    from rpim_opt.basics.files import refused
     from rpim_opt.store.simulation import write_simulation
 
     with refused(out or problem):
@@ -665,25 +626,24 @@ def design(
 
         from rpim_opt.basics.tables import columns_csv, read_columns
         from rpim_opt.calibration.diagnosis import measured_ranges
-        from rpim_opt.problem.design import choose, joint_cells, random_candidates, read_candidates
-        from rpim_opt.problem.workspace import configurations_at, touched_place
-        from rpim_opt.store.instances import load
+        from rpim_opt.problem.design import joint_cells, read_candidates
+        from rpim_opt.problem.workspace import touched_place
 
         say("reading the problem")
-        posed = load(problem).problem
+        posed = ro.load(problem).problem
         where = ""
         if table is not None:
             q = read_candidates(table, posed.robot)
         elif posed.data.blocks[0].measurement.touching:
             place = console.touched_point(point) or touched_place(posed)
-            q = configurations_at(posed, np.tile(place, (candidates, 1)), seed)
+            q = ro.problem.configurations_at(posed, np.tile(place, (candidates, 1)), seed)
         else:
             limits = posed.robot.limits
             if augment:
                 limits = measured_ranges(posed)[posed.data.blocks[0].robot].T
                 where = "\nCandidates are within the measured joint ranges (use --table for others)."
-            q = random_candidates(replace(posed.robot, limits=limits), candidates, seed)
-        chosen = choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
+            q = ro.problem.random_candidates(replace(posed.robot, limits=limits), candidates, seed)
+        chosen = ro.problem.choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
     columns = joint_cells(posed.robot, q[chosen.chosen], chosen.chosen)
     if table is not None:
         label = read_columns(table).get("label")
@@ -708,7 +668,6 @@ def study(
 
     With --gate exit code 1 if a metric got worse.
     """
-    from rpim_opt.basics.text import progress_bar
     from rpim_opt.study.studies import regressions, run_study
 
     with progress_bar(name, not as_json) as say:
@@ -745,12 +704,11 @@ def compare(
 
     With --out every replicate is stored when it is finished, and README.md with the figure at the end.
     """
-    from rpim_opt.study.comparison import compare
     from rpim_opt.study.methods import USUAL
 
     journal = None if out is None else out / "replicates.sqlite"
     words, numbers = console.listed_words, console.listed_numbers
-    comparison = compare(
+    comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
         counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
         workers=workers, journal=journal, resume=resume, progress=not as_json,
@@ -767,12 +725,9 @@ def compare(
 @command
 def robots() -> Answer:
     """List the ready robots that a problem file may name."""
-    from rpim_opt.basics.text import table
-    from rpim_opt.robot.formats.tables import read_robot
     from rpim_opt.robot.library import find_robot
-    from rpim_opt.robot.library import robots as names
 
-    ready = {name: read_robot(find_robot(name)) for name in names()}
+    ready = {name: ro.read_robot(find_robot(name)) for name in ro.robots()}
     rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
     text = table(["robot", "name", "joints"], [[str(cell) for cell in row.values()] for row in rows])
     return Answer(text, {"robots": rows})
@@ -782,18 +737,16 @@ def robots() -> Answer:
 
 
 @contextmanager
-def _loaded(result: Path) -> Iterator[tuple["Calibration", Callable[[str], None]]]:
+def _loaded(result: Path) -> Iterator[tuple["ro.calibration.Calibration", Callable[[str], None]]]:
     """Load a result, and show what goes on while the command works with it."""
     with console.progress() as say:
-        from rpim_opt.store.result_file import load_result
-
         say("reading the result")
-        yield load_result(result), say
+        yield ro.load_result(result), say
 
 
 def _calibrated(
-    instance: "Instance", selector: Text, formulation: Text, words: dict[str, Text], say: Callable[[str], None]
-) -> "Calibration":
+    instance: "ro.store.Instance", selector: Text, formulation: Text, words: dict[str, Text], say: Callable[[str], None]
+) -> "ro.calibration.Calibration":
     """Calibrate as a problem's file says, or as the options say; name likely causes where there is no solution."""
     from rpim_opt.store.problem_file import named_formulation, named_weight
 
@@ -808,27 +761,22 @@ def _calibrated(
             **changes, progress=lambda it: say(f"linearizing: objective {it.objective:.6g}, step {it.step:.1e}")
         )
     except NoSolutionFound as error:
-        from rpim_opt.calibration.identify import calibrate
         from rpim_opt.calibration.verdict import likely_causes, mistakes
-        from rpim_opt.convex.formulation import tikhonov
 
-        causes = [] if error.conflict else likely_causes(calibrate(instance.problem, tikhonov, weight=1.0))
+        causes = [] if error.conflict else likely_causes(ro.calibrate(instance.problem, ro.tikhonov, weight=1.0))
         if not mistakes(causes):
             raise
         advice = " ".join(causes).rstrip(".")
         raise NoSolutionFound(error.formulation, error.weight, error.status, advice=advice) from None
 
 
-def _saved(result: "Calibration", out: Path | None) -> list[Path]:
+def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]:
     """Write a result's file where a folder is given."""
     if out is None:
         return []
-    from rpim_opt.basics.files import inside, refused
-    from rpim_opt.store.result_file import save_result
-
     file = inside(out, "result.json", "the file", out)
     with refused(file):
-        save_result(result, file)
+        ro.store.save_result(result, file)
     return [file]
 
 
@@ -876,9 +824,5 @@ def _run() -> None:
         console.fail(error.format_message(), error.exit_code)
     except ABORT:
         console.fail("Interrupted.", INTERRUPTED)
-    except NoSolutionFound as error:
-        console.fail(str(error), 3)
-    except NotDelivered as error:
-        console.fail(str(error), 1)
     except RpimError as error:
-        console.fail(str(error), 2)
+        console.fail(str(error), next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))

@@ -13,6 +13,8 @@ from threading import Timer
 from typing import TYPE_CHECKING, Any, TextIO
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.files import json_text, refused, write_text
+from rpim_opt.basics.text import visible
 from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
@@ -38,9 +40,6 @@ def fail(text: str, code: int) -> None:
 
 def _print(text: str | dict[str, Any], stream: TextIO) -> None:
     """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
-    from rpim_opt.basics.files import json_text
-    from rpim_opt.basics.text import visible
-
     if not isinstance(text, str):
         text = json_text(text).rstrip("\n")
     encoding = getattr(stream, "encoding", None) or "utf-8"
@@ -90,8 +89,6 @@ def progress() -> Iterator[Callable[[str], None]]:
 
 def written_to(path: Path | None, text: str) -> list[Path]:
     """Write a text if a path is given, and return the paths written."""
-    from rpim_opt.basics.files import refused, write_text
-
     if path is None:
         return []
     with refused(path):
