@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -18,6 +19,7 @@ from rpim_opt.bayes.hyperparameters import Learned
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import ActiveBound, ShadowPrice
+from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate, mapped_as
 from rpim_opt.calibration.result import Calibration, Iteration, Kept
 from rpim_opt.convex import constraints
@@ -45,8 +47,9 @@ from rpim_opt.store.serialize import digest, plain, structured
 FORMAT = "rpim-opt result"
 VERSION = 3
 Models = Model | Mapping[str, Model]
-SHARED = ("weight", "selection", "converged", "message", "history", "certificate", "learned", "mapping")
-"""What a calibration and its file hold under the same name."""
+SHARED = ("x", "weight", "selection", "converged", "message", "history", "certificate", "learned", "mapping")
+DERIVED = ("active_bounds", "shadow_prices", "record", "causes")
+"""What a calibration and its file hold under the same name, and what a calibration derives of what it holds."""
 RELATIVE = 1e-4
 """Standard deviations of hardly identifiable directions differ by that much from one processor to another."""
 ABSOLUTE = 1e-6  # Largest difference of a small figure [mm, deg] and the one that follows from the data.
@@ -122,13 +125,10 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         for name, rows in _rows(result).items():
             for before, now in zip(file.rows.get(name, ()), rows, strict=True):
                 errors = np.array([before[1:], now[1:]], dtype=float)  # NaN for none
-                same = np.allclose(*errors, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True)
-                if before.label != now.label or not same:
-                    found = f"{before.identified_mm} mm"
-                    accepted = (
-                        f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
-                    )
-                    raise InputError(f"key rows.{name}, row {before.label}", found, accepted)
+                if before.label == now.label and np.allclose(*errors, rtol=RELATIVE, atol=ABSOLUTE, equal_nan=True):
+                    continue
+                accepted = f"{now.identified_mm} mm, which follows from the file's data, terms and measurement models"
+                raise InputError(f"key rows.{name}, row {before.label}", f"{before.identified_mm} mm", accepted)
         result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
     except InputError as error:
         raise error.within(path) from None
@@ -234,24 +234,20 @@ def content(result: Calibration) -> dict[str, Any]:
     result = replace(result, record=result.record.dated(), known_causes=result.causes)
     functions = definition(result.formulation)
     solvable = formulation_of("", functions).solvable
+    arms = dict(result.problem.arms)
     stored = Stored(
-        **{name: getattr(result, name) for name in SHARED},
+        **{name: getattr(result, name) for name in (*SHARED, *DERIVED)},
         formulation=result.formulation.name,
         definition=functions,
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
-        x=result.x,
         inliers=None if solvable else _inliers(result),
-        active_bounds=result.active_bounds,
-        shadow_prices=result.shadow_prices,
-        robots=dict(result.problem.arms),
-        terms={name: _terms(robot.model, robot) for name, robot in result.problem.arms.items()},
-        transmission=tuple(curve for robot in result.problem.arms.values() for curve in robot.model.curves),
-        origins={name: carried_by(robot.model.terms) for name, robot in result.problem.arms.items()},
+        robots=arms,
+        terms={name: _terms(robot.model, robot) for name, robot in arms.items()},
+        transmission=tuple(curve for robot in arms.values() for curve in robot.model.curves),
+        origins={name: carried_by(robot.model.terms) for name, robot in arms.items()},
         model=result.problem.parameters,
-        data=_sets(result),
+        data=sets(result),
         repeatability=result.problem.repeatability,
-        record=result.record,
-        causes=result.causes,
         rows=_rows(result),
     )
     parts = {
@@ -259,7 +255,7 @@ def content(result: Calibration) -> dict[str, Any]:
         "version": VERSION,
         "title": result.record.title,
         **figures(result),
-        "nominal": {name: statistics(result.nominal_errors(data)) for name, data in _sets(result).items()},
+        "nominal": {name: statistics(result.nominal_errors(data)) for name, data in sets(result).items()},
         **plain(stored),
         "acceptance": None if result.record.requirement is None else accept(result).content(),
     }
@@ -292,26 +288,13 @@ def figures(result: Calibration) -> dict[str, Any]:
     }
 
 
-def _sets(result: Calibration) -> dict[str, Dataset]:
-    """Return the measurements by name."""
-    data = {"identification": result.problem.data}
-    if result.record.validation is not None:
-        data["validation"] = result.record.validation
-    return data
-
-
 def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
     rows = {}
-    for name, data in _sets(result).items():
-        before = 1e3 * result.nominal_errors(data)
-        after = 1e3 * result.errors(data)
-        errors = zip(data.label, before, after, strict=True)
-        rows[name] = [RowErrors(label, _finite(b), _finite(a)) for label, b, a in errors]
+    for name, data in sets(result).items():
+        errors = (1e3 * result.nominal_errors(data), 1e3 * result.errors(data))
+        columns = [[value if math.isfinite(value) else None for value in each.tolist()] for each in errors]
+        rows[name] = list(map(RowErrors, data.label, *columns))
     return rows
-
-
-def _finite(value: float) -> float | None:
-    return float(value) if math.isfinite(value) else None
 
 
 def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
@@ -330,10 +313,9 @@ def _inliers(result: Calibration) -> StoredInliers | None:
         if result.kept.linear is None:
             return None
         return StoredInliers(float(np.sqrt(result.kept.factor)), list(result.kept.left_out))
-    try:
+    inliers = None
+    with suppress(InputError):  # a loss that no squared one stands for
         inliers = result.program.inliers(result.z)
-    except InputError:  # a loss that no squared one stands for
-        return None
     if inliers is None:
         return None
     left_out = np.flatnonzero(~inliers.keeps(result.program.model, result.z))
@@ -393,10 +375,8 @@ def _function(stated: Any, name: str) -> Any:
 def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models) -> Calibration:
     robots = {name: _robot(name, file, models) for name in file.robots}
     data = {name: _with_measurements(part, known, f"key data.{name}") for name, part in file.data.items()}
-    problem = CalibrationProblem(
-        robots.get("", robots), file.model, data["identification"], repeatability=file.repeatability
-    )
-    validation = data.get("validation")
+    rows, validation = data["identification"], data.get("validation")
+    problem = CalibrationProblem(robots.get("", robots), file.model, rows, repeatability=file.repeatability)
     if validation is not None:
         problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
     formulation = formulation_of(file.formulation, file.definition)
@@ -410,7 +390,6 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
     return Calibration(
         problem,
         formulation,
-        file.x,
         **{name: getattr(file, name) for name in SHARED},
         program=program,
         asked=mapped_as(file.mapping, partial(calibrate, formulation=formulation, weight=weight, model=extensions)),
@@ -423,19 +402,15 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
 def _robot(name: str, file: Stored, models: Models) -> Robot:
     """Return a robot of the file with the terms that somebody gives again: by name, or one model for all."""
     terms = file.terms.get(name, [])
-    if not isinstance(models, Model):
-        if not name:
-            raise InputError("model", "models by name", "a Model, for the one robot of the file")
-        model = models.get(name, Model())
-    elif name and not terms:
-        model = Model()
-    else:
-        model = models
+    model = models if isinstance(models, Model) else models.get(name, Model())
+    if not isinstance(models, Model) and not name:
+        raise InputError("model", "models by name", "a Model, for the one robot of the file")
+    if name and not terms and isinstance(models, Model):
+        model = Model()  # one model for all: a robot without terms has none of them
     robot = file.robots[name]
     own_terms = _terms(model, robot)
     if terms != own_terms:
-        wanted = "; ".join(map(str, terms)) or "none"
-        accepted = f"model=ro.Model(terms=[...]) with the calibration's terms: {wanted}"
+        accepted = f"model=ro.Model(terms=[...]) with the calibration's terms: {'; '.join(map(str, terms)) or 'none'}"
         raise InputError("key terms", "; ".join(map(str, own_terms)) or "no term given", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
     origins = [displaced(carried) for carried in file.origins.get(name, ())]
@@ -462,8 +437,8 @@ def _kept(file: Stored, program: Program) -> Kept:
     """Return the values of a script's functions as they were saved; they cannot be called again."""
     if file.inliers is None:
         return Kept(file.active_bounds, None, shadow_prices=file.shadow_prices)
+    factor, left_out = file.inliers.factor**2, file.inliers.left_out
     keep = np.ones(len(program.model.b), dtype=bool)
-    keep[file.inliers.left_out] = False
-    factor = file.inliers.factor**2
+    keep[left_out] = False
     equations = kept_equations(program.model, keep, factor)
-    return Kept(file.active_bounds, equations, factor, tuple(file.inliers.left_out), file.shadow_prices)
+    return Kept(file.active_bounds, equations, factor, tuple(left_out), file.shadow_prices)
