@@ -118,27 +118,13 @@ def load(
 ) -> Instance:
     """Return the problem of a folder, or a shipped problem by name.
 
-    Parameters
-    ----------
-    name
-        A folder with ``problem.toml`` (its format: the guide "Your own robot"), that file, or the name of one that
-        comes with the package.
-    variant
-        One of the file's ``[variant.NAME]`` tables, laid over the other keys.
-    measurements
-        Measurement models of your own that the file may name.
-    model
-        Terms of your own: the file may identify and scale their parameters, its tables have the columns that they see.
-    chain
-        One of the file's ``[chain.NAME]`` tables alone; by default all of them are one problem.
+    ``name`` is a folder with ``problem.toml`` (its format: the guide "Your own robot"), that file, or the name of one
+    that comes with the package; ``variant`` one of the file's ``[variant.NAME]`` tables, laid over the other keys.
+    ``measurements`` are measurement models of your own that the file may name, ``model`` has terms of your own: the
+    file may identify and scale their parameters, its tables have the columns that they see. ``chain`` is one of the
+    file's ``[chain.NAME]`` tables alone; by default all of them are one problem. InputError names the file, the row or
+    key, what was found and what is accepted.
 
-    Raises
-    ------
-    InputError
-        Naming the file, the row or key, what was found and what is accepted.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm", variant="swap")  # the 16 points for the 9, and the other way round
     >>> len(instance.problem.data), len(instance.validation), instance.formulation.name

@@ -105,8 +105,6 @@ def new_problem(
     called with what was understood of the tables, before anything is computed. Raises InputError for a folder that is
     there already, and whatever of the robot or the data cannot be used.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.store.find_problem("paper_arm")
     >>> made = ro.store.new_problem("cell7", str(arm / "robot.toml"), arm / "identification.csv", hold_out=0.25)

@@ -114,28 +114,12 @@ def understand_tables(
     Several files are stacked where each is whole, and joined by a key where some have the joint values and others the
     measured ones. Whether a quaternion's numbered components begin with w is checked against the nominal robot.
 
-    Parameters
-    ----------
-    robot
-        The name of a ready robot, or a file.
-    data
-        Text, Excel or Parquet files.
-    measurement
-        What was measured; by default poses where the tables have orientations, else positions.
-    options
-        What is stated of the tables.
-    urdf_base, urdf_tip
-        Links between which a URDF's robot is.
-    dh
-        The convention of a DH table, ``"modified"`` or ``"standard"``, where it does not say it (`read_sheet`).
+    ``robot`` is the name of a ready robot, or a file, ``data`` are text, Excel or Parquet files. ``measurement`` is
+    what was measured, by default poses where the tables have orientations, else positions; ``options`` are what is
+    stated of the tables. ``urdf_base`` and ``urdf_tip`` are links between which a URDF's robot is, ``dh`` the
+    convention of a DH table, ``"modified"`` or ``"standard"``, where it does not say it (`read_sheet`). InputError for
+    what cannot be read, or may mean two things.
 
-    Raises
-    ------
-    InputError
-        For what cannot be read, or may mean two things.
-
-    Examples
-    --------
     >>> from pathlib import Path
     >>> import rpim_opt as ro
     >>> _ = Path("joints.csv").write_text("Point,A1,A2,A3,A4,A5,A6\nP1,0,-90,10,20,30,40\nP2,5,-80,0,0,10,0\n")

@@ -87,23 +87,11 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     A formulation with functions of a script's own is there by its name: it cannot be solved again, everything else
     works.
 
-    Parameters
-    ----------
-    path
-        A file of `save_result`, or a folder with ``result.json``.
-    measurements
-        Measurement models of your own that the file names.
-    model
-        The terms of your own that the calibration had, of several robots also by name: a file holds what the terms are
-        called and no functions. They are checked by names, columns and the errors of all rows.
+    ``path`` is a file of `save_result`, or a folder with ``result.json``. ``measurements`` are measurement models of
+    your own that the file names, ``model`` has the terms of your own that the calibration had, of several robots also
+    by name: a file holds what the terms are called and no functions. They are checked by names, columns and the errors
+    of all rows. InputError names the file, the key, what was found and what is accepted.
 
-    Raises
-    ------
-    InputError
-        Naming the file, the key, what was found and what is accepted.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.store.save_result(ro.load("paper_arm").calibrate(), "result.json")
     >>> again = ro.load_result("result.json")  # without the problem's folder

@@ -43,6 +43,7 @@ REACHED = 1e-7  # A target counts as reached when no more than this is left [m, 
 EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
+AT_FAULT = {UNREACHABLE: " in the robot's base frame", ABOVE: ""}  # states of commands that miss, and of which target
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK = 2000
 TRIALS = 12
@@ -103,22 +104,15 @@ class Compensation:
             if np.isfinite(values).all():
                 shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
                 figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
-        changes = ([*name.split("_"), f"{value:.3f}"] for name, value in self._largest_corrections().items())
+        changes = (f"{name.replace('_', f' {value:.3f} ')}" for name, value in self._largest_corrections().items())
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
-            f"Largest corrections: {', '.join(f'{joint} {value} {unit}' for joint, unit, value in changes)}.",
+            f"Largest corrections: {', '.join(changes)}.",
         ]
-        for status in ("limited", "near singular", UNREACHABLE, ABOVE):
-            at = [i for i, each in enumerate(self.status) if each == status]
-            if at:
-                left = [f"{1e3 * self.position_error[i]:.3f} mm off" for i in at]
-                if status == ABOVE:
-                    left = [
-                        f"{text}, U {1e3 * EXPANDED * self.std[i]:.3f} mm" for i, text in zip(at, left, strict=True)
-                    ]
-                named = listed([f"{self.label[i]} ({text})" for i, text in zip(at, left, strict=True)])
-                where = " in the robot's base frame" if status == UNREACHABLE else ""
-                lines.append(f"{status.capitalize()}{where}: {named}.")
+        for status, where in {"limited": "", "near singular": "", **AT_FAULT}.items():
+            rows = [self._missed(i) for i, each in enumerate(self.status) if each == status]
+            if rows:
+                lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
         if self.missed:
             lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target; do not execute these rows.")
         far = [i for i in np.argsort(-np.nan_to_num(self.beside)) if self.beside[i] > BESIDE]
@@ -136,10 +130,14 @@ class Compensation:
 
         Without a limit an error counts that exceeds twice its standard uncertainty.
         """
-        far = np.isin(self.status, (UNREACHABLE, ABOVE))
+        far = np.isin(self.status, list(AT_FAULT))
         if not np.isfinite(self.limit):
             far |= self.position_error > EXPANDED * self.std
         return [self.label[i] for i in np.flatnonzero(far)]
+
+    def _missed(self, i: int) -> str:
+        expanded = f", U {1e3 * EXPANDED * self.std[i]:.3f} mm" if self.status[i] == ABOVE else ""
+        return f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded})"
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -262,10 +260,9 @@ def compensate(
     if payload is not None or payload_centre is not None:
         if not cell.loads.payload:
             accepted = (
-                "a calibration with compliances identified from torques of gravity, or a term that depends"
-                " on the payload"
+                "a calibration with compliances identified from torques of gravity, or a term that depends on the "
             )
-            raise InputError("payload", "a payload without effect on the model", accepted)
+            raise InputError("payload", "a payload without effect on the model", f"{accepted}payload")
         if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
             raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
     if cell.loads.payload:
@@ -277,10 +274,9 @@ def compensate(
 
     parts = on_all_cores(compensated, range(0, N, BLOCK))
     whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    expanded = np.where(np.isfinite(whole["std"]), EXPANDED * whole["std"], 0.0)
+    expanded = EXPANDED * np.nan_to_num(whole["std"], posinf=0.0)
     above = (whole["position_error"] + expanded > limit) & (whole["status"] != UNREACHABLE)
-    commands = Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)})
-    outside = result.outside(commands)
+    outside = result.outside(Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)}))
     status = np.where(above, ABOVE, whole["status"])
     status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
@@ -369,21 +365,21 @@ def _tooled(
         raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
     at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
     identified = p.identified.copy()
-    frame = p.values(x)[at]
-    if tool is not None:
+    nominal = p.nominal.copy()
+    if tool is None:
+        nominal[at] = p.values(x)[at]
+        where = f"{'as identified, ' if identified[at].any() else ''}at {placed(nominal[at])} in the flange frame"
+        point = f"Target point: the reflector, {where}; for the controller's TCP state --tool."
+    else:
         frame = np.asarray(tool, dtype=float)
         if frame.shape != (6,) or not np.isfinite(frame).all():
             raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+        nominal[at] = frame
         identified[at] = False
         if C is not None:
             still = identified[p.identified]
             C = C[np.ix_(still, still)]
-    point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
-    if tool is None:
-        where = f"{'as identified, ' if identified[at].any() else ''}at {placed(frame)} in the flange frame"
-        point = f"Target point: the reflector, {where}; for the controller's TCP state --tool."
-    nominal = p.nominal.copy()
-    nominal[at] = frame
+        point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
     x[at] = 0.0
     return replace(p, nominal=nominal, identified=identified), x, C, marker, point
 
@@ -470,46 +466,35 @@ class _Cell(NamedTuple):
         corrected, left, active = nearest(self.identified, load, target, commands, limits, unit, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
         cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
-        position_before, orientation_before = self._norms(before)
-        position_error, orientation_error = self._norms(left)
-        std, orientation_std = self._std(corrected, torque, payload)
-        return {
-            "nominal": commands,
-            "q": corrected,
-            "position_before": position_before,
-            "orientation_before": orientation_before,
-            "position_error": position_error,
-            "orientation_error": orientation_error,
-            "std": std,
-            "orientation_std": orientation_std,
-            "beside": beside,
-            "status": np.select(list(cases.values()), list(cases), "near singular"),
-        }
+        status = np.select(list(cases.values()), list(cases), "near singular")
+        fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
+        fields["position_before"], fields["orientation_before"] = self._norms(before)
+        fields["position_error"], fields["orientation_error"] = self._norms(left)
+        fields["std"], fields["orientation_std"] = self._std(corrected, torque, payload)
+        return fields
 
     def _std(self, q: Array, torque: Array | None, payload: Array | None) -> tuple[Array, Array]:
         """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached; R is the repeatability's."""
         k = len(self.kind.components)
-        problem = self.problem.measuring(q, self.kind, self.marker, torque, payload, covariance=self.noise)
         if self.covariance is None:
-            variance = np.full((len(q), k), np.inf)
-        else:
-            J = problem.jacobian(self.x)
-            known = np.isfinite(np.diag(self.covariance))
-            C = np.where(np.outer(known, known), self.covariance, 0.0)
-            variance = np.sum((J @ C) * J, axis=1).reshape(len(q), k)
-            variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
-            variance[(np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), k)] = np.inf
+            return self._norms(np.full((len(q), k), np.inf))
+        problem = self.problem.measuring(q, self.kind, self.marker, torque, payload, covariance=self.noise)
+        J = problem.jacobian(self.x)
+        known = np.isfinite(np.diag(self.covariance))
+        C = np.where(np.outer(known, known), self.covariance, 0.0)
+        variance = np.sum((J @ C) * J, axis=1).reshape(len(q), k)
+        variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
+        variance[(np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), k)] = np.inf
         return self._norms(np.sqrt(np.maximum(variance, 0.0)))
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
         every = np.arange(len(poses))
-        low, high = self.robot.limits.T
-        limits = low, high
+        n = self.robot.dof
 
         def found(rows: np.ndarray, start: Array, W: Array) -> tuple[Array, Array, np.ndarray]:
-            no_cost = np.zeros((1, self.robot.dof, self.robot.dof))
-            return nearest(self.nominal, load[rows], poses[rows], start, limits, np.ones(self.robot.dof), W, no_cost)
+            limits = self.robot.limits[:, 0], self.robot.limits[:, 1]
+            return nearest(self.nominal, load[rows], poses[rows], start, limits, np.ones(n), W, np.zeros((1, n, n)))
 
         all_count = np.eye(len(self.kind.components))[None]
         starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]
@@ -522,7 +507,7 @@ class _Cell(NamedTuple):
             better = np.linalg.norm(error, axis=1) < np.linalg.norm(left[again], axis=1)
             best[again[better]] = other[better]
             left[again[better]] = error[better]
-        if poses.shape[1] == 3 or self.robot.dof >= 6:
+        if poses.shape[1] == 3 or n >= 6:
             return best
         return found(every, best, attainable(self.nominal.at(best, load, poses)[2]))[0]
 

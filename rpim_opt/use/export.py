@@ -64,8 +64,6 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     ``marker`` names the reflector, the first by default. Refused are identified parameters that no description of a
     robot holds (ratios, harmonics, backlash, compliances, bends, terms of a user's own), and unknown markers.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.use.identified(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml))
     >>> arm.base.round(2), (1e3 * arm.tool[:3]).round(1)  # [m, rad], [mm]
@@ -202,8 +200,6 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     rows are calibrated once more, also those that only the extension explains. A calibration to which nothing was added
     is returned as it is.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, model="auto")  # nothing was added
     >>> ro.use.geometry_alone(result) == (result, [])
@@ -294,8 +290,6 @@ def export_urdf(
     default those that the robot was read between;
     ``despite_verdict`` as for `export_files`. InputError for several reflectors of which none is named as the tip.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> arm = ro.read_urdf("arm.urdf")
