@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -129,30 +129,26 @@ def new_problem(
     columns = understanding.columns
     if "label" not in columns:  # a row keeps its number where others are held out
         columns = {"label": rows.label, **columns}
-    held = np.zeros(len(rows), dtype=bool) if hold_out is None else _held_out(rows, hold_out, seed)
-    tables = {identified: _rows(columns, ~held)}
-    rows = rows.take(np.flatnonzero(~held))
-    if held.any():
-        tables[validated] = _rows(columns, held)
-    validated_by = ""
+    held = _held_out(rows, hold_out, seed)
+    tables = {identified: _rows(columns, ~held), validated: _rows(columns, held), seen: board.table}
     if later:
         other = understand_of(arm, later, kind.name, understanding.options)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tell(other)
         tables[validated] = other.columns
-        validated_by = Path(other.file).name
-    if board.table:
-        tables[seen] = board.table
-    handed = [*paths, *later]
-    several = len({file.name for file in handed}) < len(handed)  # of one name: then by their paths
+    counts = {name: len(next(iter(each.values()), ())) for name, each in tables.items()}
+    tables = {name: each for name, each in tables.items() if counts[name]}
     noise = usual_noise(kind)
+    supplied = [*paths, *later]
+    several = len({file.name for file in supplied}) < len(supplied)  # of one name: then by their paths
     with in_file(understanding.file):
         text, guessed = _problem_text(
-            arm, kind, rows, noise, chain=chain, first=not before, source=source, ready=source.parent == READY,
-            links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, identification=identified, target=board.stated,
-            columns=how, data=Path(understanding.file).name, validation=validated, held_out=held.any(), seed=seed,
-            validated_by=validated_by, assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
-            raw={str(file) if several else file.name: sha256_of(file) for file in handed},
+            arm, kind, rows.take(np.flatnonzero(~held)), chain, noise=noise, first=not before, source=source,
+            ready=source.parent == READY, links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=board.stated,
+            identification=identified, columns=how, data=paths[0].name, validation=validated, held_out=held.any(),
+            seed=seed, validated_by=next((file.name for file in later), ""),
+            assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
+            raw={str(file) if several else file.name: sha256_of(file) for file in supplied},
             reading=replace(understanding.options, joints=arm.names).texts(),
         )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
@@ -161,34 +157,39 @@ def new_problem(
         write_files({folder / name: content for name, content in contents.items()})
     else:
         _write_whole(folder, contents, arm, source, bool(chain))
-    counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
     notes = [
         f"Measurement {kind.name}: {how}.",
         guessed,
         f"Assumed measurement noise (1 sigma) where no column states it: {assumed}, in [noise] of problem.toml.",
+        *_remarks(arm, source, understanding),
     ]
-    if source.suffix.lower() == ".csv" and arm.tool.any():  # a DH table in another convention than the modified one
-        notes.append(
-            "[tool] and --tool refer to the flange frame after the last joint. In it the last frame of the DH table is "
-            f"at {placed(arm.tool)}: transform points of the table's frame by it."
-        )
-    known = [f"q{i}" for i in range(arm.robot.dof + 1, arm.robot.dof + 9)]
-    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in known]
-    if further:
-        notes.append(
-            f"Ignored joint values: {joined(further)}. The robot ({arm.robot.source or arm.robot.name}) has "
-            f"{arm.robot.dof} joints; if these move the tool, state another robot, or another link: --urdf-tip."
-        )
     if before:
         notes.append(SHARED)
     elif chain:
         notes.append(f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}.")
-    return Started(folder, counts, tuple(notes), replace(understanding, kind=kind))
+    return Started(folder, {name: counts[name] for name in tables}, tuple(notes), replace(understanding, kind=kind))
+
+
+def _remarks(arm: Described, source: Path, understanding: Understanding) -> Iterator[str]:
+    """Yield where the flange frame of a converted DH table is, and which joint values are of no joint."""
+    if source.suffix.lower() == ".csv" and arm.tool.any():  # a DH table in another convention than the modified one
+        yield (
+            "[tool] and --tool refer to the flange frame after the last joint. In it the last frame of the DH table is "
+            f"at {placed(arm.tool)}: transform points of the table's frame by it."
+        )
+    dof = arm.robot.dof
+    known = [f"q{i}" for i in range(dof + 1, dof + 9)]
+    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in known]
+    if further:
+        yield (
+            f"Ignored joint values: {joined(further)}. The robot ({arm.robot.source or arm.robot.name}) has "
+            f"{dof} joints; if these move the tool, state another robot, or another link: --urdf-tip."
+        )
 
 
 def _files(stated: str | Path | Sequence[str | Path]) -> list[Path]:
-    return [Path(stated)] if isinstance(stated, str | Path) else [Path(file) for file in stated]
+    return [Path(file) for file in ([stated] if isinstance(stated, str | Path) else stated)]
 
 
 def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
@@ -222,8 +223,10 @@ def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: Described, so
         made.rename(folder)
 
 
-def _held_out(rows: Dataset, part: float, seed: int) -> np.ndarray:
+def _held_out(rows: Dataset, part: float | None, seed: int) -> np.ndarray:
     """Return which rows (N,) are held out: those of a part of the configurations, drawn at random."""
+    if part is None:
+        return np.zeros(len(rows), dtype=bool)
     known = len(np.unique(rows.configuration))
     if not 0 < part < 1 or known < 2:
         found = f"{part:g} of {known} configurations"
@@ -313,46 +316,36 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
 # --- the text of problem.toml -------------------------------------------------------------------------------------
 
 
-def _problem_text(
-    arm: Described, kind: Measurement, rows: Dataset, noise: Mapping[str, float], chain: str, **context: Any
-) -> tuple[str, str]:
+def _problem_text(arm: Described, kind: Measurement, rows: Dataset, chain: str, **context: Any) -> tuple[str, str]:
     """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
     from jinja2 import Environment
 
+    robot = arm.robot
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
     tools = dict.fromkeys(markers, arm.tool)
     base, how = _base(arm, rows, tools, kind)
-    parameters = starting_parameters(arm.robot, rows, base, tools)
-    names = list(identifiable("auto", arm.robot, parameters, rows))
+    parameters = starting_parameters(robot, rows, base, tools)
+    names = list(identifiable("auto", robot, parameters, rows))
     if chain and markers == [""]:
-        names = _at_links(names, carried_by(arm.robot.model.terms), base is not None)
+        names = _at_links(names, carried_by(robot.model.terms), base is not None)
     lenses = starting_cameras(rows, {})
-    touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
+    cameras = {
+        fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in list(INTRINSICS)[:4]}
+        for fixture in sorted({block.fixture for block in camera_blocks(rows)})
+    }
+    touched: list[str] = []
+    if kind.touching:
+        touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
+    known = {direction: word for word, direction in MOUNTINGS.items()}
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
     template.filters |= {"toml": toml, "key": _key, "frame": _frame}
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        **context,
-        chain=chain,
-        robot=arm.robot,
-        mounting={direction: word for word, direction in MOUNTINGS.items()}.get(
-            arm.robot.gravity.direction, list(arm.robot.gravity.direction)
-        ),
-        followers=[i for i in range(1, len(arm.robot.mdh) + 1) if i - 1 not in arm.robot.leading],
-        kind=kind,
-        rows=rows,
-        identify=_patterns(names, len(arm.robot.mdh)),
-        noise=noise,
-        base=None if base is None else _frame(base),
-        how=how,
-        guessed_tool=arm.tool.any(),
-        markers=markers,
-        tool=arm.tool,
-        cameras={
-            fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in ("fx", "fy", "cx", "cy")}
-            for fixture in sorted({block.fixture for block in camera_blocks(rows)})
-        },
-        touched=list(dict.fromkeys(touched))[:2] if kind.touching else [],
-    )
+        **context, chain=chain, robot=robot, kind=kind, rows=rows, how=how, markers=markers, tool=arm.tool,
+        cameras=cameras, touched=list(dict.fromkeys(touched))[:2], base=None if base is None else _frame(base),
+        mounting=known.get(robot.gravity.direction, list(robot.gravity.direction)),
+        followers=[i for i in range(1, len(robot.mdh) + 1) if i - 1 not in robot.leading],
+        identify=_patterns(names, len(robot.mdh)),
+    )  # fmt: skip
     return text, how
 
 
