@@ -94,8 +94,6 @@ class Inspection(Tabled):
     signs, frames, limits, coverage), ``proposals`` (what the problem file could say) and ``contact`` (what touches
     show) are sentences; ``observability`` is what the configurations can show.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> found = ro.problem.inspect(ro.load("paper_arm", variant="misprints").problem)
     >>> found.standing_out, found.observability.rank, len(found.warnings)
@@ -225,8 +223,6 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     fifth of the position error is named, with what to write. Of the rows that were kept apart for ``validation`` none
     should be an identification row.
 
-    Examples
-    --------
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem

@@ -123,8 +123,6 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
     instead of that of the robot's `Gravity`. Returned are (N, dof) [Nm], about the axes of the table; zero for
     prismatic joints.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> mdh = np.array([[np.pi / 2, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]])  # both axes are horizontal
@@ -190,8 +188,6 @@ def model_extensions(robot: Robot) -> dict[str, tuple[str, ...]]:
 
     Compliances are those of the joints whose torque of gravity changes with the configuration.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> found = ro.robot.model_extensions(ro.load("paper_arm").problem.robot)
     >>> found["gravity"]

@@ -188,8 +188,6 @@ def forward_kinematics(robot: Robot, q: Array) -> Array:
 
     At joint values q (N, dof) of the controller [rad or m]; base and tool are no part of it.
 
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> arm = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))

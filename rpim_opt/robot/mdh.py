@@ -31,27 +31,13 @@ MOUNTINGS: dict[str, Vector] = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0,
 class Gravity:
     """Gravity on a robot.
 
-    Parameters
-    ----------
-    direction
-        Where it points in the robot's base frame (frame 0 of the table), made a unit vector.
-    masses
-        Of the links that joints 1 to dof move [kg]. Without: a guess, 5 kg at the last frame's origin and 10 kg at
-        frame 4's, which is good enough to tell how torques go with the configuration: compliance takes up their size.
-    centres
-        Where those masses are in the links' own frames [m], the frames after joints 1 to dof.
-    payload
-        What the flange carries besides [kg].
-    payload_centre
-        Where, in the flange frame [m].
+    ``direction`` is where it points in the robot's base frame (frame 0 of the table), made a unit vector. ``masses``
+    are those of the links that joints 1 to dof move [kg], ``centres`` where they are in the links' own frames [m], the
+    frames after these joints. Without: a guess, 5 kg at the last frame's origin and 10 kg at frame 4's, which is good
+    enough to tell how torques go with the configuration: compliance takes up their size. ``payload`` is what the flange
+    carries besides [kg], ``payload_centre`` where, in the flange frame [m]. InputError for no direction, masses that
+    are negative, numbers that are not finite or do not fit together.
 
-    Raises
-    ------
-    InputError
-        For no direction, masses that are negative, numbers that are not finite or do not fit together.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.robot.Gravity(direction=(0, 0, -9.81), payload=2.5).direction
     (0.0, 0.0, -1.0)
@@ -135,34 +121,15 @@ class Robot(Brief):
 
     where q are the joint values of the model, ``joint_map @ (joint values of the controller)``.
 
-    Parameters
-    ----------
-    name
-        What to call it.
-    mdh
-        (n, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad].
-    joint_types
-        ``"revolute"`` or ``"prismatic"`` for every joint; all revolute by default.
-    joint_map
-        (n, dof), the identity by default: signs and couplings between the controller's joint values and the model's (a
-        FANUC counts joint 3 from the horizontal). Mimic joints have a row and no column: dof is less than n then.
-    limits
-        (dof, 2) lower and upper joint values of the controller [rad or m]; infinite where unknown.
-    source
-        Where the table comes from.
-    gravity
-        Where gravity points in the robot's base, and the masses that it pulls at.
-    model
-        Terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone.
+    ``mdh`` is (n, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad]; ``joint_types`` say ``"revolute"`` or
+    ``"prismatic"`` of every joint, all revolute by default. ``joint_map`` (n, dof) holds signs and couplings between
+    the controller's joint values and the model's, the identity by default (a FANUC counts joint 3 from the horizontal);
+    mimic joints have a row and no column: dof is less than n then. ``limits`` (dof, 2) are lower and upper joint values
+    of the controller [rad or m], infinite where unknown; ``source`` says where the table comes from. ``model`` are
+    terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone. InputError for shapes
+    that do not fit, numbers that are not finite, a singular joint map, limits that are not in order, masses that are
+    not one a joint.
 
-    Raises
-    ------
-    InputError
-        For shapes that do not fit, numbers that are not finite, a singular joint map, limits that are not in order,
-        masses that are not one a joint.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> mdh = np.array([[0, 0, 0, 0.5, 0], [0, 0.4, 0, 0, 0]])

@@ -120,28 +120,14 @@ def known_patterns(names: Sequence[str], pattern: str) -> str:
 class Parameters(Tabled):
     """A table of model parameters, one entry each in every field.
 
-    Parameters
-    ----------
-    names
-        ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz``
-        and those of the measurement; with several reflectors ``tool_A_x, ...``.
-    dimensions
-        ``length``, ``angle``, ``ratio`` or ``compliance``.
-    nominal
-        (P,) nominal values, from which deviations count [SI].
-    scale
-        (P,) prior standard deviation of a deviation [SI].
-    tolerance
-        (P,) largest deviation that a bounded calibration allows [SI]; infinite where there is none.
-    identified
-        (P,) which parameters a calibration may change.
-    own_frames
-        Prefixes of the frames of measurements, ``plane_``: their rotations are angles as those of base and tool are.
-    terms
-        Names of the parameters of a user's own terms (`Model`), which are the robot's as those of the table are.
+    ``names`` are ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz`` and those
+    of the measurement; with several reflectors ``tool_A_x, ...``. ``dimensions`` are ``length``, ``angle``, ``ratio``
+    or ``compliance``. ``nominal`` (P,) are the values from which deviations count, ``scale`` (P,) their prior standard
+    deviations, ``tolerance`` (P,) the largest deviations that a bounded calibration allows, infinite where there are
+    none [SI]; ``identified`` (P,) says which a calibration may change. ``own_frames`` are prefixes of the frames of
+    measurements, ``plane_``: their rotations are angles as those of base and tool are; ``terms`` names of the
+    parameters of a user's own terms (`Model`), which are the robot's as those of the table are.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters
     >>> len(parameters), len(parameters.free), parameters.dimension_of("tool_x")
@@ -266,15 +252,9 @@ class Parameters(Tabled):
     def identify(self, patterns: Iterable[str]) -> Parameters:
         """Return the same table with just the parameters identified that match one of the patterns.
 
-        A pattern is a name with ``*``, ``?`` and ``[...]`` as in file names: ``"a?"``, ``"beta[34]"``.
+        A pattern is a name with ``*``, ``?`` and ``[...]`` as in file names: ``"a?"``, ``"beta[34]"``. InputError for
+        one that matches no parameter.
 
-        Raises
-        ------
-        InputError
-            For a pattern that matches no parameter.
-
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> parameters = ro.load("position").problem.parameters
         >>> parameters.identify(["a[12]", "tool_[xyz]"]).free.names
@@ -313,8 +293,6 @@ class Parameters(Tabled):
         a pattern before a group. Unknown keys, missing or wrong units, and values that are not positive are refused; an
         error names ``file``.
 
-        Examples
-        --------
         >>> import rpim_opt as ro
         >>> parameters = ro.load("position").problem.parameters.scaled({"length_mm": 0.2, "a3_mm": 2.0})
         >>> parameters.identify(["a[23]"]).free.scale  # [m]
@@ -381,26 +359,12 @@ def model_parameters(
 ) -> Parameters:
     """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
 
-    Parameters
-    ----------
-    robot
-        Gives the MDH parameters' nominal values.
-    base
-        (6,) the robot's base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad].
-    tools
-        Reflectors in the flange frame by marker, (6,) each as the base; ``{"": frame}`` for the only one.
-    own
-        Further parameters, those of the measurement: name to (dimension, nominal value [SI]).
-    own_frames
-        Prefixes of those that are frames, ``plane_``.
-    sessions
-        Names of sessions, by which the robot's base is shifted and turned besides.
-    temperature
-        At which the robot's lengths are nominal [K], where temperatures are known: they grow by
-        ``expansion`` a kelvin.
+    ``base`` (6,) is the robot's in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; ``tools`` are
+    reflectors in the flange frame by marker, (6,) each as the base, ``{"": frame}`` for the only one. ``own`` are the
+    measurement's parameters, name to (dimension, nominal value [SI]), ``own_frames`` prefixes of those that are frames,
+    ``plane_``. ``sessions`` are names of sessions, by which the base is shifted and turned besides. Lengths are nominal
+    at a ``temperature`` [K], where it is known, and grow by ``expansion`` a kelvin.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> robot = ro.load("paper_arm").problem.robot
     >>> parameters = ro.robot.model_parameters(robot, tools={"A": (0, 0, 0.06, 0, 0, 0)})

@@ -68,8 +68,6 @@ class Configuration:
 class Joint:
     """Argument of a term: joint ``number`` (from 1) and its link; the first for the base, the last for the tool.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> at = ro.robot.Configuration(q=[0.1, 0.5], torque=[3.0, 7.0], approach=[-1, 1], columns={"hours": 8.0})
     >>> elbow = ro.robot.Joint(2, at)
@@ -142,38 +140,21 @@ class Entry(NamedTuple):
 class Term:
     """A motion of an arm in addition to its joint values.
 
-    Parameters
-    ----------
-    moves
-        ``moves(joint, *parameters)`` in CasADi, from what it sees (`Joint`) and the parameters in the order of
-        ``scales``. Of a joint: by how much it moves further [rad or m]. Of a link, of the base or of the tool: six
-        numbers x, y, z [m], rx, ry, rz [rad], by which the frame behind the link, the robot's or the flange's, is
-        displaced along and about its own axes. Small terms of a link add up.
-    scales
-        The parameters by name, with their unit and expected size: ``{"play_mrad": 0.1}``. Every joint or link has its
-        own, ``play2``; ``{}`` in a name stands for the number.
-    at
-        ``"joint"``, ``"link"``, ``"base"`` or ``"tool"``.
-    joints
-        Numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints or links that have it; by default the
-        revolute joints, and all links.
-    columns
-        Further columns of the data that it sees, name to dimension: ``{"temperature": "temperature"}`` stands for a
-        column ``temperature_K``, ``{"hours": ""}`` for one without unit.
-    nominal
-        Nominal values of the parameters, keys as in ``scales``; zero by default.
-    made_of
-        Of the terms of this package that follow from numbers alone, which a file holds: a `Curve` or `chain.Carried`.
+    ``moves(joint, *parameters)`` is in CasADi, from what it sees (`Joint`) and the parameters in the order of
+    ``scales``. Of a joint (``at`` is ``"joint"``, ``"link"``, ``"base"`` or ``"tool"``) it returns by how much it moves
+    further [rad or m]. Of a link, of the base or of the tool: six numbers x, y, z [m], rx, ry, rz [rad], by which the
+    frame behind the link, the robot's or the flange's, is displaced along and about its own axes. Small terms of a link
+    add up. A term whose parameters are all zero must not move anything; it is not evaluated then.
 
-    A term whose parameters are all zero must not move anything; it is not evaluated then.
+    ``scales`` are the parameters by name, with their unit and expected size: ``{"play_mrad": 0.1}``. Every joint or
+    link has its own, ``play2``; ``{}`` in a name stands for the number. ``nominal`` are their nominal values, with the
+    same keys, zero by default. ``joints`` are numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints
+    or links that have it, by default the revolute joints, and all links. ``columns`` are further columns of the data
+    that it sees, name to dimension: ``{"temperature": "temperature"}`` stands for a column ``temperature_K``,
+    ``{"hours": ""}`` for one without unit. ``made_of`` is of this package's terms that follow from numbers alone, which
+    a file holds: a `Curve` or `chain.Carried`. InputError for names, units, scales, places and dimensions that cannot
+    be.
 
-    Raises
-    ------
-    InputError
-        For names, units, scales, places and dimensions that cannot be.
-
-    Examples
-    --------
     >>> import casadi as ca
     >>> import rpim_opt as ro
     >>> third = ro.robot.Term(lambda joint, size: size * ca.cos(3 * joint.q), {"third_mrad": 0.1})
@@ -313,8 +294,6 @@ def transmission(curve: Curve) -> Term:
     Parameters ``transmission{joint}_c{k}`` and ``..._s{k}``. The period is longer than the range that was measured, so
     that only waves, which are longer still, go on beyond it.
 
-    Examples
-    --------
     >>> import math
     >>> import rpim_opt as ro
     >>> term = ro.robot.transmission(ro.robot.Curve(joint=2, centre=0.0, period=math.pi, harmonics=2))
@@ -346,8 +325,6 @@ class Model:
     ``terms`` move joints, links, the base or the tool besides those that every arm has (``ratio``, ``ecc_cos``, ...,
     ``compliance``, ``backlash``, ``bend``); two parameters of one name, or one column in two dimensions, are refused.
 
-    Examples
-    --------
     A third harmonic, identified beside the parameters that the problem identifies already:
 
     >>> import casadi as ca

@@ -163,15 +163,9 @@ def read_robot(path: str | Path) -> Robot:
     TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
     of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
     ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
-    cell is left out. A column ``convention`` says ``modified`` or ``standard``.
+    cell is left out. A column ``convention`` says ``modified`` or ``standard``. InputError names the file, the key or
+    column, what was found and what is accepted.
 
-    Raises
-    ------
-    InputError
-        Naming the file, the key or column, what was found and what is accepted.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
     >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta

@@ -63,8 +63,6 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     ``nominal`` is the model, a ready robot such as ``read_robot(find_robot("ur5e"))``. An error names the file and the
     key, what was found and what is accepted.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> from rpim_opt.robot.library import find_robot
     >>> nominal = ro.read_robot(find_robot("ur10"))
@@ -155,8 +153,6 @@ def read_ur_kinematics(path: str | Path) -> Described:
 
     The file has plain keys, two spaces or more a level, one a line; joint limits are not in it.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.robot.read_ur_kinematics("kinematics.yaml")
     >>> arm.names[:2], arm.robot.mdh[2:4, 1].round(3)  # a3 and a4 [m]

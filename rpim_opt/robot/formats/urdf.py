@@ -79,8 +79,6 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     every chain that a joint is part of, so that `together` shares them. A first row that does not move stands for the
     base link then: the table starts in that link's own frame.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.read_urdf("arm.urdf", base="base", tip="tip")
     >>> arm.robot.dof, arm.names, arm.tool[:3]
