@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -22,6 +22,8 @@ FULL = 0.6
 MOSTLY = 0.8
 """A column is one of numbers if this part of its cells are."""
 LINES_OF_HEADER = 6
+LISTS = ("columns", "constants", "joints")
+"""Options that list names."""
 DIMENSIONS = frozenset(unit.dimension for unit in UNITS.values())
 MOST_NAMED = 5
 """Lines that are left out and named one by one."""
@@ -33,7 +35,7 @@ SUMMARIES = frozenset({
 """What a row begins with that is no measurement, letters alone."""
 MOST_SUMMARIES, FEWEST_ROWS, SAME = 6, 6, 1e-3
 """Such rows at most, rows above them at least, and the part of a column's spread by which its mean may be rounded."""
-COMMENT = ("//", "#", "%", "!", "*")
+COMMENT = re.compile(r"(?:(?://|[#%!*])\s*)+")
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """How tables say that there is no value."""
 BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
@@ -109,7 +111,7 @@ class TableOptions:
         for name in texts:
             pick(cls.__dataclass_fields__, name, "key reading")
         options: dict[str, Any] = dict(texts)
-        for name in ("columns", "constants", "joints"):
+        for name in LISTS:
             options[name] = tuple(filter(None, texts.get(name, "").split(",")))
         if "within" in texts:
             options["within"] = numeral(texts["within"])
@@ -117,11 +119,9 @@ class TableOptions:
 
     def texts(self) -> dict[str, str]:
         """Return the options that are set as texts."""
-        texts = {name: getattr(self, name) for name in self.__dataclass_fields__}
+        texts = vars(self) | {name: ",".join(getattr(self, name)) for name in LISTS}
         texts["within"] = "" if self.within is None else repr(self.within)
-        units = [unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items()]
-        texts |= {"units": ",".join(units)}
-        texts |= {name: ",".join(getattr(self, name)) for name in ("columns", "constants", "joints")}
+        texts["units"] = ",".join(unit if key in DIMENSIONS else f"{key}={unit}" for key, unit in self.units.items())
         return {name: text for name, text in texts.items() if text}
 
 
@@ -167,15 +167,16 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
     (['Joints J1 [deg]', 'Joints J2 [deg]', 'Position X [mm]', 'Position Y [mm]'], ['1.5'])
     """
     options = options or TableOptions()
+    readers = {".parquet": read_columns, ".mat": array_columns, ".npz": array_columns}
+    reader = readers.get(path.suffix.lower())
     with in_file(path):
-        if columns is None and path.suffix.lower() == ".parquet":
-            columns = read_columns(path)
-        elif columns is None and path.suffix.lower() in (".mat", ".npz"):
-            columns = array_columns(path)
+        if columns is None and reader is not None:
+            columns = reader(path)
         if columns is None:
-            grid = read_grid(path, options.sheet, options.encoding, options.separator)
-            return _one_row_each(_one_number_each(_of_grid(grid, options)))
-        return _one_row_each(_one_number_each(RawTable(columns)))
+            table = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
+        else:
+            table = RawTable(columns)
+        return _one_row_each(_one_number_each(table))
 
 
 def is_missing(cell: str) -> bool:
@@ -196,20 +197,18 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     heads, above = _heads(grid, numeric, options)
     begins = {i: "".join(filter(str.isalpha, next(filter(None, grid.rows[i])))) for i in numeric}
     full = [i for i in numeric if begins[i].lower() not in SUMMARIES]
-    columns, groups, mark = _columns([grid.rows[i] for i in full], heads, options)
-    full = full[: len(full) - _summaries(columns)]
-    left = sorted(set(range(numeric[0], len(grid.rows))) - set(full))
-    notes = [*grid.notes, *_notes(grid, above, left, options)]
-    if mark == ",":
-        why = "as requested" if options.decimal else "no comma can be a thousands separator"
-        notes.append(f"decimal commas: {why}.")
+    table = _columns([grid.rows[i] for i in full], heads, options)
+    full = full[: len(full) - _summaries(table.columns)]
+    notes = [*grid.notes, *_notes(grid, above, set(range(numeric[0], len(grid.rows))).difference(full), options)]
     units: dict[str, str] = {}
-    lines = [" ".join(filter(None, row)) for row in grid.rows[: above[0] if above else 0]]
-    for stated in filter(None, map(UNITS_LINE.fullmatch, lines)):
+    for row in grid.rows[: above[0] if above else 0]:
+        stated = UNITS_LINE.fullmatch(" ".join(filter(None, row)))
         with suppress(InputError):  # a sentence that happens to begin so
-            units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
-            notes.append(f"units above the header: {stated[1]}.")
-    return RawTable({name: cells[: len(full)] for name, cells in columns.items()}, groups, tuple(notes), units)
+            if stated:
+                units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
+                notes.append(f"units above the header: {stated[1]}.")
+    columns = {name: cells[: len(full)] for name, cells in table.columns.items()}
+    return RawTable(columns, table.groups, (*notes, *table.notes), units)
 
 
 def _summaries(columns: Columns) -> int:
@@ -235,21 +234,19 @@ def _count(row: Sequence[str]) -> int:
     return numbers and numbers + sum(cell != "" and is_missing(cell) for cell in row)
 
 
-def _notes(grid: Grid, above: Sequence[int], left: Sequence[int], options: TableOptions) -> list[str]:
-    """Return notes on a header that is not the first line alone, and on lines that are left out."""
-    notes = []
+def _notes(grid: Grid, above: Sequence[int], left: Collection[int], options: TableOptions) -> Iterator[str]:
+    """Yield notes on a header that is not the first line alone, and on lines that are left out."""
     if options.columns:
-        notes.append("column names as requested" + (", instead of the header." if above else "."))
+        yield "column names as requested" + (", instead of the header." if above else ".")
     elif len(above) > 1:
-        notes.append(f"the header has {len(above)} lines, from line {grid.lines[above[0]]}.")
+        yield f"the header has {len(above)} lines, from line {grid.lines[above[0]]}."
     if above and above[0]:
-        notes.append(f"{above[0]} lines above the header are ignored ('{' '.join(grid.rows[0])[:50]}' ...).")
-    for i in left[:MOST_NAMED]:
+        yield f"{above[0]} lines above the header are ignored ('{' '.join(grid.rows[0])[:50]}' ...)."
+    for i in sorted(left)[:MOST_NAMED]:
         text = ", ".join(filter(None, grid.rows[i]))
-        notes.append(f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' ignored.")
+        yield f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' ignored."
     if len(left) > MOST_NAMED:
-        notes.append(f"{len(left) - MOST_NAMED} more lines are not rows of the table: ignored.")
-    return notes
+        yield f"{len(left) - MOST_NAMED} more lines are not rows of the table: ignored."
 
 
 # --- header --------------------------------------------------------------------------------------------------------
@@ -260,14 +257,13 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
     while len(full) > 1:
         first, second = rows[full[0]], rows[full[1]]
         names_between = any(not _count(row) for row in rows[full[0] + 1 : full[1]])
-        above_names = names_between and not first[0] and second[0] != ""
         above_numbers = sum(
             cell[:1].isalpha() and is_numeral(below) for cell, below in zip(first, second, strict=False)
         )
         # LabVIEW: counts and steps of the channels, above the names of columns that begin with a number
         lines = not is_numeral(first[0]) and is_numeral(rows[full[-1]][0])
         lines = lines and any(not _count(row) and len(row) > 1 for row in rows[full[0] + 1 : full[-1]])
-        if not above_names and not lines and above_numbers < 2:
+        if not (names_between and not first[0] and second[0]) and not lines and above_numbers < 2:
             break
         full = full[1:]
     return full
@@ -285,13 +281,13 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
     lines = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, lines))
-    units = [""] * width
+    units: list[str] = []
     bare = [cell.strip("[]()") for cell in lines[-1]]
     if len(lines) > 1 and any(bare) and all(cell.lower() in UNIT_SIGNS for cell in filter(None, bare)):
-        signs = ["" if cell in ("-", "1") else cell for cell in bare]
-        lacking = [""] * (width - len(signs))
-        units = lacking + signs if grid.blanks else signs + lacking  # a blank cell of the label cannot be seen
+        units = ["" if cell in ("-", "1") else cell for cell in bare]
         lines = lines[:-1]
+    lacking = [""] * (width - len(units))
+    units = lacking + units if grid.blanks else units + lacking  # a blank cell of the label cannot be seen
     *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
     groups = [""] * width
     downwards = [  # merged downwards: the name stands higher up
@@ -335,21 +331,18 @@ def _uncommented(row: Sequence[str], width: int) -> list[str]:
     if len(cells) > width:
         named = BLANK_NAME.findall(" ".join(cells))
         cells = named if len(named) == width else cells
-    for sign in COMMENT:
-        if cells and cells[0].startswith(sign):
-            cells[0] = cells[0].removeprefix(sign).strip()
-            if not cells[0] and len(cells) > width:
-                return cells[1:]
+    if COMMENT.match(cells[0]):
+        cells[0] = COMMENT.sub("", cells[0])
+        if not cells[0] and len(cells) > width:
+            return cells[1:]
     return cells
 
 
 # --- columns and their numbers -------------------------------------------------------------------------------------
 
 
-def _columns(
-    rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], options: TableOptions
-) -> tuple[dict[str, list[str]], dict[str, str], str]:
-    """Return the columns, those of numbers with decimal points, their groups, and the decimal mark that they had."""
+def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], options: TableOptions) -> RawTable:
+    """Return the columns, those of numbers with decimal points."""
     _fill(rows, len(heads), options)
     columns: dict[str, list[str]] = {}
     groups: dict[str, str] = {}
@@ -372,7 +365,8 @@ def _columns(
     grouping = "," if mark == "." else "."
     for name, cells in numeric.items():
         columns[name] = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
-    return columns, groups, mark
+    why = "as requested" if options.decimal else "no comma can be a thousands separator"
+    return RawTable(columns, groups, (f"decimal commas: {why}.",) if mark == "," else ())
 
 
 def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
@@ -426,13 +420,10 @@ def _mark(cell: str) -> str:
     last = max(cell.rfind(","), cell.rfind("."))
     if last < 0 or not is_numeral(cell):
         return ""
-    mark = cell[last]
-    other = "," if mark == "." else "."
-    if other in cell:
-        return mark
-    if cell.count(mark) > 1:  # 1.234.567
+    mark, other = (",", ".") if cell[last] == "," else (".", ",")
+    if other not in cell and cell.count(mark) > 1:  # 1.234.567
         return other
-    return "?" if mark == "," and GROUPED.fullmatch(cell) else mark
+    return "?" if mark == "," and other not in cell and GROUPED.fullmatch(cell) else mark
 
 
 def _unit_of(cells: Sequence[str]) -> str:
@@ -451,8 +442,7 @@ def _one_number_each(table: RawTable) -> RawTable:
     columns: dict[str, Sequence[Any]] = {}
     groups = dict(table.groups)
     for name, cells in table.columns.items():
-        lists = [list_of_numbers(cell) for cell in cells if isinstance(cell, str) and not is_missing(cell)]
-        counts = set(map(len, lists))
+        counts = {len(list_of_numbers(cell)) for cell in cells if isinstance(cell, str) and not is_missing(cell)}
         if len(counts) != 1 or counts == {0}:
             columns[name] = cells
             continue
@@ -482,20 +472,22 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point; others as is."""
-    different = ((name, {str(cell).lower() for cell in cells}) for name, cells in table.columns.items())
-    axis = next((name for name, texts in different if texts == set("xyz")), None)
-    if axis is None:
+    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
+    axis = next((name for name, cells in table.columns.items() if {str(c).lower() for c in cells} == set("xyz")), "")
+    if not axis:
         return table
-    others = {name: [str(cell) for cell in cells] for name, cells in table.columns.items()}
-    letters = [cell.lower() for cell in others.pop(axis)]
-    others = {name: _without_letters(cells, letters) for name, cells in others.items()}
-    points = _points(letters, others.values())
+    letters = [cell.lower() for cell in texts.pop(axis)]
+    for name, cells in texts.items():  # P1.X names the coordinate besides
+        pairs = zip(cells, letters, strict=True)
+        named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
+        texts[name] = [match[1] for match in named if match] if all(named) else cells
+    points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
         accepted = "a column naming the point; x, y, z once each"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
     columns: dict[str, Sequence[Any]] = {}
     values = []
-    for name, cells in others.items():
+    for name, cells in texts.items():
         own = [{cells[i] for i in rows.values()} for rows in points]
         if all(len(each) == 1 for each in own):
             columns[name] = [each.pop() for each in own]
@@ -507,30 +499,16 @@ def _one_row_each(table: RawTable) -> RawTable:
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     (value,) = measured
     for letter in "xyz":
-        cells = [others[value][rows[letter]] if letter in rows else "" for rows in points]
+        cells = [texts[value][rows[letter]] if letter in rows else "" for rows in points]
         columns[_with_unit(letter, split(value)[1])] = cells
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
 
 
-def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
-    """Return cells that all name their row's coordinate, P1.X, without it; others as they are."""
-    names = []
-    for cell, letter in zip(cells, letters, strict=True):
-        named = re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell.strip(), re.IGNORECASE)
-        if named is None:
-            return cells
-        names.append(named[1])
-    return names
-
-
-def _points(letters: Sequence[str], keys: Iterable[Sequence[str]]) -> list[dict[str, int]]:
-    """Return the row of every point's coordinates; points are named by the first column with three rows a name."""
-    for key in keys:
-        rows = list(zip((cell.strip() for cell in key), letters, strict=True))
-        points: dict[str, dict[str, int]] = {}
-        for i, (name, letter) in enumerate(rows):
-            points.setdefault(name, {})[letter] = i
-        if "" not in points and len(set(rows)) == len(rows) > 2 * len(points):
-            return list(points.values())
-    return []
+def _points(names: Sequence[str], letters: Sequence[str]) -> list[dict[str, int]]:
+    """Return the row of every point's coordinates; empty where the names are not those of points, three rows each."""
+    points: dict[str, dict[str, int]] = {}
+    for i, (name, letter) in enumerate(zip(names, letters, strict=True)):
+        points.setdefault(name, {})[letter] = i
+    alone = sum(map(len, points.values())) == len(names)
+    return list(points.values()) if alone and "" not in points and len(names) > 2 * len(points) else []
