@@ -21,7 +21,7 @@ from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import numeral, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
-from rpim_opt.data.tables.understanding import Understood, row_stems
+from rpim_opt.data.tables.understanding import Understood, counts_rows, row_stems
 from rpim_opt.robot.mdh import Robot
 
 TIME = re.compile(r"[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|zeit|zeitstempel|date|datum|t)", re.IGNORECASE)
@@ -43,9 +43,19 @@ class Key(NamedTuple):
     """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
 
     how: str
-    columns: Sequence[str]
+    columns: tuple[str, ...]
     left: list[str]
     right: list[str]
+
+
+class Match(NamedTuple):
+    """Which rows of joints and of measured values belong together, their names, notes, and the columns that say so."""
+
+    left: Sequence[int]
+    right: Sequence[int]
+    names: Sequence[str]
+    notes: Sequence[str]
+    columns: tuple[str, ...]
 
 
 def together(
@@ -66,7 +76,16 @@ def together(
         found = f"{lost or 'some tables'} without joint or measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
     joints, values = _stacked(moving), _stacked(seen)
-    return _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
+    match = _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
+    left, right = joints.take(match.left), values.take(match.right)
+    columns = {**left.columns, **right.columns}
+    columns.pop("label", None)
+    if len(set(match.names)) == len(match.names):
+        columns = {"label": match.names, **columns}
+    else:  # several measured values of a configuration
+        columns.setdefault("configuration", match.names)
+    notes = (*joints.notes, *values.notes, *match.notes)
+    return replace(right, columns=columns, raw={**left.raw, **right.raw}, notes=notes, keys=match.columns)
 
 
 def _stacked(tables: Sequence[Understood]) -> Understood:
@@ -74,56 +93,31 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
     first = tables[0]
     if len(tables) == 1:
         return replace(first, notes=())
-    wanted = {split_unit(name)[0]: name for name in first.columns if name != "label"}
-    whole: dict[str, list[Any]] = {name: [] for name in wanted.values()}
-    for table in tables:
-        own = {split_unit(name)[0]: name for name in table.columns if name != "label"}
-        lacking = own.keys() ^ wanted.keys()
+    names = [{split_unit(name)[0]: name for name in table.columns if name != "label"} for table in tables]
+    whole: dict[str, list[Any]] = {"label": [label for table in tables for label in table.labels]}
+    for table, own in zip(tables, names, strict=True):
+        lacking = own.keys() ^ names[0].keys()
         if lacking:
             found = f"{listed(sorted(lacking))} in only one of {first.file} and {table.file}"
             accepted = "the same columns in all files, or one file of joints and one of values"
             raise InputError("the header", found, accepted)
-        for stem, name in wanted.items():
+        for stem, name in names[0].items():
             cells = table.columns[own[stem]]
             old, new = split_unit(own[stem])[1], split_unit(name)[1]
             if old is not None and new is not None and old.si != new.si:
                 cells = [repr(float(cell) * old.si / new.si) for cell in cells]
-            whole[name].extend(cells)
-    labels = [_labels(table) for table in tables]
-    counts = ", ".join(f"{table.file} {len(own)}" for table, own in zip(tables, labels, strict=True))
-    notes = [f"rows of the files are stacked: {counts}."]
-    names = [name for own in labels for name in own]
-    if len(set(names)) < len(names):
+            whole.setdefault(name, []).extend(cells)
+    notes = [f"rows of the files are stacked: {', '.join(f'{each.file} {len(each.labels)}' for each in tables)}."]
+    if len(set(whole["label"])) < len(whole["label"]):
         files = [Path(table.file).stem for table in tables]
         if len(set(files)) < len(files):
             files = [str(i) for i in range(1, len(files) + 1)]
-        names = [f"{file}:{name}" for file, own in zip(files, labels, strict=True) for name in own]
+        whole["label"] = [f"{file}:{label}" for file, each in zip(files, tables, strict=True) for label in each.labels]
         notes.append("labels occur in several files: they are prefixed with the name of the file.")
     lower = [_lower(table) for table in tables]
-    raw = {
-        name: [cell for own in lower for cell in own[name]] for name in lower[0] if all(name in own for own in lower)
-    }
-    return replace(first, columns={"label": names, **whole}, raw=raw, notes=tuple(notes))
-
-
-def _beside(joints: Understood, left: Sequence[int], values: Understood, right: Sequence[int],
-            names: Sequence[str]) -> Understood:  # fmt: skip
-    """Return rows of joints and the rows of measured values that belong to them as one table of rows of these names."""
-    sides = ((joints, left), (values, right))
-    whole = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.columns.items()}
-    raw = {name: [cells[i] for i in rows] for side, rows in sides for name, cells in side.raw.items()}
-    whole.pop("label", None)
-    if len(set(names)) == len(names):
-        whole = {"label": list(names), **whole}
-    else:  # several measured values of a configuration
-        whole.setdefault("configuration", list(names))
-    return replace(values, columns=whole, raw=raw, notes=(*joints.notes, *values.notes))
-
-
-def _labels(table: Understood) -> list[str]:
-    """Return the labels of the rows, or their numbers."""
-    count = len(next(iter(table.columns.values())))
-    return [str(label) for label in table.columns.get("label", range(1, count + 1))]
+    common = [name for name in lower[0] if all(name in own for own in lower)]
+    raw = {name: [cell for own in lower for cell in own[name]] for name in common}
+    return replace(first, columns=whole, raw=raw, notes=tuple(notes))
 
 
 def _lower(table: Understood) -> Columns:
@@ -134,12 +128,12 @@ def _lower(table: Understood) -> Columns:
 # --- by a key ------------------------------------------------------------------------------------------------------
 
 
-def _by_key(joints: Understood, values: Understood, key: str) -> Understood:
+def _by_key(joints: Understood, values: Understood, key: str) -> Match:
     """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
     place = {name: i for i, name in enumerate(chosen.left)}
     if len(place) < len(chosen.left):
-        twice = next(name for name, count in Counter(chosen.left).items() if count > 1)
+        twice = Counter(chosen.left).most_common(1)[0][0]
         raise InputError(f"the key {chosen.how}", f"'{twice}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
     if not right:
@@ -155,8 +149,7 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Understood:
     lonely += [name for name in chosen.right if name not in place]
     if lonely:
         notes.append(f"without a match, ignored: {listed(lonely)}.")
-    whole = _beside(joints, [place[name] for name in names], values, right, names)
-    return replace(whole, notes=(*whole.notes, *notes), keys=tuple(chosen.columns))
+    return Match([place[name] for name in names], right, names, notes, chosen.columns)
 
 
 def _key(joints: Understood, values: Understood, key: str) -> Key:
@@ -167,7 +160,7 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
         if len(set(own) & set(others)) >= SAME * min(len(own), len(others))
         and (key in ("", "row") or key.lower() in (name.lower(), other.lower()))
     ]
-    telling = [pair for pair in pairs if not _running(pair.left)]
+    telling = [pair for pair in pairs if not counts_rows(pair.left)]
     pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
     if key == "row":
         return _row_numbers(joints, values, pair if telling else None)
@@ -175,13 +168,11 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
         labels = _normal(joints.columns["label"])
         for column in ("label", "configuration"):
             others = _normal(values.columns.get(column, ()))
-            if set(labels) & set(others) and not (telling and _running(labels)):
+            if set(labels) & set(others) and not (telling and counts_rows(labels)):
                 return Key("label", (), labels, others)
     left, right = _lower(joints), _lower(values)
     common = [name for name in left if name in right]
-    name = key.lower()
-    if not key and len(common) == 1 and not (telling and pair):
-        name = common[0]
+    name = common[0] if not key and len(common) == 1 and not (telling and pair) else key.lower()
     if name in common:
         return Key(f"column '{name}'", (name,), _normal(left[name]), _normal(right[name]))
     if pair:
@@ -200,7 +191,7 @@ def _naming(table: Understood) -> dict[str, list[str]]:
 
 def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Key:
     """Return the numbers of the rows as the key, unless a pair of columns shows that the rows are in another order."""
-    count, other = len(_labels(joints)), len(_labels(values))
+    count, other = len(joints.labels), len(values.labels)
     if count != other:
         found = f"{count} rows of joints and {other} measured"
         raise InputError("--key row", found, "equal numbers of both, or a common column")
@@ -213,11 +204,6 @@ def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Ke
             raise InputError("--key row", found, f"no --key, to join by {pair.how}")
     numbers = [str(i) for i in range(1, count + 1)]
     return Key("the number of the row", (), numbers, numbers)
-
-
-def _running(keys: Sequence[str]) -> bool:
-    """Whether keys count the rows."""
-    return keys == [str(i) for i in range(1, len(keys) + 1)]
 
 
 def _normal(cells: Sequence[Any]) -> list[str]:
@@ -250,7 +236,7 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
     return partner[rows], rows, apart[rows]
 
 
-def _by_time(joints: Understood, values: Understood, key: str, within: float) -> Understood:
+def _by_time(joints: Understood, values: Understood, key: str, within: float) -> Match:
     """Return the rows of the nearest times."""
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
@@ -261,7 +247,7 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
         nearest = float(np.abs(there - then[0]).min())
         found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
         raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
-    labels = _labels(values)
+    labels = values.labels
     notes = [
         f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
@@ -270,17 +256,14 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
     if lonely:
         several = f"{len(lonely)} measured rows without a match within {within:g} s, ignored"
         notes.append(f"{several}: {listed(lonely)}.")
-    whole = _beside(joints, left.tolist(), values, right.tolist(), [labels[i] for i in right])
-    return replace(whole, notes=(*whole.notes, *notes), keys=clocks)
+    return Match(left.tolist(), right.tolist(), [labels[i] for i in right], notes, clocks)
 
 
 def _clock_tolerance(joints: Understood, values: Understood) -> float:
     """Return a small part of the time between rows [s] where every measured row has a partner within it, else 0."""
-    if any(time_column(side.raw) is None for side in (joints, values)):
+    if any(time_column(side.raw) is None or len(side.labels) < 2 for side in (joints, values)):
         return 0.0
     there, then = (_times(side, "")[1] for side in (joints, values))
-    if min(len(there), len(then)) < 2:
-        return 0.0
     within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
     return within if len(partners(there, then, within)[1]) == len(then) else 0.0
 
@@ -288,10 +271,8 @@ def _clock_tolerance(joints: Understood, values: Understood) -> float:
 def _times(table: Understood, key: str) -> tuple[str, Array]:
     """Return the column of a table's times, in lower case, and the times [s] of its rows."""
     columns = _lower(table)
-    name = key.lower() if key.lower() in columns else None
-    if key.lower() in ("", "time"):
-        name = time_column(columns)
-    if name is None:
+    name = time_column(columns) if key.lower() in ("", "time") else key.lower()
+    if name is None or name not in columns:
         lacks = f"no column '{key}'" if key else "no column of times"
         where = f"--time-tolerance, {table.file}"
         raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -76,6 +76,17 @@ class Understood:
         return {split_unit(name)[0] for name in self.columns}
 
     @property
+    def labels(self) -> list[str]:
+        """The labels of the rows, or their numbers from 1."""
+        count = len(next(iter(self.columns.values()), ()))
+        return [str(label) for label in self.columns.get("label", range(1, count + 1))]
+
+    def take(self, rows: Sequence[int]) -> Understood:
+        """Return the table of these rows."""
+        columns, raw = ({n: [cells[i] for i in rows] for n, cells in c.items()} for c in (self.columns, self.raw))
+        return replace(self, columns=columns, raw=raw)
+
+    @property
     def left_out(self) -> tuple[str, ...]:
         """Ignored columns."""
         return tuple(each.column for each in self.meant if each.meaning == "not used")
@@ -102,27 +113,26 @@ def understand(
         accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
         raise InputError("--rotation", f"'{options.rotation}'", accepted)
     known = number_columns(robot, kind)
-    read, rotation = _readings(raw, robot, kind, options, joints, targets)
-    if options.constants:
-        more = raw.with_constants(options.constants)
-        interpreted = _readings(more, robot, kind, options, joints, targets)
-        if any(re.fullmatch(r"q\d+", interpreted[0][name].stem) for name in raw.columns):  # the file with the joints
-            raw, (read, rotation) = more, interpreted
+    more = raw.with_constants(options.constants)
+    read, rotation = _readings(more, robot, kind, options, joints, targets)
+    if any(re.fullmatch(r"q\d+", read[name].stem) for name in raw.columns):  # the file with the joints
+        raw = more
+    elif options.constants:
+        read, rotation = _readings(raw, robot, kind, options, joints, targets)
     rotation = options.rotation or rotation
     stated = {key: (unit, "--units" if key in units else "above the header") for key, unit in options.units.items()}
     columns, meant = _under_our_names(raw.columns, read, kind, known, stated)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         columns, meant = _as_quaternions(columns, meant, rotation)
-    rows, notes = range(len(next(iter(columns.values()), ()))), []
+    table = Understood(columns, raw.columns, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
     if not targets:
-        rows, columns, notes = _rows_with_values(columns, robot, kind)
-    cells = {name: [cells[i] for i in rows] for name, cells in raw.columns.items()}
-    notes = [*raw.notes, *notes]
+        table = _rows_with_values(table, robot, kind)
+    notes = list(table.notes)
     for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
         unit = units.get(dimension, each.unit)
         if unit != each.unit:
             notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
-    return Understood(columns, cells, tuple(meant), tuple(notes), _doubt(read, robot, options, rotation))
+    return replace(table, notes=tuple(notes))
 
 
 def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> tuple[Columns, list[Meant]]:
@@ -173,8 +183,7 @@ def _readings(
     _count_from_one(read, dof)
     for stems in ({f"q{i}" for i in range(1, dof + 1)}, COORDINATES):
         read.update(_without_prefix(read, stems, joints, options.prefix))
-    read.update(_counted(read, robot))
-    read.update(_counted_coordinates(read))
+    _counted(read, robot)
     for name, each in read.items():
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "one row per point, with a column marker")
@@ -192,12 +201,16 @@ def _readings(
     return read, rotation
 
 
+def counts_rows(keys: Sequence[str]) -> bool:
+    """Return whether keys are the numbers of the rows."""
+    return keys == [str(i) for i in range(1, len(keys) + 1)]
+
+
 def _choose_label(read: Readings, table: Columns, key: str) -> None:
     """Of several labels keep the stated key, or the one that does more than count the rows."""
     labels = [name for name, each in read.items() if each.stem == "label"]
-    count = [str(i) for i in range(1, len(next(iter(table.values()), ())) + 1)]
     keys = [name for name in labels if name.lower() == key.lower()]
-    chosen = keys or [name for name in labels if [str(cell).strip() for cell in table[name]] != count]
+    chosen = keys or [name for name in labels if not counts_rows([str(cell).strip() for cell in table[name]])]
     if len(labels) > 1 and len(chosen) == 1:
         read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
 
@@ -305,42 +318,30 @@ def _prefixed(read: Readings, joints: Sequence[str]) -> dict[str, Readings]:
     return by_prefix
 
 
-def _by_word(read: Readings, pattern: str, may_be: Callable[[Reading], bool]) -> dict[str, dict[str, str]]:
-    """Return the columns of unknown names that are a word with a number, by word and number."""
-    words: dict[str, dict[str, str]] = {}
+def _counted(read: Readings, robot: Robot) -> None:
+    """Name unknown columns of any one word that are counted.
+
+    With joint units they are the joints, if none are known otherwise; three of them, ``p_1, p_2, p_3``, are x, y, z, if
+    nothing else is measured.
+    """
+    words: dict[str, dict[int, str]] = {}
     for name, each in read.items():
-        match = re.fullmatch(pattern, each.stem)
-        if match and not each.why and may_be(each):
-            words.setdefault(match[1], {})[match[2]] = name
-    return words
-
-
-def _counted(read: Readings, robot: Robot) -> Readings:
-    """Return the joints from numbered columns of any word with joint units, if no joints are known otherwise."""
-    if any(re.fullmatch(r"q\d+", each.stem) for each in read.values()):
-        return {}
-    wanted = {(str(i), dimension) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    words = _by_word(read, r"(\D+?)_?([1-9]\d?)", lambda each: each.unit != "")
-    whole = [
-        {name: read[name]._replace(stem=f"q{i}", why=f"'{word}' numbered from 1, in joint units")
-         for i, name in names.items()}
-        for word, names in words.items()
-        if wanted <= {(i, dimension_of(read[name].unit)) for i, name in names.items()}
-    ]  # fmt: skip
-    return whole[0] if len(whole) == 1 else {}
-
-
-def _counted_coordinates(read: Readings) -> Readings:
-    """Return x, y, z of three columns of one word that are counted, ``p_1, p_2, p_3``, if nothing else is measured."""
-    if any(each.stem in (*COORDINATES, "distance", "q0") for each in read.values()):
-        return {}
-    words = _by_word(read, r"(\D*?)_?(\d)", lambda each: not each.unit or dimension_of(each.unit) == "length")
-    triples = [names for names in words.values() if sorted(names) in (list("123"), list("012"))]
-    if len(triples) != 1:
-        return {}
-    why = "the only three numbered columns besides the joints"
-    names = [triples[0][number] for number in sorted(triples[0])]
-    return {name: read[name]._replace(stem=axis, why=why) for name, axis in zip(names, "xyz", strict=True)}
+        match = re.fullmatch(r"(\D*?)_?(0|[1-9]\d?)", each.stem)
+        if match and not each.why:
+            words.setdefault(match[1], {})[int(match[2])] = name
+    dimensions = {name: dimension_of(read[name].unit) if read[name].unit else "" for name in read}
+    stems = {each.stem for each in read.values()}
+    joints = set(enumerate(robot.joint_dimensions, start=1))
+    whole = [word for word, names in words.items() if joints <= {(i, dimensions[n]) for i, n in names.items()}]
+    if len(whole) == 1 and whole[0] and not any(re.fullmatch(r"q\d+", stem) for stem in stems):
+        for i, name in words.pop(whole[0]).items():
+            why = f"'{whole[0]}' numbered from 1, in joint units"
+            read[name] = read[name]._replace(stem=f"q{i}", why=why)
+    lengths = [{i: n for i, n in names.items() if dimensions[n] in ("", "length")} for names in words.values()]
+    triples = [names for names in lengths if sorted(names) in ([1, 2, 3], [0, 1, 2])]
+    if len(triples) == 1 and not stems & {*COORDINATES, "distance", "q0"}:
+        for axis, (_, name) in zip("xyz", sorted(triples[0].items()), strict=True):
+            read[name] = read[name]._replace(stem=axis, why="the only three numbered columns besides the joints")
 
 
 def _leave_out(read: Readings, targets: bool) -> None:
@@ -464,39 +465,36 @@ def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
     return {"measured": {*kind.columns, *forms}, "joint": {f"q{i}" for i in range(1, robot.dof + 1)}}
 
 
-def _rows_with_values(
-    columns: Columns, robot: Robot, kind: Measurement
-) -> tuple[Sequence[int], dict[str, Sequence[Any]], list[str]]:
-    """Return the rows that have measured and joint values, their columns with unique labels, and what was changed."""
-    count = len(next(iter(columns.values()), ()))
-    labels = columns.get("label", range(1, count + 1))
+def _rows_with_values(table: Understood, robot: Robot, kind: Measurement) -> Understood:
+    """Return the rows that have measured and joint values, with unique labels, and notes on what was changed."""
+    labels = table.labels
     out: set[int] = set()
-    notes = []
+    notes = list(table.notes)
     for what, stems in row_stems(robot, kind).items():
-        own = [cells for name, cells in columns.items() if split_unit(name)[0] in stems]
-        lacking = [sum(is_missing(str(cells[i])) for cells in own) for i in range(count)]
-        none = [i for i in range(count) if own and lacking[i] == len(own)]
-        some = [i for i in range(count) if 0 < lacking[i] < len(own)]
-        if len(some) > INCOMPLETE * count:  # then a column is wrong, which is named where its numbers are read
+        own = [cells for name, cells in table.columns.items() if split_unit(name)[0] in stems]
+        lacking = [sum(is_missing(str(cell)) for cell in row) for row in zip(*own, strict=True)]
+        none = [i for i, count in enumerate(lacking) if count == len(own)]
+        some = [i for i, count in enumerate(lacking) if 0 < count < len(own)]
+        if len(some) > INCOMPLETE * len(labels):  # then a column is wrong, which is named where its numbers are read
             some = []
         for rows, which in ((none, f"without {what} values"), (some, f"that lack one of their {what} values")):
             if rows:
-                notes.append(f"rows {which} are ignored: {listed([str(labels[i]) for i in rows])}.")
+                notes.append(f"rows {which} are ignored: {listed([labels[i] for i in rows])}.")
             out.update(rows)
-    usable = [i for i in range(count) if i not in out]
-    if columns and not usable:
+    whole = table.take([i for i in range(len(labels)) if i not in out])
+    if table.columns and not whole.labels:
         raise InputError("the table", "no row with values", "at least one")
-    whole: dict[str, Sequence[Any]] = {name: [cells[i] for i in usable] for name, cells in columns.items()}
-    own = [str(cell).strip() for cell in whole.get("label", ())]
-    both = [f"{label}/{marker}" for label, marker in zip(own, whole.get("marker", ()), strict=False)]
+    columns = dict(whole.columns)
+    own = [str(cell).strip() for cell in columns.get("label", ())]
+    both = [f"{label}/{marker}" for label, marker in zip(own, columns.get("marker", ()), strict=False)]
     if both and not _unique(own) and _unique(both):
         notes.append("labels combine point and reflector.")
-        whole = {"configuration": own, **whole, "label": both}
+        columns = {"configuration": own, **columns, "label": both}
     elif not _unique(own):
         again = next((label for label in own if own.count(label) > 1), "")
         notes.append(f"labels are not unique ('{again}'): rows are numbered.")
-        del whole["label"]
-    return usable, whole, notes
+        del columns["label"]
+    return replace(whole, columns=columns, notes=tuple(notes))
 
 
 def _unique(labels: Sequence[str]) -> bool:
