@@ -99,10 +99,8 @@ def read_columns(source: Any) -> Columns:
         names = list(getattr(source, "column_names", getattr(source, "columns", source)))
         _require_names(names)
         columns = {name.strip(): source[name] for name in names}
-    if not columns:
-        raise InputError("the table", "an empty table", "at least one row")
-    if not len(next(iter(columns.values()))):
-        raise InputError("the table", "a header and no rows", "at least one row")
+    if not len(next(iter(columns.values()), ())):
+        raise InputError("the table", "a header and no rows" if columns else "an empty table", "at least one row")
     return columns
 
 
@@ -123,8 +121,8 @@ def _rectangle(rows: Sequence[Sequence[str]]) -> Columns:
     _require_names(header)
     for number, row in enumerate(body, start=1):
         if len(row) != len(header):
-            accepted = f"{len(header)} cells as in the header"
-            raise InputError(f"row {number} ({row[0][:40]})", f"{len(row)} cells", accepted)
+            where = f"row {number} ({row[0][:40]})"
+            raise InputError(where, f"{len(row)} cells", f"{len(header)} cells as in the header")
     return {name: [row[i] for row in body] for i, name in enumerate(header)}
 
 
@@ -186,28 +184,30 @@ def array_columns(path: Path) -> Columns:
     try:
         if path.suffix.lower() == ".npz":
             with ZipFile(path) as archive:
-                if sum(entry.file_size for entry in archive.infolist()) > 8 * MOST_CELLS:
-                    raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
+                _require_few(sum(entry.file_size for entry in archive.infolist()) // 8)
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: np.atleast_2d(file[name].T).T for name in file.files if file[name].dtype.kind == "f"}
-            sizes = {name: array.shape for name, array in arrays.items()}
         else:
             sizes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind in ("double", "single")}
-            if sum(map(math.prod, sizes.values())) > MOST_CELLS:
-                raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
+            _require_few(sum(map(math.prod, sizes.values())))
             arrays = scipy.io.loadmat(path, variable_names=list(sizes)) if sizes else {}
+            arrays = {name: arrays[name] for name in sizes}
     except (OSError, ValueError, TypeError, NotImplementedError, MemoryError, BadZipFile) as error:
         raise InputError("the file", _first_line(error), accepted) from None
-    rows = Counter(shape[0] for shape in sizes.values() if len(shape) == 2 and shape[0] > 1)
+    rows = Counter(len(array) for array in arrays.values() if array.ndim == 2 and len(array) > 1)
     columns: dict[str, Sequence[Any]] = {}
-    for name, shape in sizes.items():
-        if rows and len(shape) == 2 and shape[0] == rows.most_common(1)[0][0]:
-            columns |= {
-                f"{name}_{i}" if shape[1] > 1 else name: part for i, part in enumerate(arrays[name].T.tolist(), 1)
-            }
+    for name, array in arrays.items():
+        if rows and array.ndim == 2 and len(array) == rows.most_common(1)[0][0]:
+            of_array = enumerate(array.T.tolist(), start=1)
+            columns |= {f"{name}_{i}" if array.shape[1] > 1 else name: part for i, part in of_array}
     if not columns:
-        raise InputError("the file", f"variables {', '.join(sizes) or 'without numbers'}", accepted)
+        raise InputError("the file", f"variables {', '.join(arrays) or 'without numbers'}", accepted)
     return columns
+
+
+def _require_few(numbers: int) -> None:
+    if numbers > MOST_CELLS:
+        raise InputError("the file", f"more than {MOST_CELLS} numbers", "fewer")
 
 
 def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = "") -> Grid:
@@ -217,19 +217,16 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         return _excel(path, sheet)
     if sheet:
         raise InputError("--sheet", f"'{sheet}' of a text file", "an Excel workbook")
-    whole, remarks = decoded(path, encoding)
-    whole = SEXAGESIMAL.sub(_decimal, whole)
-    text = FORTRAN.sub("e", NO_NUMBER.sub("", whole))
+    whole, notes = decoded(path, encoding)
+    text = FORTRAN.sub("e", NO_NUMBER.sub("", SEXAGESIMAL.sub(_decimal, whole)))
     mark = SEPARATORS.get(separator, separator.replace("\\t", "\t")) if separator else _separator(text)
     if len(mark) != 1:
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
-    notes = list(remarks)
     if mark != ",":
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
-        notes.append(
-            f"cells are separated by {spelled}: {'as requested' if separator else 'it separates most numbers'}."
-        )
-    return Grid(*_split(text, mark), tuple(notes), mark == " ")
+        why = "as requested" if separator else "it separates most numbers"
+        notes = (*notes, f"cells are separated by {spelled}: {why}.")
+    return Grid(*_split(text, mark), notes, mark == " ")
 
 
 def _decimal(angle: re.Match[str]) -> str:
@@ -287,12 +284,11 @@ def _separator(text: str) -> str:
     rows = {mark: _split(sample, mark, strict=False)[0] for mark in SEPARATORS.values()}
     parted = {mark: sum(map(_parted, split)) for mark, split in rows.items()}
     blanks = parted.pop(" ")
-    best = max(parted, key=lambda mark: parted[mark])
+    best = max(parted, key=parted.__getitem__)
     if blanks > BLANKS_CLEARLY * parted[best]:
         return " "
-    if not parted[best]:  # a header so wide that no row is seen
-        best = max(parted, key=lambda mark: sum(map(len, rows[mark])))
-    return best
+    # a header may be so wide that no row is seen
+    return best if parted[best] else max(parted, key=lambda mark: sum(map(len, rows[mark])))
 
 
 def _parted(row: Sequence[str]) -> int:
@@ -371,6 +367,7 @@ def _excel(path: Path, sheet: str) -> Grid:
     """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has cells."""
     openpyxl = library("openpyxl", "Excel files")
     rows: list[tuple[int, list[str]]] = []
+    chosen = ""
     try:
         with path.open("rb") as stream:
             with ZipFile(stream) as archive:  # what it says of itself is what is read of it
@@ -380,7 +377,6 @@ def _excel(path: Path, sheet: str) -> Grid:
                 raise InputError("the file", f"{size} bytes unpacked", accepted)
             book = openpyxl.load_workbook(stream, read_only=True, data_only=True)
             names = [each.title for each in book.worksheets]
-            chosen = ""
             wanted = [sheet] if sheet else names
             if sheet and sheet not in names:
                 number = int(sheet) if sheet.isdigit() else 0
