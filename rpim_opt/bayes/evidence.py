@@ -16,13 +16,11 @@ from rpim_opt.problem.noise import Repeatability, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
 """Prior medians of the robot's repeatability [m, rad, rad], and of the factor on the instrument's noise."""
-CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5), "transmission waves": (1.5e-4, 0.05)}
-"""Hyperparameters of transmission errors: prior median [rad], and standard deviation of the natural logarithm.
-
-That of the waves is narrow: part of a joint's range hardly distinguishes them from its offset and eccentricity.
-"""
-WAVES_LENGTH = 1.0
-"""Length scale of the waves [rad]."""
+CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5)}
+"""Hyperparameters of transmission errors: prior median [rad], and standard deviation of the natural logarithm."""
+WAVES, WAVES_LENGTH = 1.5e-4, 1.0
+"""Standard deviation and length scale [rad] of the waves beside them, which are not estimated: part of a joint's range
+hardly distinguishes them from its offset and eccentricity."""
 NOISE_SD, GEOMETRY_SD, EXTENSION_SD = 2.0, 3.0, 2.0
 """Prior standard deviations of the natural logarithms of the hyperparameters."""
 BASE_SD = 1.0
@@ -59,12 +57,23 @@ FACTORS = np.geomspace(1.0, 30.0, 100)
 class Spectrum(NamedTuple):
     """Prior variances of Fourier coefficients that represent Gaussian processes with Matern covariance (3/2).
 
-    The sum of size^2 8 r^3 / (r^2 + w^2)^2 / measure, r = sqrt(3) / length, over ripple (size and length estimated) and
-    waves (size estimated, length `WAVES_LENGTH`); squared frequencies and measures are (c,).
+    The sum of size^2 8 r^3 / (r^2 + w^2)^2 / measure, r = sqrt(3) / length, over ripple, which is estimated, and
+    `WAVES`; squared frequencies and measures are (c,).
     """
 
     w2: Array
     measure: Array
+
+    def variances(self, size: float, length: float) -> tuple[Array, Array, Array]:
+        """Return variances (c,) at logarithms of ripple's size and length, slopes (c, 2) and curvature of ln."""
+        r2, slow = 3 * np.exp(-2 * length), 3 / WAVES_LENGTH**2
+        ripple = np.exp(2 * size) * 8 * r2**1.5 / (r2 + self.w2) ** 2
+        waves = WAVES**2 * 8 * slow**1.5 / (slow + self.w2) ** 2
+        share = ripple / (ripple + waves)
+        of_ripple = np.column_stack([np.full(len(share), 2.0), 4 * r2 / (r2 + self.w2) - 3])
+        curvature = np.einsum("i,ij,ik->ijk", share * (1 - share), of_ripple, of_ripple)
+        curvature[:, 1, 1] -= share * 8 * r2 * self.w2 / (r2 + self.w2) ** 2
+        return (ripple + waves) / self.measure, share[:, None] * of_ripple, curvature
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,29 +106,18 @@ class Hierarchy:
         return self.names if self.spectrum is None else (*self.names, *CURVES)
 
     def variances(self, logs: Array) -> tuple[Array, Array, Array]:
-        """Return variances (p,) at logarithms of hyperparameters, slopes (p, s) and curvature (p, 3, 3) of ln.
+        """Return variances (p,) at logarithms of hyperparameters, slopes (p, s) of ln, and curvature of a spectrum's.
 
-        The curvature is by those of `CURVES`. Without local scales; replaced deviations follow no hyperparameter.
+        Without local scales; replaced deviations follow no hyperparameter.
         """
         g = len(self.names)
         variances = np.append(np.exp(2 * logs[:g]), 1.0)[self.group]
         slopes = np.zeros((len(variances), len(logs)))
         slopes[:, :g] = 2.0 * (self.group[:, None] == np.arange(g))
-        curvature = np.zeros((len(variances), len(CURVES), len(CURVES)))
+        curvature = np.zeros((0, len(CURVES), len(CURVES)))
         if self.spectrum is not None:
-            w2, measure = self.spectrum
-            own = slice(len(variances) - len(w2), None)
-            r2 = 3 / float(np.exp(logs[g + 1])) ** 2
-            slow = 3 / WAVES_LENGTH**2
-            ripple = np.exp(2 * logs[g] + np.log(8 * r2**1.5) - 2 * np.log(r2 + w2))
-            waves = np.exp(2 * logs[g + 2]) * 8 * slow**1.5 / (slow + w2) ** 2
-            variances[own] = (ripple + waves) / measure
-            share = ripple / (ripple + waves)
-            of_ripple = np.column_stack([np.full(len(w2), 2.0), 4 * r2 / (r2 + w2) - 3, np.zeros(len(w2))])
-            apart = of_ripple - [0.0, 0.0, 2.0]
-            slopes[own, g:][:, :3] = share[:, None] * apart + [0.0, 0.0, 2.0]
-            curvature[own] = np.einsum("i,ij,ik->ijk", share * (1 - share), apart, apart)
-            curvature[own, 1, 1] -= share * 8 * r2 * w2 / (r2 + w2) ** 2
+            own, curves = slice(len(variances) - len(self.spectrum.w2), None), slice(g, g + len(CURVES))
+            variances[own], slopes[own, curves], curvature = self.spectrum.variances(*logs[curves])
         slopes[self.replaced] = 0.0
         return variances, slopes, curvature
 
@@ -326,7 +324,7 @@ class Evidence:
         curvature[s:, s:] = among + 2 * (f @ z_by_noise + np.diag(by_noise)) - direct[:, s:].T @ precision[:, s:]
         if prior.spectrum is not None:
             curves = slice(s - len(CURVES), s)
-            curvature[curves, curves] += np.tensordot(1 - e2 / v, bend, axes=1)
+            curvature[curves, curves] += np.tensordot((1 - e2 / v)[len(v) - len(bend) :], bend, axes=1)
         off = self.root @ (logs - self.centre)
         of_z = C @ (z[:, None] * precision)
         of_z[:, s:] += z_by_noise

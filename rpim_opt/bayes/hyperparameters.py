@@ -23,7 +23,7 @@ from rpim_opt.bayes.evidence import (
     tail_widening,
 )
 from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
-from rpim_opt.bayes.prior_terms import FIXED, ScaledPrior
+from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
@@ -80,11 +80,10 @@ class LeftOut(NamedTuple):
 
 
 class Transmitted(NamedTuple):
-    """Standard deviation and length scale of ripple, that of ``waves`` [rad], and the decrease of -2 ln L."""
+    """Standard deviation and length scale of ripple [rad], and the decrease of -2 ln L."""
 
     size: Size
     length: Size
-    waves: Size
     gain: float
 
 
@@ -219,12 +218,8 @@ class Estimator:
             replaced=stated.replaced,
             rows=stated.rows * stated.scale,
             values=stated.values - stated.rows @ stated.centre,
+            spectrum=spectrum_of(self.curves, unit) if self.curves else None,
         )
-        if self.curves:
-            spectrum = spectrum_of(self.curves, unit)
-            known = np.arange(len(unit)) < len(unit) - len(spectrum.w2)
-            own = replace(hierarchy, group=np.where(known, stated.group, FIXED), spectrum=spectrum)
-            hierarchy = own.of(np.ones(len(unit), dtype=bool))
         have = {"instrument"}
         if any(stack.unit is not None or stack.length.any() for stack in stacks):
             have |= {"position", "joint"}

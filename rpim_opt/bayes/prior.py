@@ -215,7 +215,7 @@ class Prior:
             else:
                 keys.append(f"{dimension}s" if _GEOMETRY.fullmatch(own) else kind_of(name))
         of_base = np.array([own_name(name).startswith(f"{BASE}_") for name in parameters.names])
-        fixed = (parameters.placed & (known | ~of_base))[parameters.identified]
+        fixed = (parameters.of_curves | parameters.placed & (known | ~of_base))[parameters.identified]
         names = tuple(dict.fromkeys(key for key, alone in zip(keys, fixed, strict=True) if not alone))
         numbers = [FIXED if alone else names.index(key) for key, alone in zip(keys, fixed, strict=True)]
         return np.array(numbers, dtype=int), names

@@ -20,7 +20,7 @@ from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
 FIXED = -1
-"""The group of a parameter whose prior scale is not estimated: of frames, but for the base."""
+"""The group of a parameter whose prior scale is not estimated: of frames, but for the base, and of curves."""
 JOINT_OFFSET, FRAMES = 3.0, 10.0
 """Factors on the scales of joint offsets, which are set at assembly, and of frames."""
 FAR = 100.0

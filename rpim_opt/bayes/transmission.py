@@ -33,8 +33,8 @@ COLUMNS, FINEST = 68, 128
 """Harmonics a joint in the mean at most, sines and cosines, of six joints at least; cycles a turn of the finest one."""
 SHORTEST = 0.05
 """Travel of a joint [rad] from which its curve is looked for."""
-BEYOND, LENGTHS = 0.3, 2.5
-"""How far curves go on beyond the measured angles [rad], and in length scales at least: there they are unknown."""
+BEYOND = 0.3
+"""How far curves go on beyond the measured angles [rad], where they are unknown."""
 STARTS = (0.3, 0.03)
 """Length scales [rad] from which the optimum is looked for."""
 ACCURACY = 0.3
@@ -141,29 +141,21 @@ def _most_likely(
     for stack in data.stacks if by_joints else problem.stacks():  # other noise needs no slopes by joints
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]
-    size, _, waves = np.log([median for median, _ in CURVES.values()])
-    starts = [np.array([size, np.log(length), waves, *plain.logs]) for length in STARTS]
-    margin = BEYOND
     centre, travel = (q.min(axis=0) + q.max(axis=0)) / 2, np.ptp(q, axis=0)
     joints = [j for j, kind in enumerate(problem.robot.joint_types) if kind == "revolute" and travel[j] > SHORTEST]
     if not joints:
         return None
-    while True:
-        turns = np.minimum(travel + 2 * margin, 2 * np.pi) / (2 * np.pi)
-        cycles = min(FINEST, COLUMNS * max(len(joints), 6) / 2 / max(np.sum(turns[joints]), 1e-9))
-        counts = np.maximum(cycles * turns, 1).astype(int)
-        curves = tuple(Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), int(counts[j])) for j in joints)
-        columns = series(curves, q, slopes)
-        beside = given(columns, curves)
-        start = min((beside.at(logs) for logs in starts), key=lambda point: point.value)
-        point = beside.optima([start.logs], ACCURACY, start)[0]
-        if plain.value - point.value <= GAIN:
-            return None
-        length = float(np.exp(point.logs[1]))
-        if margin > BEYOND or LENGTHS * length <= 1.2 * margin:
-            return point, curves, columns
-        margin = min(LENGTHS * length, np.pi)  # they reach further
-        starts = [point.logs]
+    turns = np.minimum(travel + 2 * BEYOND, 2 * np.pi) / (2 * np.pi)
+    cycles = min(FINEST, COLUMNS * max(len(joints), 6) / 2 / np.sum(turns[joints]))
+    counts = np.maximum(cycles * turns, 1).astype(int)
+    curves = tuple(Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), int(counts[j])) for j in joints)
+    columns = series(curves, q, slopes)
+    beside = given(columns, curves)
+    size = CURVES["transmission size"][0]
+    starts = [beside.at(np.array([*np.log([size, length]), *plain.logs])) for length in STARTS]
+    start = min(starts, key=lambda point: point.value)
+    point = beside.optima([start.logs], ACCURACY, start)[0]
+    return (point, curves, columns) if plain.value - point.value > GAIN else None
 
 
 def _integrated(evidence: Evidence, columns: Array, point: Point) -> Evidence:

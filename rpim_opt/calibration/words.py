@@ -249,11 +249,11 @@ def _scales(learned: Learned) -> dict[str, list[str]]:
     for name, size in learned.sizes.items():
         if name in DEFLECTIONS:
             deflections.append(f"{DEFLECTIONS[name]} {_figure(size, 1e3 * EXPECTED, 'mrad')}")
-        elif name not in (*SESSIONS.values(), BASE, EXPANSION, "transmission"):
+        elif name not in (*SESSIONS.values(), BASE, EXPANSION):
             groups.append(f"{name} {_figure(size, 1.0, 'x' if groups else 'x the stated one')}")
     if learned.curves is not None:
-        ripple, waves = (_figure(size, 1e3, "mrad") for size in (learned.curves.size, learned.curves.waves))
-        curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad; slow component {waves}")
+        ripple = _figure(learned.curves.size, 1e3, "mrad")
+        curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad")
     return {
         "Estimated prior scale": groups,
         "Estimated scale of model extensions": deflections,

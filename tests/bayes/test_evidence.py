@@ -137,8 +137,8 @@ def test_posterior_and_derivatives_beside_a_spectrum(count: int) -> None:
     plain = hierarchy([0, 0, 0] + [-1] * count, [True, True] + [False] * (1 + count), ("a",))
     spectrum = Spectrum(np.geomspace(1.0, 900.0, count), np.full(count, 2e-8))
     evidence = Evidence(linearized(1, 6, 3 + count), replace(plain, spectrum=spectrum), NOISE)
-    logs = evidence.centre + 0.4 * np.random.default_rng(1).normal(size=7)
-    sides = [(evidence.at(logs + s), evidence.at(logs - s)) for s in 1e-5 * np.eye(7)]
+    logs = evidence.centre + 0.4 * np.random.default_rng(1).normal(size=6)
+    sides = [(evidence.at(logs + s), evidence.at(logs - s)) for s in 1e-5 * np.eye(6)]
     found = evidence.at(logs)
     R, y = dense(evidence, logs)
     X = evidence.data.X

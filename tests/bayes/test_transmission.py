@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.evidence import Hierarchy
+from rpim_opt.bayes.evidence import WAVES, WAVES_LENGTH, Hierarchy
 from rpim_opt.bayes.hyperparameters import spectrum_of
 from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration import words
@@ -109,12 +109,12 @@ def test_coefficients_stand_for_ripple_and_waves(travel):
     nothing = np.zeros((0, count))
     spectrum = spectrum_of([curve], np.ones(count))
     prior = Hierarchy(np.full(count, -1), free, (), np.zeros((0, 0)), 3.0, free, nothing, np.zeros(0), spectrum)
-    variances = prior.variances(np.log([3e-4, 0.05, 2e-4]))[0]
+    variances = prior.variances(np.log([3e-4, 0.05]))[0]
     apart = np.array([0.02, 0.1, 0.3])
     columns = series([curve], np.append(0.0, apart)[:, None], np.ones((4, 1)))
     found = (columns[1:] - columns[0]) ** 2 @ variances
     expected = 0.0
-    for size, length in ((3e-4, 0.05), (2e-4, 1.0)):
+    for size, length in ((3e-4, 0.05), (WAVES, WAVES_LENGTH)):
         r = np.sqrt(3) * apart / length
         expected = expected + 2 * size**2 * (1 - (1 + r) * np.exp(-r))
     np.testing.assert_allclose(found, expected, rtol=0.05)
