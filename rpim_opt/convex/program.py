@@ -372,8 +372,6 @@ class Program(Brief):
                 b = np.concatenate([self.squared.triangle[:, -1], np.sqrt(weight) * form.c])
                 z = z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
             estimate = self._at(z, weight)
-        elif self.structure.joint:
-            estimate = self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False)
         else:
             estimate = self._by_structure(weight, damping, accuracy)
         return replace(estimate, seconds=time.perf_counter() - begin)
@@ -447,7 +445,11 @@ class Program(Brief):
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
-        z = optimum.x[self.structure.canonical.at]
+        penalty, loss = self.structure.canonical, self.structure.loss
+        z = optimum.x[penalty.at]
+        if self.structure.joint and loss is not None and optimum.rest is not None:  # own variables as they are there
+            values = loss.canonical.value(optimum.rest) + self.model.offset, penalty.value(optimum.x)
+            self._values[z.tobytes(), weight] = values
         if weight == 0 and damping is None and not self.structure.constrained:  # what the data do not see stays nominal
             _, s, V = self.model.svd
             z = z - V[s == 0].T @ (V[s == 0] @ z)

@@ -259,7 +259,8 @@ class Structure:
             return Canonical.box(self.penalty_form, *self.box)
         penalty = self.answers.penalty_of_z
         with self._lock:
-            return Canonical(cp.Constant(0.0) if penalty is None else penalty, self.answers.flat, self.answers.z)
+            constant = cp.Constant(0.0) if penalty is None else penalty
+            return Canonical(constant, self.answers.flat, self.answers.z, self.joint)
 
     @cached_property
     def loss(self) -> Loss | None:
@@ -267,7 +268,7 @@ class Structure:
         if self.loss_form is not None:
             return None
         with self._lock:
-            return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms)
+            return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms, self.joint)
 
     # --- values ------------------------------------------------------------------------------------------------
 
@@ -277,12 +278,13 @@ class Structure:
         return not self._declared and bool(self.answers.owned(self.answers.loss.expression, self.answers.penalty_of_z))
 
     @cached_property
-    def joint(self) -> bool:
-        """Whether the loss shares variables with penalty or constraints: then they are one program."""
+    def joint(self) -> list[cp.Variable]:
+        """The variables of their own that the loss shares with penalty or constraints."""
         if self._declared:
-            return False
+            return []
         a = self.answers
-        return bool(a.owned(a.loss.expression) & a.owned(a.penalty_of_z, *a.flat))
+        shared = a.owned(a.loss.expression) & a.owned(a.penalty_of_z, *a.flat)
+        return [v for v in a.loss.expression.variables() if v.id in shared]
 
     def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
         """Return loss and penalty at numbers; variables of the functions' own are at their best."""

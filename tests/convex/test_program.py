@@ -77,6 +77,58 @@ def test_a_solution_is_that_of_the_written_problem(name: str, constraints: tuple
         assert ours.iterations == 0
 
 
+def joint(name: str) -> ro.Formulation:
+    """A formulation whose loss shares variables of its own with the penalty or with constraints."""
+    slack, slacks = cp.Variable(nonneg=True), cp.Variable(N, nonneg=True)
+    shift, threshold, square = cp.Variable(3), cp.Variable(), cp.Variable((2, 2), PSD=True)
+
+    def inequality(z: Any, p: Any) -> Any:
+        return cp.bmat([[square[0, 0] - 1e-4, z[0]], [z[0], square[1, 1] - 1e-4]]) >> 0
+
+    kinds: dict[str, dict[str, Any]] = {
+        "slack": {
+            "loss": lambda r: cp.sum(cp.huber(r, 1.5)) + 5 * slack,
+            "constraints": (lambda z, p: cp.norm(z) <= 0.2 + slack,),
+        },
+        "slacks": {
+            "loss": lambda r: cp.sum_squares(r) + 3 * cp.sum(slacks),
+            "penalty": cp.norm1,
+            "constraints": (lambda z, p: [cp.abs(z) <= 0.1 + slacks, cp.sum(slacks) <= 2],),
+        },
+        "norms": {
+            "loss": lambda v: threshold + cp.sum(cp.pos(v - threshold)) / 5,
+            "loss_over": "configuration",
+            "constraints": (lambda z, p: threshold <= 1.0,),
+        },
+        "shift": {
+            "loss": lambda r: cp.norm1(r - shift[0]),
+            "penalty": lambda z: cp.norm(z[:3] - shift) + cp.norm1(z),
+            "constraints": (lambda z, p: cp.sum(shift) == 0.1,),
+        },
+        "matrix": {
+            "loss": lambda r: cp.sum_squares(r) + 10 * cp.trace(square),
+            "constraints": (inequality,),
+        },
+    }
+    return ro.Formulation(name, **{"penalty": cp.sum_squares, **kinds[name]})
+
+
+@pytest.mark.parametrize("name", ["slack", "slacks", "norms", "shift", "matrix"])
+def test_variables_that_loss_and_constraints_share_have_one_value(name: str) -> None:
+    program = ro.convex.pose(joint(name), MODEL)
+    for weight, estimate in zip([10.0, 0.1], program.path([10.0, 0.1]), strict=True):
+        written = program.problem(weight)
+        least = float(written.solve(solver=cp.CLARABEL, tol_gap_rel=1e-9, tol_gap_abs=1e-9))
+        A, b = program.rows
+        loss, penalty = program.structure.values(estimate.z, A @ estimate.z - b, weight)
+        assert estimate.objective == pytest.approx(least, rel=1e-7)
+        assert loss + weight * penalty == pytest.approx(least, rel=1e-7)
+        assert program.violation(estimate.z) <= 1e-7
+        theirs = np.concatenate([np.empty(0), *[np.ravel(each.dual_value) for each in written.constraints[1:]]])
+        ours = np.concatenate([np.empty(0), *estimate.duals])
+        assert np.abs(ours) == pytest.approx(np.abs(theirs), abs=1e-4 * (1 + np.abs(theirs).max()))
+
+
 def test_a_written_problem_is_parametrized_with_parameters_of_the_users_own_too() -> None:
     price, radius = cp.Parameter(nonneg=True, value=2.0), cp.Parameter(nonneg=True, value=0.5)
     mine = ro.Formulation(

@@ -24,8 +24,8 @@ from rpim_opt.convex.rules.selection import (
 
 PARTS = 100
 """Configurations up to which each is left out alone, where each takes solving; of more, so many parts are left out."""
-COARSE = 12
-"""Weights with which a search for the least error begins, where each takes solving."""
+COARSE, FOLDS = 12, 10
+"""Weights with which a search for the least error begins, where each takes solving, and the parts that tell where."""
 DROPPED = 1e-13
 """Added to what a configuration leaves to itself: below, nothing else decides it."""
 
@@ -48,11 +48,16 @@ def leave_one_out(program: Program) -> Selection:
     mixed = form is not None and not form.diagonal  # a square then belongs to no configuration
     if program.closed_form and not mixed:
         return linear_rule(program, "leave_one_out", _of_squares(program), "smallest leave-one-out error")
-    return _least(program, "leave_one_out", held_out_error(program, _singly(program)))
+    return _least(
+        program,
+        "leave_one_out",
+        held_out_error(program, _singly(program)),
+        held_out_error(program, _drawn(program, FOLDS)),
+    )
 
 
 @on_squares
-def k_fold(program: Program, folds: int = 10, seed: int = 0, parts: Sequence[np.ndarray] | None = None) -> Selection:
+def k_fold(program: Program, folds: int = FOLDS, seed: int = 0, parts: Sequence[np.ndarray] | None = None) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole (Stone 1974); any formulation.
 
     ``folds`` parts are drawn with ``seed``; or ``parts`` are the numbers (k,) of the configurations that are left out
@@ -105,20 +110,20 @@ def two_step(program: Program) -> Selection:
     if program.closed_form and program.squared is program.model:
         score = np.sqrt(_of_squares(program)(fine) / len(program.model.b))
     else:
-        score = held_out_error(program, _singly(program))(fine)
+        score = held_out_error(program, _drawn(program, FOLDS))(fine)
     note = "the paper's two steps: residual norm, then held-out error"
     edge = "; the held-out error is smallest at an edge of the ten weights, so a wider range of weights may be better"
     return choice("two_step", fine, score, int(np.nanargmin(score)), note, at_edge=note + edge)
 
 
-def _least(program: Program, name: str, error: Score) -> Selection:
-    """Return the choice of the least error of configurations held out."""
+def _least(program: Program, name: str, error: Score, begin: Score | None = None) -> Selection:
+    """Return the choice of the least error of configurations held out; a cheaper one tells where to ``begin``."""
     if program.closed_form:
         weights = weight_grid(program)
         score = error(weights)
         best = int(np.argmin(score))
     else:
-        weights, score, best = searched(error, weight_grid(program, COARSE))
+        weights, score, best = searched(error, weight_grid(program, COARSE), begin)
     return choice(name, weights, score, best, "smallest k-fold cross-validation error")
 
 

@@ -98,8 +98,6 @@ Score = Callable[[Array], Array]
 """From weights (K,) to what a rule compares, (K,)."""
 
 
-SAME_SCORE = 1e-4
-"""Scores that differ by no more, relative, tell no weights apart."""
 SAME_WEIGHT = 1.1
 """Ratio of weights up to which a search does not tell them apart."""
 
@@ -198,28 +196,40 @@ def grid_of(form: Ridge, count: int = 200) -> Array:
     return np.geomspace(1e-4 * s[-1] ** 2, 10 * s[0] ** 2, count)
 
 
-def least_between(score: Score, weights: Array, best: int) -> tuple[float, float]:
-    """Return the weight of smallest score between the neighbours of the best grid point, and that score."""
+def least_between(score: Score, weights: Array, best: int, ratio: float = 1 + 1e-6) -> tuple[float, float]:
+    """Return the weight of smallest score between the neighbours of the best grid point, and that score.
+
+    It is known to a ``ratio`` of weights.
+    """
     low, high = np.log(weights[[best - 1, best + 1]])
-    minimum = minimize_scalar(
-        lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": 1e-6}
-    )
+    with np.errstate(invalid="ignore"):  # of scores where the solver failed
+        minimum: Any = minimize_scalar(
+            lambda t: score(np.exp([t]))[0], bounds=(low, high), method="bounded", options={"xatol": np.log(ratio)}
+        )
     return float(np.exp(minimum.x)), float(minimum.fun)
 
 
-def searched(score: Score, grid: Array) -> tuple[Array, Array, int]:
-    """Return weights (K,), their scores and the index of the smallest, from a coarse grid refined around the best.
+def searched(score: Score, grid: Array, begin: Score | None = None) -> tuple[Array, Array, int]:
+    """Return weights (K,), their scores and the index of the smallest, known to a ratio of `SAME_WEIGHT`.
 
-    It ends where the neighbours' scores do not differ from the best's, or their weights hardly from its own; or where
-    a score is NaN: there the solver failed.
+    A coarse grid tells where to search: by the scores, or by cheaper ones, ``begin``.
     """
-    weights, scores = np.array(grid), score(grid)
+    tried: dict[float, float] = {}
+
+    def recorded(weights: Array) -> Array:
+        scores = score(weights)
+        tried.update(zip(weights.tolist(), scores.tolist(), strict=True))
+        return np.where(np.isnan(scores), np.inf, scores)
+
+    last = len(grid) - 2
+    centre = int(np.clip(np.nanargmin((begin or recorded)(grid)), 1, last))
     while True:
+        if grid[centre] not in tried:
+            recorded(grid[[centre]])
+        least_between(recorded, grid, centre, SAME_WEIGHT)
+        weights = np.array(sorted(tried))
+        scores = np.array([tried[weight] for weight in weights])
         best = int(np.nanargmin(scores))
-        around = scores[max(best - 1, 0) : best + 2]
-        flat = not np.ptp(around) > SAME_SCORE * np.max(np.abs(around))
-        if not 0 < best < len(weights) - 1 or flat or weights[best + 1] <= SAME_WEIGHT * weights[best - 1]:
+        centre += int(best == len(weights) - 1) - int(best == 0)
+        if 0 < best < len(weights) - 1 or not 1 <= centre <= last:
             return weights, scores, best
-        between = np.sqrt(weights[best - 1 : best + 1] * weights[best : best + 2])
-        weights = np.insert(weights, [best, best + 1], between)
-        scores = np.insert(scores, [best, best + 1], score(between))

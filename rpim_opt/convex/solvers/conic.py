@@ -32,9 +32,16 @@ ATTEMPTS: tuple[Attempt, ...] = (
 """What is tried in turn: where one factorization stalls, another does not."""
 EQUILIBRATED: Attempt = (
     ("equilibrate_enable", True),
-    *((f"tol_{each}", SOUGHT) for each in ("gap_abs", "gap_rel", "feas")),
+    ("tol_gap_abs", SOUGHT),
+    ("tol_gap_rel", SOUGHT),
+    ("tol_feas", 0.1 * SOUGHT),  # relative to the largest residual, an outlier's perhaps
 )
 """Settings for the rows of a loss, which come as they are: a quarter fewer iterations."""
+LOOSE: Attempt = (
+    ("equilibrate_enable", True),
+    *((f"reduced_tol_{each}", 5e-8) for each in ("gap_abs", "gap_rel", "feas")),
+)
+"""Settings for a distance that may be zero, where progress ends early."""
 CURVED = 1e-14
 """Eigenvalues of P below this part of the largest are rounding."""
 DENSE = 4e5
@@ -50,13 +57,16 @@ MOST_ACTIVE_SETS = 8
 class Canonical:
     """minimize 1/2 x'P x + q'x + offset subject to b - A x in K, where ``x[at]`` is the variable of the functions.
 
+    ``x[shared]`` are the entries of own variables that another form has, too.
+
     Rows of a cone and columns that CVXPY added are scaled to unit size: a solver's tolerances are absolute, and
     constraints may be stated in metres.
     """
 
     own = False  # whether the functions have variables of their own
+    shared = np.zeros(0, dtype=int)
 
-    def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any):
+    def __init__(self, objective: Any, constraints: Sequence[Any], variable: Any, shared: Sequence[Any] = ()):
         from cvxpy.reductions.solvers.conic_solvers.clarabel_conif import dims_to_solver_cones
         from scipy import sparse
 
@@ -67,12 +77,15 @@ class Canonical:
             v.save_value(None)
         anchor = [] if variable.id in present else [variable == cp.Variable(variable.shape)]
         objective, cones = _in_one_cone(objective)
-        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor, *cones])
+        copies = [cp.Variable(each.size) for each in shared]  # of a variable with attributes there is no column
+        same = [copied == cp.vec(each, order="F") for copied, each in zip(copies, shared, strict=True)]
+        problem = cp.Problem(cp.Minimize(objective), [*constraints, *anchor, *cones, *same])
         self._chain: Any
         data, self._chain, self._inverse = problem.get_problem_data(cp.CLARABEL, solver_opts={})
         self.size = len(data["c"])
         self._columns = data["param_prob"].var_id_to_col
-        self.at = self._columns[variable.id] + np.arange(variable.size)
+        self.at, *others = [self._columns[each.id] + np.arange(each.size) for each in (variable, *copies)]
+        self.shared = np.concatenate([self.shared, *others])
         dims = data["dims"]
         self.cones = dims_to_solver_cones(dims)
         self.zero = int(dims.zero)
@@ -422,12 +435,11 @@ class ReducedProgram:
 class _ConicData:
     """Clarabel's data of a small program. Unknowns are those of the penalty, R z - y, and those of the loss.
 
-    Rows: R z - s = y, those of the penalty and of the loss, and what the loss gets: v = A z - b, or for norms
-    (v_k, A_k z - b_k) in a second-order cone each.
+    Rows: R z - s = y, those of the penalty and of the loss, what the loss gets: v = A z - b, or for norms
+    (v_k, A_k z - b_k) in a second-order cone each, and that variables which both have are the same.
     """
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
-
         clarabel = import_module("clarabel")
         cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
         top, size = k + len(p.b), p.size + k
@@ -451,8 +463,13 @@ class _ConicData:
                 cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
                 entries += [(first, size + loss.at, -np.ones(len(first)))]
             dense += [_block(links, p.at)]
+            same = links[-1] + 1 + np.arange(len(loss.shared))
+            if len(same):
+                cones += [clarabel.ZeroConeT(len(same))]
+                entries += [(same, size + loss.shared, loss.column_scale[loss.shared])]
+                entries += [(same, p.shared, -p.column_scale[p.shared])]
             self._links = links - top
-            self._bounds = np.pad(loss.b, (0, int(links[-1]) + 1 - begin))
+            self._bounds = np.pad(loss.b, (0, int(links[-1]) + 1 - begin + len(same)))
             top += len(self._bounds)
             size += loss.size
         self._dense, self._entries, self._shape = dense, entries, (top, size)
@@ -526,7 +543,8 @@ def nearest(p: Canonical, z: Array) -> Array:
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
     flat = sparse.csc_matrix((N + 1, N + 1))
-    solution = Clarabel([*p.linear_cones, cone]).solve(flat, np.append(np.zeros(N), 1.0), A, bound)
+    clarabel = Clarabel([*p.linear_cones, cone], (*ATTEMPTS, LOOSE))
+    solution = clarabel.solve(flat, np.append(np.zeros(N), 1.0), A, bound)
     return np.array(solution.x)[p.at]
 
 

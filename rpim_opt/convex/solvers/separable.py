@@ -9,6 +9,7 @@ sqrt(v^2 + h^2) of norms, with a falling width h; then the rows near a kink are 
 from __future__ import annotations
 
 import threading
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -341,11 +342,12 @@ def gram(A: Array, weights: Array) -> Array:
 class Loss:
     """A loss f(v) that is no square, of residuals v (M,), or where ``positive`` of configurations' norms.
 
-    Where it is ``separable``, f(v) = sum_i f_i(v_i); with a ``threshold`` t min_t rate t + sum_i f_i(v_i, t).
+    Where it is ``separable``, f(v) = sum_i f_i(v_i); with a ``threshold`` t min_t rate t + sum_i f_i(v_i, t). It has
+    ``shared`` own variables with penalty or constraints.
     """
 
-    def __init__(self, expression: Any, variable: Any, positive: bool):
-        self.expression, self.variable, self.positive = expression, variable, positive
+    def __init__(self, expression: Any, variable: Any, positive: bool, shared: Sequence[Any] = ()):
+        self.expression, self.variable, self.positive, self.shared = expression, variable, positive, shared
         self.quadratic = bool(expression.is_qpwa())  # piecewise, of what is piecewise affine
         self.entries: Any = None
         self.threshold: Any = None
@@ -354,7 +356,7 @@ class Loss:
         own = [v for v in expression.variables() if v.id != variable.id]
         if not own:
             self.entries = _summands(expression, variable)
-        elif len(own) == 1 and own[0].shape == () and not any(own[0].attributes.values()):
+        elif len(own) == 1 and own[0].shape == () and not (shared or any(own[0].attributes.values())):
             self.entries, self.threshold = _summands(expression, variable), own[0]
             self.rate = self._rate(expression)
             if not np.isfinite(self.rate):
@@ -368,7 +370,7 @@ class Loss:
     @cached_property
     def canonical(self) -> Canonical:
         """The loss in canonical form."""
-        return Canonical(self.expression, [], self.variable)
+        return Canonical(self.expression, [], self.variable, self.shared)
 
     @cached_property
     def _evaluated(self) -> Evaluation:
