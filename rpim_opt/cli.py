@@ -40,7 +40,6 @@ acceptance inconclusive.
 
 
 def _others() -> dict[str, Any]:
-    """Return commands that other packages have, as entry points by name."""
     return {each.name: each for each in entry_points(group="rpim_opt.commands")}
 
 
@@ -807,7 +806,6 @@ def main() -> None:
 
 @cache
 def _command() -> Any:
-    """Return what typer makes of the commands above."""
     return typer.main.get_command(app)
 
 

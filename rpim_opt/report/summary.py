@@ -95,7 +95,6 @@ def _figures(what: str, errors: Array, unit: Unit = "mm") -> dict[str, Any]:
 
 
 def _kinds(data: Dataset) -> dict[str, list[int]]:
-    """Return the rows of every measurement type."""
     kinds: dict[str, list[int]] = {}
     for block in data.blocks:
         kinds.setdefault(block.measurement.name, []).extend(block.row.tolist())

@@ -93,7 +93,6 @@ class Instance(Tabled):
         return f"'{shortened(self.record.title)}' {self.problem._short()}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return the identified parameters."""
         return self.problem.parameters.free._frame_rows()
 
     def _notes(self) -> list[str]:

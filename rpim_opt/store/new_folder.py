@@ -72,7 +72,6 @@ class Started:
     understood: Understanding
 
     def __str__(self) -> str:
-        """Return the files and the sentences."""
         lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
         then = f"Check {self.folder / 'problem.toml'}, then run: rpim-opt inspect {self.folder}"
         return "\n".join([f"Created: {self.folder}", *lines, *self.notes, then])
@@ -414,5 +413,4 @@ def _frame(place: Array) -> str:
 
 
 def _key(text: str) -> str:
-    """Return a TOML key."""
     return text if re.fullmatch(r"[\w-]+", text, re.ASCII) else toml(text)

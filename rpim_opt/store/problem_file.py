@@ -310,7 +310,6 @@ def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> Descr
 
 
 def _board(table: ProblemTable, path: Path) -> Board | None:
-    """Return what a camera sees: the points of a table, or of a grid."""
     if table.target is None:
         return None
     if isinstance(table.target, str):

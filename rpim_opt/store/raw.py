@@ -78,7 +78,6 @@ class Understanding:
         return len(next(iter(self.columns.values())))
 
     def __str__(self) -> str:
-        """Return the table of column meanings, and the sentences."""
         parts = []
         for each in self.tables:
             rows = [["column", "meaning", "name here", "unit", "why"]]

@@ -156,7 +156,6 @@ class OwnTerm(NamedTuple):
     columns: dict[str, str]
 
     def __str__(self) -> str:
-        """Return it in words."""
         columns = [f"column {name} ({dimension or 'no unit'})" for name, dimension in self.columns.items()]
         return f"a term of the {self.at} ({', '.join([*self.parameters, *columns]) or 'without parameters'})"
 

@@ -91,7 +91,6 @@ class Compensation:
     limit: float = np.inf
 
     def __str__(self) -> str:
-        """Return the errors as a table, the largest corrections, and the rows that keep an error by name."""
         figures = []
         for name, values in {
             "position [mm], nominal command": self.position_before,

@@ -77,7 +77,6 @@ class Performance(Tabled):
         return csv_text(rows[0], [["" if value is None else value for value in row.values()] for row in rows])
 
     def __str__(self) -> str:
-        """Return the figures as tables, without what no pose has."""
         rows = self._frame_rows()
         parts = []
         for unit in ("_mm", "_mrad"):

@@ -117,7 +117,6 @@ class Monitoring:
         return csv_text(self._columns(), zip(*self._columns().values(), strict=True))
 
     def __str__(self) -> str:
-        """Return the verdict, what shows it, and the largest figures."""
         count = f"{len(self.label)} checks"
         lines = [f"The robot deviates from its calibration in {count}." if self.drifts else f"No drift in {count}."]
         if self.beyond:

@@ -61,7 +61,6 @@ class Fit(NamedTuple):
         return self.probability >= FALSE_ALARM
 
     def __str__(self) -> str:
-        """Return the figures."""
         return f"chi-squared {self.squares:.1f} of {self.equations}, p-value {self.probability:.2g}"
 
 
@@ -89,7 +88,6 @@ class Moved(NamedTuple):
     std: float
 
     def __str__(self) -> str:
-        """Return it in mm or degrees."""
         figures = self.content()
         return f"{self.name} {figures['change']:+.4g} {figures['unit']} (standard deviation {figures['std']:.2g})"
 
@@ -144,7 +142,6 @@ class Update:
         }
 
     def __str__(self) -> str:
-        """Return the verdict, what moved, and the causes that were weighed."""
         count = f"{self.readings} readings"
         if self.changes:
             verdict = "The robot has changed" if self.changed else "The robot has not changed, but readings are wrong"

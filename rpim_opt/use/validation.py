@@ -92,7 +92,6 @@ class Validation:
         return columns_csv(self._rows())
 
     def __str__(self) -> str:
-        """Return the errors as a table, and the rows beyond their uncertainty by name."""
         content = self.content()
         figures = {"nominal": content["nominal"], "identified": content["identified"]}
         for axis, of_axis in content["axes"].items():
