@@ -18,22 +18,13 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
+from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import headline_errors
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
-from rpim_opt.calibration.words import (
-    HEADER,
-    curve_columns,
-    noise_sentence,
-    rotated,
-    touch_errors,
-    touch_rows,
-    turned_frames,
-    weight_lines,
-)
 from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
@@ -177,10 +168,10 @@ def _accuracy(content: Content) -> Iterator[Block]:
     if angles:
         yield "table", Table("Orientation error [mrad]", head, summary.cells(angles, "mrad"))
     for name, data in summary.sets(result).items():
-        touched = touch_errors(data, result.nominal_errors(data), result.errors(data))
+        touched = words.touch_errors(data, result.nominal_errors(data), result.errors(data))
         if touched:
             caption = f"{name.capitalize()}, distance of touches from their point [mm]"
-            yield "table", Table(caption, HEADER, touch_rows(touched))
+            yield "table", Table(caption, words.HEADER, words.touch_rows(touched))
     name, data = next(iter(summary.sets(result).items()))
     yield "figures", [_error_figure(result, name, data)]
     if content.map is not None:
@@ -279,7 +270,7 @@ def _parameters(content: Content) -> Iterator[Block]:
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in held:
             name += ", at its bound"
-        if rotated(row):
+        if words.rotated(row):
             name += " *"
         expanded = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
@@ -288,8 +279,8 @@ def _parameters(content: Content) -> Iterator[Block]:
     if not np.isfinite(tolerance).any():
         head = head[:-1]
         rows = [row[:-1] for row in rows]
-    yield "text", weight_lines(result)
-    yield "text", [note, *turned_frames(result)]
+    yield "text", words.weight_lines(result)
+    yield "text", [note, *words.turned_frames(result)]
     own = np.array(free.dimensions)[~free.of_frames & ~free.of_curves]
     drawn = []
     for dimension in ("length", "angle"):
@@ -308,7 +299,7 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     yield "heading", "Transmission errors of the joints"
     text = "The actual joint angle is the encoder value plus this error; outside the measured range it is unknown."
     yield "text", [text]
-    yield "table", Table("Within the measured range", *curve_columns(result))
+    yield "table", Table("Within the measured range", *words.curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
     drawn = []
@@ -337,7 +328,7 @@ def _diagnostics(content: Content) -> Iterator[Block]:
 
 
 def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
-    yield "text", [*noise_sentence(result), *composition]
+    yield "text", [*words.noise_sentence(result), *composition]
     rows = []
     what = ""
     if len(summary.sets(result)) > 1:

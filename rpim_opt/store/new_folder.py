@@ -11,20 +11,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from rpim_opt.basics import files
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, in_file
-from rpim_opt.basics.files import (
-    make_folder,
-    read_bytes,
-    read_text,
-    read_toml,
-    scratch_folder,
-    sha256_of,
-    undoing,
-    write_bytes,
-    write_files,
-    write_text,
-)
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import Columns, csv_text
 from rpim_opt.basics.text import joined
@@ -147,13 +136,13 @@ def new_problem(
             identification=identified, columns=how, data=paths[0].name, validation=validated, held_out=held.any(),
             seed=seed, validated_by=next((file.name for file in later), ""),
             assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
-            raw={str(file) if several else file.name: sha256_of(file) for file in supplied},
+            raw={str(file) if several else file.name: files.sha256_of(file) for file in supplied},
             reading=replace(understanding.options, joints=arm.names).texts(),
         )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
     contents["problem.toml"] = before + text.encode()
     if before:
-        write_files({folder / name: content for name, content in contents.items()})
+        files.write_files({folder / name: content for name, content in contents.items()})
     else:
         _write_whole(folder, contents, arm, source, bool(chain))
     assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
@@ -178,8 +167,8 @@ def _remarks(arm: Described, source: Path, understanding: Understanding) -> Iter
             f"at {placed(arm.tool)}: transform points of the table's frame by it."
         )
     dof = arm.robot.dof
-    known = [f"q{i}" for i in range(dof + 1, dof + 9)]
-    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in known]
+    beyond = {f"q{i}" for i in range(dof + 1, dof + 9)}
+    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in beyond]
     if further:
         yield (
             f"Ignored joint values: {joined(further)}. The robot ({arm.robot.source or arm.robot.name}) has "
@@ -197,26 +186,27 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
         raise InputError("--chain", f"'{chain}'", "a name of letters, digits and _")
     if not folder.exists() and not folder.is_symlink():
         return b""
-    known = read_toml(folder / "problem.toml").get("chain", {}) if chain and (folder / "problem.toml").is_file() else {}
+    stated = folder / "problem.toml"
+    known = files.read_toml(stated).get("chain", {}) if chain and stated.is_file() else {}
     if not known:
         raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
     if chain in known:
         raise InputError("--chain", f"'{chain}', which exists", "a unique name for every chain", folder)
-    if read_bytes(folder / ROBOT_OF_CHAINS) != read_bytes(robot):
+    if files.read_bytes(folder / ROBOT_OF_CHAINS) != files.read_bytes(robot):
         raise InputError("the robot", f"another one than {ROBOT_OF_CHAINS}", "the same URDF for all chains", robot)
-    return read_bytes(folder / "problem.toml")
+    return files.read_bytes(stated)
 
 
 def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: Described, source: Path, chains: bool) -> None:
     """Write a new folder with its robot beside its place, and move it there when it is whole."""
     with ExitStack() as stack:
-        make_folder(folder.parent, stack.enter_context(undoing()))
-        made = stack.enter_context(scratch_folder(folder)) / folder.name
-        write_files({made / name: content for name, content in contents.items()})
+        files.make_folder(folder.parent, stack.enter_context(files.undoing()))
+        made = stack.enter_context(files.scratch_folder(folder)) / folder.name
+        files.write_files({made / name: content for name, content in contents.items()})
         if chains:
-            write_bytes(made / ROBOT_OF_CHAINS, read_bytes(source))
+            files.write_bytes(made / ROBOT_OF_CHAINS, files.read_bytes(source))
         elif source.suffix == ".toml":
-            write_text(made / "robot.toml", read_text(source))  # with its comments
+            files.write_text(made / "robot.toml", files.read_text(source))  # with its comments
         else:
             write_robot(arm.robot, made / "robot.toml")
         made.rename(folder)

@@ -22,15 +22,7 @@ from rpim_opt.calibration.verdict import misread
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.use.recalibration import (
-    Cause,
-    Misfit,
-    Moved,
-    candidates,
-    posterior_as_prior,
-    previous_deviations,
-    with_data,
-)
+from rpim_opt.use import recalibration
 
 FALSE_ALARM = 0.01  # probability that a robot that does not drift is said to
 TESTS = 3  # each check alone, their sum, and every parameter: each test may err by a third of `FALSE_ALARM`
@@ -47,10 +39,10 @@ class Drift(NamedTuple):
     ``moved`` is by how much a single parameter moved in all; None for a frame.
     """
 
-    cause: Cause
+    cause: recalibration.Cause
     first: int
     steady: bool
-    moved: Moved | None
+    moved: recalibration.Moved | None
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
@@ -97,9 +89,7 @@ class Monitoring:
 
     def content(self) -> dict[str, Any]:
         """Return the figures, and the chart's points [mm]."""
-        moved = None
-        if self.drift is not None:
-            moved = {**self.drift.content(), "label": self.label[self.drift.first]}
+        drift = self.drift
         return {
             "drifts": self.drifts,
             "checks": len(self.label),
@@ -107,7 +97,7 @@ class Monitoring:
             "alarm": None if self.alarm is None else self.label[self.alarm],
             "since": None if self.alarm is None else self.label[self._since(self.alarm)],
             "limit": self.limit,
-            "moved": moved,
+            "moved": None if drift is None else {**drift.content(), "label": self.label[drift.first]},
             "mistake": self.mistake,
             "rows": records(self._columns()),
         }
@@ -155,15 +145,9 @@ class Monitoring:
         return f"{self.label[i]} ({self.times[i]})" if self.times else f"'{self.label[i]}'"
 
     def _columns(self) -> dict[str, Sequence[Any]]:
-        columns: dict[str, Sequence[Any]] = {"label": self.label}
-        if self.times:
-            columns["time"] = self.times
-        figures = {
-            "error_mm": 1e3 * self.error,
-            "sigmas": self.sigmas,
-            "allowed_sigmas": self.allowed,
-            "sum": self.sums,
-        }
+        columns: dict[str, Sequence[Any]] = {"label": self.label, **({"time": self.times} if self.times else {})}
+        figures = {"error_mm": 1e3 * self.error, "sigmas": self.sigmas, "allowed_sigmas": self.allowed}
+        figures["sum"] = self.sums
         return columns | {name: [round(value, 6) for value in values.tolist()] for name, values in figures.items()}
 
 
@@ -200,7 +184,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     if when is not None:
         visit = np.unique(when, return_inverse=True)[1]
     visits = np.unique(np.stack([visit, data.configuration]), axis=1, return_inverse=True)[1].ravel()
-    problem = with_data(result, replace(data, configuration=visits))
+    problem = recalibration.with_data(result, replace(data, configuration=visits))
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
@@ -235,7 +219,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     C = np.pad(np.where(np.outer(known, known), C, 0.0), (0, len(own)))
     C[n:, n:] = np.diag(own**2)
     m = np.zeros(len(C))
-    residual, slopes = problem.slopes(previous_deviations(result, problem))
+    residual, slopes = problem.slopes(recalibration.previous_deviations(result, problem))
     readings = noise_covariances(problem, result.variance_factor).reading
     rows: dict[int, tuple[Array, Array]] = {}
     for (block, part), V in zip(by_block(problem, np.column_stack([residual, slopes])), readings, strict=True):
@@ -244,8 +228,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     freedom = max(result.freedom, 1.0)
     sigmas = np.zeros(len(rows))
     p_values = np.ones(len(rows))
-    for t in range(len(rows)):
-        equations, V = rows[t]
+    for t, (equations, V) in sorted(rows.items()):
         J = equations[:, 1:]
         S = J @ C @ J.T + V
         e = equations[:, 0] - J @ m
@@ -286,13 +269,13 @@ def cusum_limit(count: int, level: float) -> float:
 
 def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Drift | None:
     """Return the change that explains checks best; None where chance does, over all changes that were tried."""
-    model = problem.linearize(previous_deviations(result, problem))
-    penalty = posterior_as_prior(result, problem).penalty
+    model = problem.linearize(recalibration.previous_deviations(result, problem))
+    penalty = recalibration.posterior_as_prior(result, problem).penalty
     form: Quadratic = getattr(penalty, "quadratic", None) or identity(model.A.shape[1])
     # rows of one configuration were read together: the first of them says when
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
-    misfit = Misfit(result, model, form)
+    misfit = recalibration.Misfit(result, model, form)
     count = len(problem.data)
     moments = np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(int))
     courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
@@ -300,7 +283,7 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
         courses.append((0, True, when / (count - 1)))
     free = problem.parameters.free
     tried = []
-    for cause in candidates(free):
+    for cause in recalibration.candidates(free):
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])
         for start, steady, course in courses:
@@ -308,8 +291,8 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
             g, G = misfit.projected(slice(misfit.m), misfit.A[:, index] * course[:, None])
             moved = None
             if len(g) == 1 and G[0, 0] > 0:
-                std = scale / np.sqrt(G[0, 0])
-                moved = Moved(cause.name, free.dimensions[index[0]], float(scale * g[0] / G[0, 0]), float(std))
+                change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
+                moved = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
             tried.append(Drift(misfit.evidence(cause, g, G), start, steady, moved))
     best = min(tried, key=lambda drift: (drift.cause.p_value, -drift.cause.gain))
     return best if best.cause.p_value * len(tried) < level else None
