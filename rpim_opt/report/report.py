@@ -14,7 +14,7 @@ import numpy as np
 from scipy.special import stdtrit
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.exceptions import InputError, NoSolutionFound, RpimError
+from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
@@ -124,10 +124,8 @@ def _headline(content: Content) -> Iterator[Block]:
         ("Maximum error, identified", "after", mm(after["max_mm"]), f"of {after['count']} rows"),
     ]
     if content.map is not None:
-        sure = percent(content.map.requirement.confidence)
-        cards.append(
-            ("Expanded uncertainty U", "after", mm(1e3 * content.map.largest), f"{sure}, maximum over the region")
-        )
+        note = f"{percent(content.map.requirement.confidence)}, maximum over the region"
+        cards.append(("Expanded uncertainty U", "after", mm(1e3 * content.map.largest), note))
     yield "cards", cards
 
 
@@ -187,9 +185,8 @@ def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
         named = " and ".join(sorted({name.rpartition("_")[2] for name in units}))
         lines.append(f"The maximum U is at joints {', '.join(values)} {named}.")
     if found.repeatability is not None and not found.reasons:
-        lines.append(
-            f"Repeatability alone, with all parameters known: {1e3 * found.repeatability:.3f} mm of the maximum U."
-        )
+        least = f"{1e3 * found.repeatability:.3f} mm of the maximum U."
+        lines.append(f"Repeatability alone, with all parameters known: {least}")
     return lines
 
 
@@ -220,12 +217,11 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         drawn.append(figure(draw, title, f"{view.capitalize()}.{frame}", height))
     yield "figures", drawn
     units = joint_columns(map_.region.problem.robot.joint_dimensions)
-    ranges = [
-        [*name.split("_"), f"{low / si:.2f}", f"{high / si:.2f}"]
-        for (name, si), (low, high) in zip(units.items(), map_.region.limits, strict=True)
-    ]
-    ranges_table = ("table", Table("Joint ranges of the region", ["joint", "unit", "from", "to"], ranges))
-    yield "beside", [("table", _budget(map_, result)), ranges_table]
+    ranges = []
+    for (name, si), ends in zip(units.items(), map_.region.limits, strict=True):
+        ranges.append([*name.split("_"), *(f"{end / si:.2f}" for end in ends)])
+    joints = Table("Joint ranges of the region", ["joint", "unit", "from", "to"], ranges)
+    yield "beside", [("table", _budget(map_, result)), ("table", joints)]
 
 
 def _budget(map_: Workspace, result: Calibration) -> Table:
@@ -261,24 +257,18 @@ def _parameters(content: Content) -> Iterator[Block]:
         t = f"Student's t with {result.freedom:.0f} effective degrees of freedom"
         note = f"U = k u is the expanded uncertainty ({k}, 95 %, {t}), from measurement noise and prior."
     tolerance = plot.active_tolerance(result)
-    held = {each.name for each in result.active_bounds}
+    at_bound = {each.name for each in result.active_bounds}
+    columns = len(head) - (not np.isfinite(tolerance).any())
     rows = []
     for i, row in enumerate(result.parameter_rows()):
         if free.of_curves[i]:
             continue
         _, si = display(free.dimensions[i])
-        name = f"{row['name']} [{row['unit']}]"
-        if row["name"] in held:
-            name += ", at its bound"
-        if words.rotated(row):
-            name += " *"
+        marks = f"{', at its bound' * (row['name'] in at_bound)}{' *' * words.rotated(row)}"
         expanded = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
-        rows.append([name, *figures, expanded, bound])
-    if not np.isfinite(tolerance).any():
-        head = head[:-1]
-        rows = [row[:-1] for row in rows]
+        rows.append([f"{row['name']} [{row['unit']}]{marks}", *figures, expanded, bound][:columns])
     yield "text", words.weight_lines(result)
     yield "text", [note, *words.turned_frames(result)]
     own = np.array(free.dimensions)[~free.of_frames & ~free.of_curves]
@@ -288,7 +278,7 @@ def _parameters(content: Content) -> Iterator[Block]:
             draw = partial(plot.parameters, result, dimension)
             title, caption = f"Deviations of the {dimension} parameters", f"The robot's {dimension} parameters."
             drawn.append(figure(draw, title, caption, 80.0 + 17 * np.count_nonzero(own == dimension)))
-    yield "beside", [("table", Table("Identified parameters", head, rows)), ("figures", drawn)]
+    yield "beside", [("table", Table("Identified parameters", head[:columns], rows)), ("figures", drawn)]
     yield from _transmission(result)
 
 
@@ -335,10 +325,9 @@ def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
         yield "figures", [_error_figure(result, "identification", result.problem.data)]
     for name, data in summary.sets(result).items():
         what, vectors = summary.signed_errors(result, data)
-        if len(vectors["after"]):
-            for i, axis in enumerate("xyz"):
-                means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
-                rows.append([f"{name}, {axis}", *means])
+        for i, axis in enumerate("xyz" if len(vectors["after"]) else ""):
+            means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
+            rows.append([f"{name}, {axis}", *means])
     if rows:
         caption = f"{what}, mean ± standard deviation [mm]"
         yield "table", Table(caption, ["data, axis", "nominal", "identified"], rows)
@@ -374,17 +363,10 @@ def _flagged(result: Calibration) -> Block:
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
-    if result.learned is not None:
-        rows += [
-            [
-                row.label,
-                "",
-                "" if row.error is None else mm(1e3 * row.error),
-                f"excluded outlier, {row.ratio:.0f} x the median error",
-            ]
-            for row in result.learned.left_out
-            if row.label not in result.record.excluded
-        ]
+    for row in () if result.learned is None else result.learned.left_out:
+        if row.label not in result.record.excluded:
+            error = "" if row.error is None else mm(1e3 * row.error)
+            rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} x the median error"])
     if not rows:
         return "text", ["No row is flagged or excluded (one in a hundred good data sets has a flagged row)."]
     head = ["row", "standardized residual", "error [mm]", "status"]
@@ -392,19 +374,15 @@ def _flagged(result: Calibration) -> Block:
 
 
 def _convergence(result: Calibration) -> Iterator[Block]:
-    try:
-        c = result.certificate
-        text = (
-            f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
-            f"violation {c.violation:.2g} (in prior standard deviations)."
-        )
-    except RpimError as error:
-        text = f"No certificate. {error}"
+    c = result.certificate
+    text = (
+        f"Certificate at the solution: next step of the convex program {c.step:.2g}, constraint "
+        f"violation {c.violation:.2g} (in prior standard deviations)."
+    )
     yield "text", [result.message, text]
-    rows = [
-        [str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"]
-        for k, it in enumerate(result.history, start=1)
-    ]
+    rows = []
+    for k, it in enumerate(result.history, start=1):
+        rows.append([str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"])
     yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 
@@ -443,9 +421,8 @@ def _provenance(content: Content) -> Iterator[Block]:
 
 def _changes(each: Earlier) -> str:
     changes = ", ".join(each.released) or "no detectable change"
-    if each.prior_inflation != 1:
-        changes += f"; standard deviations times {each.prior_inflation:g}"
-    return changes
+    widened = f"; standard deviations times {each.prior_inflation:g}" if each.prior_inflation != 1 else ""
+    return changes + widened
 
 
 def _robot(name: str, robot: Robot) -> str:
@@ -460,11 +437,13 @@ FEW_NUMBERS = 8
 def _formulation(result: Calibration) -> str:
     """Return what is minimized, in the terms of the result's file."""
 
+    def argument(value: Any) -> str:
+        long = isinstance(value, list | tuple) and len(value) > FEW_NUMBERS
+        return f"{len(value)} rows" if long else str(value)
+
     def term(part: Any) -> str:
         if isinstance(part, list):
-            long = [isinstance(each, list | tuple) and len(each) > FEW_NUMBERS for each in part]
-            texts = [f"{len(each)} rows" if cut else str(each) for each, cut in zip(part, long, strict=True)]
-            return f"{texts[0]}({', '.join(texts[1:])})"
+            return f"{argument(part[0])}({', '.join(map(argument, part[1:]))})"
         return part or "a function of a script, not stored in the file"
 
     parts = definition(result.formulation)
@@ -478,10 +457,9 @@ def _noise(block: Rows) -> str:
     """Return the stated standard deviations by component, as a range where rows differ."""
     spread = np.sqrt(np.einsum("nii->ni", block.covariance))
     components: dict[str, list[str]] = {}
-    for i, (name, dimension) in enumerate(block.measurement.components.items()):
+    for (name, dimension), sigmas in zip(block.measurement.components.items(), spread.T, strict=True):
         unit, si = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}.get(dimension, ("", 1.0))
-        low = spread[:, i].min() / si
-        high = spread[:, i].max() / si
+        low, high = sigmas.min() / si, sigmas.max() / si
         value = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
         components.setdefault(f"{value} {unit}".strip(), []).append(name)
     return "; ".join(f"{value} ({', '.join(names)})" for value, names in components.items())
@@ -494,16 +472,13 @@ L_CURVE_HEIGHT = 430.0
 
 
 def _regularization(content: Content) -> Iterator[Block]:
+    """Yield the L-curve, and the choice of every rule with the resulting mean error."""
     result = content.result
     formulation = result.formulation
     # with an earlier result as the prior, weight 1 joins two sets of data: no other weight has a meaning
     has_path = formulation.penalty is not None and formulation.solvable and not result.record.earlier
-    if has_path and result.weight > 0:
-        yield from _weight(result)
-
-
-def _weight(result: Calibration) -> Iterator[Block]:
-    """Yield the L-curve, and the choice of every rule with the resulting mean error."""
+    if not has_path or not result.weight > 0:
+        return
     by_user = Selection(result.weight, "given", np.array([]), np.array([]), True)
     chosen = {**compare(result.program), result.selector: result.selection or by_user}
     chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))

@@ -75,8 +75,7 @@ def signed_errors(result: Calibration, data: Dataset) -> tuple[str, dict[str, Ar
     what = "Measured minus modelled along the axes of the instrument"
     if any(block.measurement.touching for block in data.blocks):  # there is no instrument
         what = "Mean of the point minus touch along the axes of the robot's base"
-    before = 1e3 * result.error_vectors(data, nominal=True)
-    after = 1e3 * result.error_vectors(data)
+    before, after = (1e3 * result.error_vectors(data, nominal=nominal) for nominal in (True, False))
     finite = np.isfinite(after).all(axis=1)
     return what, {"before": before[finite], "after": after[finite]}
 
@@ -121,11 +120,9 @@ def workspace_sentence(found: Workspace) -> str:
 
 def acceptance(result: Calibration) -> Acceptance | None:
     """Return the verdict on the requirement of a result's record; None without a requirement."""
-    if result.record.requirement is None:
-        return None
     from rpim_opt.calibration.acceptance import accept
 
-    return accept(result)
+    return None if result.record.requirement is None else accept(result)
 
 
 # --- sentences ---------------------------------------------------------------------------------------------
@@ -205,10 +202,9 @@ def warnings(result: Calibration) -> list[str]:
 
 def nominal_note(result: Calibration) -> str:
     """Return a note that defines the nominal errors."""
-    fitted = result.problem.parameters.placed & result.problem.parameters.identified
-    if fitted.any():
-        return "Nominal: the nominal robot, with its base, tool and other frames fitted to the identification data."
-    return "Nominal: the nominal robot."
+    fitted = (result.problem.parameters.placed & result.problem.parameters.identified).any()
+    frames = ", with its base, tool and other frames fitted to the identification data" if fitted else ""
+    return f"Nominal: the nominal robot{frames}."
 
 
 # --- documents ---------------------------------------------------------------------------------------------

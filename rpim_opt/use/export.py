@@ -81,8 +81,7 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
-    base = np.array([of["base_" + c] for c in FRAME])
-    tool = np.array([of[prefix + c] for c in FRAME])
+    base, tool = (np.array([of[frame + c] for c in FRAME]) for frame in ("base_", prefix))
     return Described(replace(result.robot, joint_map=joint_map), base, tool)
 
 
@@ -126,17 +125,7 @@ def export_files(
     if corrections and any(others) and not transmission_errors(whole):
         notes.append(f"Not written: {corrections.name}, since the calibration has no transmission errors.")
         corrections = None
-    accepted = accept(whole) if whole.record.requirement else None
-    found = accepted.workspace if accepted else measured_workspace(whole)
-    verdict, doubt = result.verdict, inconclusive(whole, found)
-    if accepted:
-        tested = " ".join(["Acceptance of the calibration, whole model:", accepted.sentences()[0], *accepted.reasons])
-        doubt = tested if accepted.verdict == "inconclusive" else ""
-        if accepted.verdict == "accepted":
-            notes.append(tested)
-        elif accepted.verdict == "rejected" and verdict.delivered:
-            verdict = replace(verdict, reasons=(tested,))
-    note = verdict.require(despite_verdict) or doubt
+    note, remarks, undecided = _judged(whole, result, despite_verdict)
     frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
@@ -144,38 +133,55 @@ def export_files(
         (ur_calibration, partial(export_ur_calibration, result)),
         (camera_info, partial(export_camera, result)),
     ]
-    sources = [(source, write) for source, write in corrected if source]
-    if sources and out is None:
-        raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
-    writers: list[Writer] = []
-    for source, write in sources:
-        target = Path(out or "")
-        if len(sources) > 1 or target.is_dir():
-            target = target / source.name
-        if target.resolve() == source.resolve():
-            raise InputError("--out", f"the original, {source}", "another file: the original is not overwritten")
-        writers.append((target, partial(write, source)))
-    plain = [
+    made: list[tuple[Path | None, Callable[[Path], Any]]] = [
         (mdh, partial(_write_table, result, marker, dh)),
         (robodk, lambda target: write_robodk(identified(result, marker).robot, target)),
         (corrections, partial(_write_joint_corrections, whole)),
     ]
-    writers += [(target, write) for target, write in plain if target]
+    writers = _beside([(source, write) for source, write in corrected if source], out)
+    writers += [(target, write) for target, write in made if target]
     if not writers:
         options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
         raise InputError("export", "nothing to write", f"{options}, one or several")
-    undecided = accepted is not None and accepted.verdict == "inconclusive" and verdict.delivered
-    if whole.learned is not None and result is not whole and found is not None:
-        limit = found.requirement.limit if accepted else np.inf
-        less, above = _of_geometry(result, joined(whole.learned.extensions), found, limit)
-        undecided |= above
-        note = " ".join(filter(None, [note, less]))
-        notes.append(
-            "Another point of the flange and its orientation may be known less: `compensate --tool` states their "
-            "uncertainty."
-        )
     messages = write_all(writers, note)
-    return Exported([target for target, _ in writers], [*filter(None, [note]), *notes, *messages], undecided)
+    notes = [*filter(None, [note]), *notes, *remarks, *messages]
+    return Exported([target for target, _ in writers], notes, undecided)
+
+
+def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: Path | None) -> list[Writer]:
+    """Return the writers of corrected files: to ``out``, or of several into that folder."""
+    if sources and out is None:
+        raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
+    place = Path(out or "")
+    writers: list[Writer] = []
+    for source, write in sources:
+        target = place / source.name if len(sources) > 1 or place.is_dir() else place
+        if target.resolve() == source.resolve():
+            raise InputError("--out", f"the original, {source}", "another file: the original is not overwritten")
+        writers.append((target, partial(write, source)))
+    return writers
+
+
+def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], bool]:
+    """Return the note for every file, remarks, and whether what is written is inconclusive; or raise NotDelivered."""
+    accepted = accept(whole) if whole.record.requirement else None
+    found = accepted.workspace if accepted else measured_workspace(whole)
+    verdict, doubt = alone.verdict, inconclusive(whole, found)
+    remarks, undecided = [], False
+    if accepted:
+        tested = " ".join(["Acceptance of the calibration, whole model:", accepted.sentences()[0], *accepted.reasons])
+        doubt = tested if accepted.verdict == "inconclusive" else ""
+        undecided = bool(doubt) and verdict.delivered
+        remarks = [tested] if accepted.verdict == "accepted" else []
+        if accepted.verdict == "rejected" and verdict.delivered:
+            verdict = replace(verdict, reasons=(tested,))
+    note = verdict.require(despite_verdict) or doubt
+    if whole.learned is None or alone is whole or found is None:
+        return note, remarks, undecided
+    limit = found.requirement.limit if accepted else np.inf
+    less, above = _of_geometry(alone, joined(whole.learned.extensions), found, limit)
+    other = "Another point of the flange and its orientation may be known less: `compensate --tool` states their"
+    return " ".join(filter(None, [note, less])), [*remarks, f"{other} uncertainty."], undecided or above
 
 
 def _of_geometry(alone: Calibration, extensions: str, found: Workspace, limit: float) -> tuple[str, bool]:
@@ -237,12 +243,10 @@ def _write_table(result: Calibration, marker: str | None, dh: str, target: Path)
     robot = identified(result, marker).robot
     write_robot(robot, target, dh)
     convention = CONVENTIONS[dh.lower()]
-    alpha, a = robot.mdh[0, :2]
+    alpha, a = 1e3 * robot.mdh[0, :2]
     apart = ""
     if convention == "standard" and (alpha or a):
-        apart = (
-            f" Not in it: alpha1 = {1e3 * alpha:.4g} mrad and a1 = {1e3 * a:.4g} mm, which place axis 1 in the base."
-        )
+        apart = f" Not in it: alpha1 = {alpha:.4g} mrad and a1 = {a:.4g} mm, which place axis 1 in the base."
     return [f"{target.name}: {CONVENTION[convention]}.{apart}"]
 
 
@@ -367,16 +371,15 @@ def _orientation(result: Calibration, marker: str | None) -> list[str]:
 def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path, target: Path) -> list[str]:
     """Write the origins of the joints of all chains, from deviations by the joints' own names."""
     p = result.problem.parameters
-    others = [
-        name for name, x in zip(p.free.names, result.x, strict=True) if x and not own_name(name).startswith(OF_JOINTS)
-    ]
-    refused = [name for name in others if of_joint(name) or name in p.terms]
-    if refused:
-        raise InputError("the calibration", listed(refused, 6), "origins and multipliers: a URDF holds nothing else")
+    moved = [name for name, x in zip(p.free.names, result.x, strict=True) if x]
+    others = [name for name in moved if not own_name(name).startswith(OF_JOINTS)]
+    foreign = [name for name in others if of_joint(name) or name in p.terms]
+    if foreign:
+        raise InputError("the calibration", listed(foreign, 6), "origins and multipliers: a URDF holds nothing else")
     parts: dict[str, Array] = {}
     for prefix in {frame_of(name) for name in of if name.startswith(OF_JOINTS)}:
-        parts_of = ("multiplier", "offset") if prefix.startswith(MIMIC) else FRAME
-        parts[prefix] = np.array([of.get(prefix + part, 0.0) for part in parts_of])
+        numbers = ("multiplier", "offset") if prefix.startswith(MIMIC) else FRAME
+        parts[prefix] = np.array([of.get(prefix + number, 0.0) for number in numbers])
     write_origins(source, parts, target)
     frames = sorted({own_name(name).partition("_")[0] for name in others})
     return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []
