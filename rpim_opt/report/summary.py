@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.text import counted, joined, listed, percent, table
 from rpim_opt.calibration import words
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -18,9 +19,6 @@ from rpim_opt.data.measurements.contact import known_distance, known_parallel, k
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.store.result_file import figures
 from rpim_opt.store.statements import FIELDS
-
-if TYPE_CHECKING:
-    from rpim_opt.calibration.acceptance import Acceptance, Workspace
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")
@@ -120,8 +118,6 @@ def workspace_sentence(found: Workspace) -> str:
 
 def acceptance(result: Calibration) -> Acceptance | None:
     """Return the verdict on the requirement of a result's record; None without a requirement."""
-    from rpim_opt.calibration.acceptance import accept
-
     return None if result.record.requirement is None else accept(result)
 
 
@@ -221,8 +217,6 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         for method, mean in methods.items():
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
-    from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
-
     accepted = acceptance(result)
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
     remarks = [
