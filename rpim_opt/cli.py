@@ -135,6 +135,13 @@ Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's 
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
+Chain = Annotated[str, Option(help="Chain name: makes a problem with a URDF's joint origins, or adds a chain to one.")]
+Source = Annotated[Text, Option(help="Who measured what, when, with which instrument; the files by default.")]
+UrKinematics = Annotated[File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")]
+CONF = "calibration.conf copied from a Universal Robot's controller; corrected file to --out."
+Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")]
+TIP = "The reflector is the tip link: write its identified pose."
+REMAINING = "Largest residual error plus its U (k = 2) [mm]; rows above are marked, exit code 1."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
@@ -213,12 +220,10 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
         add(name, annotation, Tables._field_defaults[name])
     if function.__name__ not in CODELESS:
         add("allow_code", Code, False)
-    if "as_json" not in own:
-        add("as_json", Json, False)
+    add("as_json", Json, False)
 
     @wraps(function)
-    def run(allow_code: bool = False, **values: Any) -> None:
-        as_json = values["as_json"] if "as_json" in own else values.pop("as_json")
+    def run(as_json: bool, allow_code: bool = False, **values: Any) -> None:
         if "tables" in own:
             values["tables"] = Tables(**{name: values.pop(name) for name in Tables._fields})
         answer = function(**values)
@@ -255,12 +260,9 @@ def new(
     seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
-    chain: Annotated[
-        str, Option(help="Chain name: makes a problem with a URDF's joint origins, or adds a chain to one.")
-    ] = "",
+    chain: Chain = "",
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
-    as_json: Json = False,
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
@@ -276,7 +278,7 @@ def new(
             made = ro.store.new_problem(
                 folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
-                understood=None if as_json else lambda found: console.show(f"{found}\n", {}, as_json),
+                understood=None if "--json" in sys.argv else lambda found: console.show(f"{found}\n", {}, False),
             )  # fmt: skip
     document = made.understood.content()
     document["notes"] += made.notes
@@ -341,9 +343,7 @@ def calibrate(
         requirement = console.required(limit, box, instance.record.requirement)
         instance = replace(instance, record=replace(instance.record, requirement=requirement))
         result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
-        without: list[str] = []
-        if drop_outliers:
-            without = [flag.label for flag in result.flagged if flag.label not in result.clustered]
+        without = [flag.label for flag in result.flagged if drop_outliers and flag.label not in result.clustered]
         if without:
             say("calibrating without outliers")
             result = result.without_flagged()
@@ -354,10 +354,8 @@ def calibrate(
         document = summary(result, instance.published)
     text = describe(result, document)
     if drop_outliers:
-        refitted = (
-            f"Refitted without {', '.join(without)}." if without else "No flagged row to drop: nothing was refitted."
-        )
-        text = f"{refitted}\n\n{text}"
+        rows = f"Refitted without {', '.join(without)}" if without else "No flagged row to drop: nothing was refitted"
+        text = f"{rows}.\n\n{text}"
     code = CODES[(document["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
     return Answer(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
@@ -467,9 +465,7 @@ def update(
     tables: Tables = TABLES,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
-    source: Annotated[
-        Text, Option(help="Who measured what, when, with which instrument; the files by default.")
-    ] = None,
+    source: Source = None,
     out: Folder = None,
 ) -> Answer:
     """Recalibrate with the previous result as prior, and report which parameters changed.
@@ -478,11 +474,10 @@ def update(
     """
     with _loaded(result) as (loaded, say):
         read = tables.read(loaded, data)
-        patterns = reset.replace(",", " ").split()
-        source = source or ", ".join(file.name for file in data)
         recalibration = ro.use.update(
-            loaded, read.data, prior_inflation=prior_inflation, reset=patterns, source=source, progress=say
-        )
+            loaded, read.data, prior_inflation=prior_inflation, reset=reset.replace(",", " ").split(),
+            source=source or ", ".join(file.name for file in data), progress=say,
+        )  # fmt: skip
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
     failed = not (recalibration.explained and updated.verdict.delivered)
@@ -513,26 +508,17 @@ def monitor(
 def export(
     result: Result,
     urdf: Annotated[File, Option(help="URDF of the nominal robot; corrected origins go to --out.")] = None,
-    ur_kinematics: Annotated[
-        File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")
-    ] = None,
-    ur_calibration: Annotated[
-        File, Option(help="calibration.conf copied from a Universal Robot's controller; corrected file to --out.")
-    ] = None,
+    ur_kinematics: UrKinematics = None,
+    ur_calibration: Annotated[File, Option(help=CONF)] = None,
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
     mdh: Annotated[File, Option(help="DH table to write: .csv, .json or .toml; convention as --dh says.")] = None,
-    dh: Annotated[
-        str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")
-    ] = "modified",
+    dh: Convention = "modified",
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint (modified DH).")] = None,
     corrections: Annotated[File, Option(help="CSV file for transmission errors, to subtract from commands.")] = None,
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
-    tip_measured: Annotated[
-        bool,
-        Option("--tip-measured", help="The reflector is the tip link: write its identified pose."),
-    ] = False,
+    tip_measured: Annotated[bool, Option("--tip-measured", help=TIP)] = False,
     marker: Marker = None,
     despite_verdict: Despite = False,
 ) -> Answer:
@@ -563,9 +549,7 @@ def compensate(
     base: Annotated[bool, Option("--base", help="Correct for deviations of the base as well.")] = False,
     payload: Annotated[Text, Option(help="Mass at the flange [kg], or mass and centre: kg,x,y,z [mm].")] = None,
     largest: Annotated[float, Option(help="Largest permitted correction of a joint [rad or m].")] = 0.2,
-    limit: Annotated[
-        Number, Option(help="Largest residual error plus its U (k = 2) [mm]; rows above are marked, exit code 1.")
-    ] = None,
+    limit: Annotated[Number, Option(help=REMAINING)] = None,
     out: Table = None,
     despite_verdict: Despite = False,
 ) -> Answer:
@@ -588,9 +572,8 @@ def compensate(
             limit=float("inf") if limit is None else 1e-3 * limit,
         )  # fmt: skip
     document = {**compensation.content(), "limit_mm": limit}
-    return _with_table(compensation, compensation.csv(), out, document)._replace(
-        code=int(bool(compensation.missed)), left_out=left_out
-    )
+    code = int(bool(compensation.missed))
+    return _with_table(compensation, compensation.csv(), out, document, code=code, left_out=left_out)
 
 
 @command
@@ -644,10 +627,9 @@ def design(
             q = ro.problem.random_candidates(replace(posed.robot, limits=limits), candidates, seed)
         chosen = ro.problem.choose(posed, q, count, criterion, progress=say, measured=posed.data if augment else None)
     columns = joint_cells(posed.robot, q[chosen.chosen], chosen.chosen)
-    if table is not None:
-        label = read_columns(table).get("label")
-        if label is not None:
-            columns["label"] = [str(label[k]) for k in chosen.chosen]
+    label = None if table is None else read_columns(table).get("label")
+    if label is not None:
+        columns["label"] = [str(label[k]) for k in chosen.chosen]
     document = {"criterion": criterion, "value": chosen.value, "bound": chosen.bound, "gap": chosen.gap}
     return _with_table(f"{chosen}{where}", columns_csv(columns), out, {**document, "configurations": columns})
 
@@ -661,7 +643,6 @@ def study(
     redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from stored replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
-    as_json: Json = False,
 ) -> Answer:
     """Run a study: replicates in parallel, resumable, with provenance in the results.
 
@@ -669,15 +650,13 @@ def study(
     """
     from rpim_opt.study.studies import regressions, run_study
 
-    with progress_bar(name, not as_json) as say:
+    with progress_bar(name, "--json" not in sys.argv) as say:
         report, folder = run_study(name, quick, workers, resume, redraw, out, progress=say)
-    worse: list[str] = []
-    if gate:
-        worse = regressions(name, quick, report.metrics)
+    worse = regressions(name, quick, report.metrics) if gate else []
     document = {"report": report.text, "metrics": report.metrics, "worse": worse}
     answer = Answer(f"{report.text}\n", document, written=[folder])
     if worse:
-        answer.show(as_json)
+        answer.show("--json" in sys.argv)
         console.fail("\n".join(f"Worse: {line}" for line in worse), 1)
     return answer
 
@@ -697,7 +676,6 @@ def compare(
     workers: Workers = 1,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,
-    as_json: Json = False,
 ) -> Answer:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
@@ -710,7 +688,7 @@ def compare(
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
         counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
-        workers=workers, journal=journal, resume=resume, progress=not as_json,
+        workers=workers, journal=journal, resume=resume, progress="--json" not in sys.argv,
     )  # fmt: skip
     summary = comparison.summary(against=against)
     written: list[Path] = []
@@ -779,10 +757,10 @@ def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]
     return [file]
 
 
-def _with_table(found: object, rows: str, out: Path | None, document: dict[str, Any]) -> Answer:
+def _with_table(found: object, rows: str, out: Path | None, document: dict[str, Any], **more: Any) -> Answer:
     """Return what was found, with its table where no file takes it."""
     text = str(found) if out else f"{found}\n{rows.rstrip()}"
-    return Answer(text, document, written=console.written_to(out, rows))
+    return Answer(text, document, written=console.written_to(out, rows), **more)
 
 
 def _against(limit: float | None, name: str, value: float) -> tuple[list[str], bool | None]:
@@ -793,6 +771,9 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
     return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if within else 'above'} {limit:g} mm."], within
 
 
+_command = cache(lambda: typer.main.get_command(app))
+
+
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
     if not set(LONG).intersection(sys.argv[1:2]):
@@ -801,26 +782,17 @@ def main() -> None:
         gc.set_threshold(GARBAGE_THRESHOLD)
     atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
     with console.arriving():
-        _run()
-
-
-@cache
-def _command() -> Any:
-    return typer.main.get_command(app)
-
-
-def _run() -> None:
-    try:
-        code = _command()(standalone_mode=False)
-        if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
+        try:
+            code = _command()(standalone_mode=False)
+            if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
+                console.fail("Interrupted.", INTERRUPTED)
+            sys.exit(code)
+        except USAGE as error:
+            if "--json" not in sys.argv:
+                error.show()
+                sys.exit(error.exit_code)
+            console.fail(error.format_message(), error.exit_code)
+        except ABORT:
             console.fail("Interrupted.", INTERRUPTED)
-        sys.exit(code)
-    except USAGE as error:
-        if "--json" not in sys.argv:
-            error.show()
-            sys.exit(error.exit_code)
-        console.fail(error.format_message(), error.exit_code)
-    except ABORT:
-        console.fail("Interrupted.", INTERRUPTED)
-    except RpimError as error:
-        console.fail(str(error), next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))
+        except RpimError as error:
+            console.fail(str(error), next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))
