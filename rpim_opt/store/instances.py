@@ -23,7 +23,7 @@ from rpim_opt.convex.arguments import arguments_of
 from rpim_opt.convex.constraints import Box, Parsed
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.rules.selection import Selector
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import Known, KnownAngle, KnownDistance, with_known
 from rpim_opt.data.measurements.measurement import Measurement
@@ -103,9 +103,8 @@ class Instance(Tabled):
 
         ``changes`` are arguments of `calibrate` to use instead: ``weight="reml"``, ``formulation=ro.robust``.
         """
-        settings = {"formulation": self.formulation, "weight": self.weight, "prior": self.prior}
-        settings |= {"model": self.model, "noise": self.noise}
-        return replace(identify.calibrate(self.problem, **{**settings, **changes}), record=self.record)
+        settings = {name: getattr(self, name) for name in ("formulation", "weight", "prior", "model", "noise")}
+        return replace(identify.calibrate(self.problem, **(settings | changes)), record=self.record)
 
 
 def load(
@@ -158,39 +157,23 @@ def load(
         if len(pair) != 2:
             raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
     robot = find_robot(table.robot, path.parent)
-    used = {path.name: path, robot.name: robot}
     named = [file for names in files.values() for file in names]
     if isinstance(table.target, str):
         named.append(table.target)
-    used |= {file: path.parent / file for file in named} | table.prior.files(path)
+    used = {path.name: path, robot.name: robot} | {file: path.parent / file for file in named} | table.prior.files(path)
+    digests = {name: sha256_of(file) for name, file in used.items()}
     record = Record(
-        title=table.title,
-        source=table.source,
-        validation=validation,
-        files={
-            **{name: sha256_of(file) for name, file in used.items()},
-            **{f"{name} (raw data)": digest for name, digest in table.raw.items()},
-        },
-        excluded=table.exclude,
-        simulated=bool(table.simulation),
-        noise_assumed=table.noise_assumed,
-        details=details,
-        requirement=requirement,
-        reading=table.reading,
-        terms=tuple(table.terms) if model is None else (),
-    )
+        title=table.title, source=table.source, validation=validation, excluded=table.exclude,
+        files=digests | {f"{name} (raw data)": digest for name, digest in table.raw.items()},
+        simulated=bool(table.simulation), noise_assumed=table.noise_assumed, details=details, requirement=requirement,
+        reading=table.reading, terms=tuple(table.terms) if model is None else (),
+    )  # fmt: skip
     return Instance(
-        problem=problem,
-        formulation=formulation,
-        weight=named_weight(table.selector, path),
-        prior=prior,
-        model=table.model,
-        noise=table.repeatability if isinstance(table.repeatability, str) else "declared",
-        record=record,
+        problem, formulation, named_weight(table.selector, path), prior, table.model,
+        noise=table.repeatability if isinstance(table.repeatability, str) else "declared", record=record,
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
-        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
-        held_out=table.held_out,
-    )
+        reference={key: (value, spread) for key, (value, spread) in table.reference.items()}, held_out=table.held_out,
+    )  # fmt: skip
 
 
 def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
@@ -231,8 +214,7 @@ def _also_of_folders(
         if not isinstance(problem, Instance):
             return function(problem, *arguments, **options)
         bound = signature(function).bind(problem.problem, *arguments, **options).arguments
-        del bound["problem"]
-        return problem.calibrate(**bound)
+        return problem.calibrate(**{name: value for name, value in bound.items() if name != "problem"})
 
     return calibrate
 
@@ -336,15 +318,14 @@ def _require_enough(data: Dataset) -> None:
     """Refuse points and planes with too few touches to be informative."""
     blocks = [(block, block.touched) for block in data.blocks if block.touched is not None]
     joined = {name for block, rows in blocks if not block.measurement.touching for names in rows for name in names}
-    count: Counter[str] = Counter()
-    last: dict[str, tuple[Block, str]] = {}
+    touches: dict[str, list[tuple[str, bool]]] = {}  # label and whether a plane is touched, by what is
     for block, rows in blocks:
-        if block.measurement.touching:
-            count.update(names[0] for names in rows)
-            last |= {names[0]: (block, data.label[i]) for i, names in zip(block.row, rows, strict=True)}
-    for name, touches in count.items():
-        block, label = last[name]
-        least, column = (4, "plane") if block.measurement.planar else (2, "point")
-        if touches < least - (name in joined):
+        for i, names in zip(block.row, rows, strict=True):
+            if block.measurement.touching:
+                touches.setdefault(names[0], []).append((data.label[i], block.measurement.planar))
+    for name, those in touches.items():
+        label, planar = those[-1]
+        least, column = (4, "plane") if planar else (2, "point")
+        if len(those) < least - (name in joined):
             accepted = f"{least} or more, one less where a [[known_distance]] or [[known_angle]] joins it to another"
-            raise InputError(f"row {label}, column {column}", f"'{name}' touched {touches} times", accepted)
+            raise InputError(f"row {label}, column {column}", f"'{name}' touched {len(those)} times", accepted)

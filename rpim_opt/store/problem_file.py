@@ -100,11 +100,6 @@ class FrameTable(Table):
     ry: Angle = 0.0
     rz: Angle = 0.0
 
-    @property
-    def numbers(self) -> tuple[float, ...]:
-        """The six numbers [m, rad]."""
-        return tuple(getattr(self, c) for c in FRAME)
-
 
 class RepeatabilityTable(Table):
     """Known repeatability of the robot."""
@@ -316,7 +311,7 @@ def _board(table: ProblemTable, path: Path) -> Board | None:
         return read_board(inside(path.parent, table.target, "key target", path))
     pattern = validate(GridTable, table.target, path, "target")
     try:
-        return grid_board(pattern.columns, pattern.rows, pattern.spacing)
+        return grid_board(**dict(pattern))
     except InputError as error:
         raise InputError("key target", error.found, error.accepted, path) from None
 
@@ -337,12 +332,11 @@ def stated_repeatability(table: ProblemTable, path: Path) -> Repeatability | Non
             accepted = choices(table.repeatability, LEARNED_NOISE) + ", or a table"
             raise InputError("key repeatability", f"'{table.repeatability}'", accepted, path)
         return None
-    numbers = validate(RepeatabilityTable, table.repeatability, path, "repeatability")
-    return Repeatability(numbers.position, numbers.orientation, numbers.joint)
+    return Repeatability(**dict(validate(RepeatabilityTable, table.repeatability, path, "repeatability")))
 
 
 def _frame(table: Any, where: str, path: Path) -> tuple[float, ...]:
     """Return the six numbers [m, rad] of a frame's table."""
     if not isinstance(table, dict):
         raise InputError(f"key {where}", repr(table)[:60], "a table with x_mm, ..., rz_deg", path)
-    return validate(FrameTable, table, path, where).numbers
+    return tuple(dict(validate(FrameTable, table, path, where)).values())

@@ -65,12 +65,8 @@ class Constraints(Table):
 
     def all(self, robot: Robot, data: Dataset) -> tuple[Constraint, ...]:
         """Return the constraint functions for a problem with this robot and identification data."""
-        boxes = (
-            (self.at_nominal, at_nominal),
-            (self.positive, partial(signed, 1)),
-            (self.negative, partial(signed, -1)),
-        )
-        made = [make(*patterns) for patterns, make in boxes if patterns]
+        made = [at_nominal(*self.at_nominal)] if self.at_nominal else []
+        made += [signed(sign, *names) for sign, names in ((1, self.positive), (-1, self.negative)) if names]
         places: dict[str, Any] = {MEASURED: _rows(data, None)}
         for name, table in self.places.items():
             where = f"key constraints.places.{name}"
@@ -96,9 +92,8 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     if set(values) not in ({"q"}, set(joints)):
         accepted = "x_mm, y_mm and z_mm of a box, all joints' q1_deg, ..., q_deg of all joints, or rows = [labels]"
         raise InputError(where, ", ".join(table) or "nothing", accepted)
-    joints_of_place = values["q"] if "q" in values else [values[name] for name in joints]
     try:
-        q = np.array(joints_of_place, dtype=float)
+        q = np.array(values["q"] if "q" in values else [values[name] for name in joints], dtype=float)
     except ValueError:
         raise InputError(where, "lists of different lengths", f"{robot.dof} joint values per configuration") from None
     q = q.reshape(-1, q.shape[-1] if q.ndim else 1)
@@ -177,15 +172,10 @@ def stated_prior(
         matches = [name for name in parameters.names if fits(name, stem)]
         if stem == JOINT_OFFSET or stem in parameters.names or (matches and all(map(is_joint_offset, matches))):
             offsets[key] = value
+    numbers: Any = {name: float(getattr(table, name)) for name in ("tails", "joint_offset", "frames")}
+    groups = tuple(tuple(group.split()) for group in table.groups)
     try:
-        prior = Prior(
-            centre=table.centre,
-            scale={**offsets, **table.scale},
-            tails=float(table.tails),
-            groups=tuple(tuple(group.split()) for group in table.groups),
-            joint_offset=float(table.joint_offset),
-            frames=float(table.frames),
-        )
+        prior = Prior(centre=table.centre, scale={**offsets, **table.scale}, groups=groups, **numbers)
     except InputError as error:
         raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
     files = table.files(path)
@@ -247,27 +237,17 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
     joints = _joints(robot)
     pair = Annotated[list[float] | None, Field(min_length=2, max_length=2)]
     known = dict.fromkeys(BOX, ("length",)) | joints
-    sides_of: dict[str, Any] = {name: (Annotated[pair, dimension], None) for name, (dimension,) in known.items()}
-    schema: type[Table] = create_model(
-        "Acceptance",
-        __base__=Table,
-        limit=(Length, ...),
-        confidence=(float, CONFIDENCE),
-        marker=(str, ""),
-        **sides_of,
-    )
+    fields: dict[str, Any] = {name: (Annotated[pair, dimension], None) for name, (dimension,) in known.items()}
+    fields |= {"limit": (Length, ...), "confidence": (float, CONFIDENCE), "marker": (str, "")}
+    schema: type[Table] = create_model("Acceptance", __base__=Table, **fields)
     keys = dict(validate(schema, table, path, "acceptance"))
-    sides = {name: (keys[name][0], keys[name][1]) for name in (*BOX, *joints) if keys[name] is not None}
+    sides = {name: (keys[name][0], keys[name][1]) for name in known if keys[name] is not None}
     axes = [axis for axis in BOX if axis in sides]
     if axes and len(axes) < len(BOX):
         raise InputError("table acceptance", f"{', '.join(axes)} alone", "x_mm, y_mm and z_mm of a box, or none", path)
-    return Requirement(
-        limit=keys["limit"],
-        box=(sides["x"], sides["y"], sides["z"]) if axes else None,
-        joints=tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX),
-        marker=keys["marker"],
-        confidence=keys["confidence"],
-    )
+    box = (sides["x"], sides["y"], sides["z"]) if axes else None
+    ranges = tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX)
+    return Requirement(keys["limit"], box, ranges, keys["marker"], keys["confidence"])
 
 
 # --- places of anchors, planes, spheres --------------------------------------------------------------------------
