@@ -141,8 +141,9 @@ def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]
     own = place_fixtures(stated.placed, nothing)
     entries = {}
     for block in blocks:
-        named = {of_fixture(name, block.fixture): of for name, of in block.measurement.parameters.items()}
-        entries |= {name: (dimension, own.get(name, 0.0)) for name, dimension in named.items()}
+        for name, dimension in block.measurement.parameters.items():
+            whole = of_fixture(name, block.fixture)
+            entries[whole] = dimension, own.get(whole, 0.0)
     base = (0.0,) * 6 if stated.base is None else stated.base
     return fixtures, stated.chosen(model_parameters(stated.robot, base, stated.tools, entries), nothing)
 
@@ -218,15 +219,15 @@ class _Table:
             errors = self._errors(block)
             if self.noisy:
                 values[block.row] = kind.plus(block.y, errors)
-        wrong: list[str] = []
-        if self.noisy and self.plan.blunders:  # moved by the length of a blunder, in random directions
-            hit = self.rng.choice(len(values), self.plan.blunders, replace=False)
-            lengths = [i for i, dimension in enumerate(kind.columns.values()) if dimension == "length"]
-            direction = self.rng.normal(size=(len(hit), len(lengths)))
-            direction /= np.linalg.norm(direction, axis=1, keepdims=True)
-            values[hit[:, None], np.array(lengths)] += self.plan.blunder * direction
-            wrong = [columns["label"][i] for i in sorted(hit.tolist())]
-        return columns | self._values(values), wrong
+        if not self.noisy or not self.plan.blunders:
+            return columns | self._values(values), []
+        # moved by the length of a blunder, in random directions
+        hit = self.rng.choice(len(values), self.plan.blunders, replace=False)
+        lengths = [i for i, dimension in enumerate(kind.columns.values()) if dimension == "length"]
+        direction = self.rng.normal(size=(len(hit), len(lengths)))
+        direction /= np.linalg.norm(direction, axis=1, keepdims=True)
+        values[hit[:, None], np.array(lengths)] += self.plan.blunder * direction
+        return columns | self._values(values), [columns["label"][i] for i in sorted(hit.tolist())]
 
     def _touching(self, problem: CalibrationProblem, wanted: Array) -> Array:
         """Return joint values (N, dof) at which a constraint's residuals are the wanted ones (N,) [m]."""
@@ -258,9 +259,8 @@ class _Table:
         columns = {"label": [f"c{k}{''.join(m) * several}{f * (len(self.fixtures) > 1)}" for k, m, f in rows]}
         if several:
             columns["configuration"] = [str(k) for k, _, _ in rows]
-        if self.markers != ("",):
-            for i, prefix in enumerate(PREFIXES[:points]):
-                columns[f"{prefix}marker"] = [row[1][i] for row in rows]
+        for i, prefix in enumerate(PREFIXES[:points] if self.markers != ("",) else ()):
+            columns[f"{prefix}marker"] = [row[1][i] for row in rows]
         if self.fixtures != ("",):
             columns["fixture"] = [fixture for _, _, fixture in rows]
         return columns, [k for k, _, _ in rows]
@@ -297,10 +297,9 @@ class _Table:
 
     def _seen(self, count: int) -> Columns:
         """Return a camera's table: configurations in which it sees its whole board, and where every point appears."""
-        definition, plan = self.stated, self.plan
-        if definition.board is None:
+        definition, plan, board = self.stated, self.plan, self.stated.board
+        if board is None:
             raise InputError("key target", "nothing", "the points of the board that the camera sees", definition.path)
-        board = definition.board
         names = list(board)
         joints = list(joint_columns(definition.robot.joint_dimensions))
         one = self._read(on_board({"point": names[:1], **{n: ["0"] for n in ("u_px", "v_px", *joints)}}, board))
@@ -310,8 +309,7 @@ class _Table:
         q = visible_configurations(world, points, count, self.rng, self.x, plan.joint_share, (width, height))
         table: Columns = {"label": [f"v{k}/{name}" for k in range(count) for name in names], "point": names * count}
         table |= self._joints(np.repeat(q, len(names), axis=0)[:, None], CAMERA_DIGITS)
-        empty = {name: ["0"] * len(table["label"]) for name in ("u_px", "v_px")}
-        data = self._read(on_board({**table, **empty}, board))
+        data = self._read(on_board({**table, **dict.fromkeys(("u_px", "v_px"), ["0"] * len(table["label"]))}, board))
         y = world.on(data).modelled(self.x)[0] + self._errors(data.blocks[0])
         return {**table, "u_px": [f"{u:.4f}" for u in y[:, 0]], "v_px": [f"{v:.4f}" for v in y[:, 1]]}
 
@@ -328,8 +326,8 @@ class _Table:
         things = {name: np.tile(np.array(place, dtype=float) / 1e3, (each, 1)) for name, place in points.items()}
         things |= {name: self._on(square, each) for name, square in planes.items()}
         names = [name for name in things for _ in range(each)]
-        table = {"label": [f"{name}_{i}" for name in things for i in range(each)]}
-        table |= {"plane" if planes else "point": names}
+        labels = [f"{name}_{i}" for name in things for i in range(each)]
+        table = {"label": labels, "plane" if planes else "point": names}
         turn = np.arange(len(names)) % len(markers)
         if len(markers) > 1:
             table["marker"] = [markers[k] for k in turn.tolist()]
