@@ -207,19 +207,18 @@ def update(
     """
     say = progress or (lambda text: None)
     problem = with_data(result, data)
-    released: tuple[str, ...] = ()
-    if reset:
-        free = problem.parameters.free
-        matches = matching(free, reset, "update, reset")
-        released = tuple(name for name, new in zip(free.names, matches, strict=True) if new)
+    free = problem.parameters.free
+    matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
+    released = tuple(np.array(free.names)[matches].tolist())
     say("comparing with the last calibration")
     # a frame that was reset may be anywhere: then it is registered anew
     start = None if released else previous_deviations(result, problem)
-    updated = _recalibrated(result, problem, released, prior_inflation, start)
-    first, before = _weighed(result, updated, released)
-    causes, after = first, before
     changes: list[Cause] = []
+    weighings: list[tuple[tuple[Cause, ...], Fit]] = []
     while True:
+        updated = _recalibrated(result, problem, released, prior_inflation, start)
+        causes, after = _weighed(result, updated, released)
+        weighings.append((causes, after))
         # the most probable of the causes that chance does not explain
         cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
         if cause is None:
@@ -233,8 +232,8 @@ def update(
             problem = problem.without(set(cause.members))
         else:
             released += cause.members
-        updated = _recalibrated(result, problem, released, prior_inflation, updated.x)
-        causes, after = _weighed(result, updated, released)
+        start = updated.x
+    first, before = weighings[0]
     robots = " and ".join(robot.name for robot in result.problem.arms.values())
     if not after.likely:
         # another unit or order explains them, or they are further off than the robot ever was uncalibrated
@@ -242,24 +241,21 @@ def update(
         furthest = float(np.nanmax(result.nominal_errors()))
         missed = float(np.sqrt(np.nanmean(updated.errors(data) ** 2)))
         if missed > STRANGE * furthest:
-            accepted = f"those of the same robot ({robots}) in the same units and instrument's frame, or --reset "
-            accepted += "with what moved (base_*)"
+            same = f"those of the same robot ({robots}) in the same units and instrument's frame"
             found = f"readings {1e3 * missed:.3g} mm off, whichever parameters change"
-            raise InputError("the new measurements", found, accepted)
-    old, new = result.problem.parameters.free, updated.problem.parameters.free
+            raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     was, now = (  # values: of a frame that was registered again, deviations refer to another orientation
         dict(zip(each.problem.parameters.names, parameter_values(each.problem, each.x), strict=True))
         for each in (result, updated)
     )
     moved = []
-    for name in released:
-        if name in old.names:
-            i = new.names.index(name)
-            std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
-            change = float(now[name] - was[name])
-            if new.dimensions[i] == "angle":
-                change = float(np.angle(np.exp(1j * change)))
-            moved.append(Moved(name, new.dimensions[i], change, float(std)))
+    for name in [name for name in released if name in result.problem.parameters.free.names]:
+        i = free.names.index(name)
+        std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
+        change = now[name] - was[name]
+        if free.dimensions[i] == "angle":
+            change = np.angle(np.exp(1j * change))
+        moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = result.record
     last = Earlier(
@@ -334,13 +330,10 @@ def _recalibrated(
     if learned is not None:
         more = problem.parameters.free.scale[len(learned.stated) :]
         learned = replace(
-            learned,
-            left_out=(),
-            notes=(),
-            drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
-            stated=np.append(learned.stated, more),
+            learned, left_out=(), notes=(), stated=np.append(learned.stated, more),
             local=np.append(learned.local, np.ones(len(more))),
-        )
+            drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
+        )  # fmt: skip
     return replace(updated, learned=learned, asked=partial(calibrate, formulation=formulation, weight=1.0))
 
 
@@ -451,8 +444,7 @@ def _log_bayes_factor(g: Array, G: Array, width: Array) -> float:
         ln p(y | d ~ N(0, W^2)) / p(y | 0) = (g' (G + W^-2)^-1 g - ln det(I + W G W)) / 2
     """
     logs = []
-    for size in SIZES:
-        W = size * width
+    for W in [size * width for size in SIZES]:
         inner = np.eye(len(g)) + W[:, None] * G * W
         squares = (W * g) @ np.linalg.solve(inner, W * g)
         logs.append(0.5 * (squares - np.linalg.slogdet(inner)[1]))
