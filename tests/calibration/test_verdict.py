@@ -13,7 +13,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.verdict import worse_than_nominal
 from rpim_opt.store import load_result, save_result
-from rpim_opt.store.serialize import digest
+from rpim_opt.store.result_file import digest
 from tests.calibration.mistakes import IN_TABLES, coupled, joints, simulated_arm, values
 from tests.simulate import simulated
 from tests.test_cli import run

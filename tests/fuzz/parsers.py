@@ -27,7 +27,7 @@ from rpim_opt.robot.chain import Described
 from rpim_opt.robot.library import find_robot
 from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
 from rpim_opt.store.raw import understand_of, usual_noise
-from rpim_opt.store.serialize import digest
+from rpim_opt.store.result_file import digest
 
 TWO = ro.robot.Robot("two", np.array([[0.0, 0, 0, 0.3, 0], [1.5, 0.4, 0, 0, 0]]))
 IDENTITY = np.zeros(6)

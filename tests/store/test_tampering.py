@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.store.serialize import digest
+from rpim_opt.store.result_file import digest
 
 
 @pytest.fixture(scope="module")
