@@ -161,11 +161,8 @@ class NoSolutionFound(RpimError):
         self.status = status
         self.conflict = conflict
         self.advice = advice
-        why = (
-            (str(conflict) if conflict else "")
-            or advice
-            or "use another weight, or add constraints that bound the solution"
-        )
+        contradiction = str(conflict) if conflict else ""
+        why = contradiction or advice or "use another weight, or add constraints that bound the solution"
         super().__init__(
             f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; {why}."
         )

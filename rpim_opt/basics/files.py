@@ -38,12 +38,11 @@ def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str]
     try:
         status = path.stat()
     except FileNotFoundError:
-        near: list[str] = []
+        accepted = "an existing file"
         with suppress(OSError):
             near = sorted(p.name for p in path.parent.iterdir() if p.suffix in endings)
-        raise InputError(
-            "the file", "nothing", choices(path.name, near) if near else "an existing file", path
-        ) from None
+            accepted = choices(path.name, near) if near else accepted
+        raise InputError("the file", "nothing", accepted, path) from None
     except (OSError, ValueError) as error:  # a name with a zero byte is a ValueError
         raise InputError("the file", str(error), "a readable file", path) from None
     if not stat.S_ISREG(status.st_mode):

@@ -6,12 +6,12 @@ import os
 import threading
 from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
-from functools import lru_cache, wraps
+from contextlib import ContextDecorator
+from functools import lru_cache
 from typing import Any, TypeVar
 
 from threadpoolctl import ThreadpoolController
 
-Function = TypeVar("Function", bound=Callable[..., Any])
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
 _worker = threading.local()
@@ -42,11 +42,6 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
         return list(pool.map(function, waiting))
 
 
-_lock = threading.Lock()
-_inside = 0
-_limit: Any = None
-
-
 @lru_cache(maxsize=1)
 def _controller() -> ThreadpoolController:
     import scipy.linalg  # noqa: F401 - its BLAS must be loaded to be found
@@ -54,27 +49,27 @@ def _controller() -> ThreadpoolController:
     return ThreadpoolController()
 
 
-def one_blas_thread(function: Function) -> Function:
-    """Limit BLAS to one thread while the function runs.
+class _OneThread(ContextDecorator):
+    lock = threading.Lock()
+    inside = 0
+    limit: Any = None
 
-    On two cores that other work shares, LAPACK's QR of a few thousand rows took ten times as long with two threads as
-    with one. Calls may be nested and may come from several threads; the last one out restores.
-    """
+    def __enter__(self) -> None:
+        with self.lock:
+            if not self.inside:
+                self.limit = _controller().limit(limits=1, user_api="blas")
+            self.inside += 1
 
-    @wraps(function)
-    def limited(*arguments: Any, **options: Any) -> Any:
-        global _inside, _limit
-        with _lock:
-            if not _inside:
-                _limit = _controller().limit(limits=1, user_api="blas")
-                _limit.__enter__()
-            _inside += 1
-        try:
-            return function(*arguments, **options)
-        finally:
-            with _lock:
-                _inside -= 1
-                if not _inside:
-                    _limit.__exit__(None, None, None)
+    def __exit__(self, *error: object) -> None:
+        with self.lock:
+            self.inside -= 1
+            if not self.inside:
+                self.limit.restore_original_limits()
 
-    return limited  # type: ignore[return-value]
+
+one_blas_thread = _OneThread()
+"""Decorator that limits BLAS to one thread while a function runs.
+
+On two cores that other work shares, LAPACK's QR of a few thousand rows took ten times as long with two threads as with
+one. Calls may be nested and may come from several threads; the last one out restores.
+"""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Iterable, Mapping
+from contextlib import suppress
 from fnmatch import fnmatchcase
 from functools import cache
 from typing import Any, NamedTuple
@@ -99,11 +100,9 @@ def with_unit(stem: str, *dimensions: str, count: int = 9) -> list[str]:
 def number(value: Any, where: str) -> float:
     """Return a finite number; InputError for anything else."""
     if isinstance(value, int | float) and not isinstance(value, bool):
-        try:
+        with suppress(OverflowError):  # an integer beyond all doubles
             if math.isfinite(value):
                 return float(value)
-        except OverflowError:  # an integer beyond all doubles
-            pass
     raise InputError(where, repr(value)[:60], "a finite number")
 
 

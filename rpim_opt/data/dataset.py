@@ -19,9 +19,6 @@ from rpim_opt.data.measurements.pose import from_matrices, pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.parameters import session_prefix
 
-ROW_FIELDS = ("q", "y", "torque", "payload", "approach", "point", "session")
-"""What a block has of every row, besides its columns."""
-
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Block(Brief):
@@ -60,24 +57,21 @@ class Block(Brief):
     @property
     def touched(self) -> np.ndarray | None:
         """(N, p) names of the points that were touched; None for what a camera has seen."""
-        if self.measurement.by_camera:
-            return None
-        return self.point
+        return None if self.measurement.by_camera else self.point
 
     @property
     def session_names(self) -> np.ndarray:
         """(N,) names of the rows' sessions, ``""`` where none is stated."""
-        if self.session is None:
-            return np.full(len(self.row), "", dtype=object)
-        return self.session
+        return np.full(len(self.row), "", dtype=object) if self.session is None else self.session
 
     def take(self, index: np.ndarray, row: np.ndarray) -> Block:
         """Return the entries at ``index``, which become the rows ``row``."""
-        covariance = self.covariance if len(self.covariance) == 1 else self.covariance[index]
+        fields = ["q", "y", "torque", "payload", "approach", "point", "session"]
+        fields += ["covariance"] if len(self.covariance) > 1 else []
+        whole = {name: getattr(self, name) for name in fields}
+        rows = {name: values[index] for name, values in whole.items() if values is not None}
         columns = {name: values[index] for name, values in self.columns.items()}
-        fields = {name: getattr(self, name) for name in ROW_FIELDS}
-        rows = {name: values[index] for name, values in fields.items() if values is not None}
-        return replace(self, covariance=covariance, row=row, columns=columns, **rows)
+        return replace(self, row=row, columns=columns, **rows)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -260,6 +254,7 @@ class Dataset(Tabled):
         approach: Array | None = None,
         columns: Mapping[str, ArrayLike] = MappingProxyType({}),
         session: Sequence[str] = (),
+        point: Sequence[str] | np.ndarray = (),
     ) -> Dataset:
         """Return a dataset from arrays.
 
@@ -283,8 +278,8 @@ class Dataset(Tabled):
             (N,) mass at the flange [kg].
         columns
             Further columns by name, (N,) each [SI], which terms and measurements of your own see.
-        session
-            N names of the sessions in which they were measured.
+        session, point
+            N names of the sessions in which they were measured, and of the points that were touched or seen.
 
         Raises
         ------
@@ -326,22 +321,17 @@ class Dataset(Tabled):
             joints = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
             accepted = f"{of_q} joint values and (N, {c}) measured values: {', '.join(measurement.columns)}"
             raise InputError("q and y", f"shapes {joints.shape} and {y.shape}", accepted)
-        k = len(measurement.components)
         rows = np.arange(N)
-        covariance = _covariances(sigma, N, k)
+        names = _names(point, "point", N)
         block = Block(
-            measurement,
-            q,
-            y,
-            covariance,
-            rows,
-            ("",) * measurement.points,
+            measurement, q, y, _covariances(sigma, N, len(measurement.components)), rows, ("",) * measurement.points,
             torque=_beside(torque, "torque", q),
             payload=_beside(payload, "payload", rows),
             approach=_beside(approach, "approach", q),
             columns={name: _beside(values, f"column {name}", rows) for name, values in columns.items()},
+            point=None if names is None else names[:, None],
             session=named_sessions(session, N),
-        )
+        )  # fmt: skip
         return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
 
     @classmethod
@@ -364,36 +354,32 @@ def _covariances(sigma: float | Array, N: int, k: int) -> Array:
     """Return covariances (1 or N, k, k) [SI] from them or from standard deviations, as `Dataset.of` takes both."""
     values = np.array(sigma, dtype=float)
     shape = values.shape
-    accepted = (
-        f"a standard deviation above zero, ({k},) of them for the components, ({N},) or ({N}, {k}) for the rows, or "
-        f"covariances ({k}, {k}) or ({N}, {k}, {k})"
-    )
-    if shape in ((), (k,)):
-        deviations = values.reshape(1, 1, -1)
-    elif shape in ((k, k), (1, k, k), (N, k, k)):
+    if shape in ((k, k), (1, k, k), (N, k, k)):
         return values.reshape(-1, k, k)
-    elif shape in ((N,), (N, k)):
-        deviations = values.reshape(N, 1, -1)
-    else:
-        raise InputError("sigma", f"shape {shape}", accepted)
-    if not (deviations > 0).all():
-        raise InputError("sigma", f"{sigma}", accepted)
-    return deviations**2 * np.eye(k)
+    known = shape in ((), (k,), (N,), (N, k))
+    if not known or not (values > 0).all():
+        accepted = f"a standard deviation above zero, ({k},) of them for the components, ({N},) or ({N}, {k}) for the "
+        accepted += f"rows, or covariances ({k}, {k}) or ({N}, {k}, {k})"
+        raise InputError("sigma", f"{sigma}" if known else f"shape {shape}", accepted)
+    return values.reshape(1 if shape in ((), (k,)) else N, 1, -1) ** 2 * np.eye(k)
 
 
 def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | None:
     """Return the names (N,) of the rows' sessions, or None; refuse names that differ in punctuation alone."""
-    if not len(names):
-        return None
-    sessions = np.array([str(name) for name in names], dtype=object)
-    if len(sessions) != N:
-        raise InputError("session", f"{len(sessions)} names", f"{N}, one per row")
+    sessions = _names(names, "session", N)
     called: dict[str, str] = {}
-    for name in dict.fromkeys(sessions):
+    for name in dict.fromkeys(() if sessions is None else sessions):
         other = called.setdefault(session_prefix(name), name)
         if other != name:
             raise InputError("column session", f"'{other}' and '{name}'", "names that differ in letters or digits")
     return sessions
+
+
+def _names(names: Sequence[Any] | np.ndarray, what: str, N: int) -> np.ndarray | None:
+    """Return names (N,), or None where there are none."""
+    if len(names) not in (0, N):
+        raise InputError(what, f"{len(names)} names", f"{N}, one per row")
+    return np.array([str(name) for name in names], dtype=object) if len(names) else None
 
 
 def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:

@@ -195,9 +195,8 @@ def views(q: Array, board: Board, uv: Array, sigma: float | Array, measurement: 
     if spread.ndim == 4:
         spread = spread[view, point]
     label = tuple(f"v{v}/{names[p]}" for v, p in zip(view, point, strict=True))
-    data = Dataset.of(q[view], uv[view, point], spread, label, kind, columns=columns)
-    block = replace(data.blocks[0], point=names[point][:, None])
-    return replace(data, blocks=(block,), configuration=view)
+    data = Dataset.of(q[view], uv[view, point], spread, label, kind, columns=columns, point=names[point])
+    return replace(data, configuration=view)
 
 
 def on_board(table: Columns, board: Board) -> Columns:

@@ -92,16 +92,12 @@ class KnownDistance:
     between: tuple[str, str]
     value: float
     sigma: float
+    measurement: ClassVar[Measurement] = known_distance
 
     def __post_init__(self) -> None:
         if not self.value > 0:
             raise InputError("known distance", f"{self.value:g} m", "a length greater than zero")
         _require_sound(self)
-
-    @property
-    def measurement(self) -> Measurement:
-        """The model of its row."""
-        return known_distance
 
 
 @dataclass(frozen=True)
@@ -174,26 +170,20 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
             accepted = "two planes, or two points for a distance"
             raise InputError(where, f"between '{each.between[0]}' and '{each.between[1]}'", accepted)
         # the row's joint values are those of a touch of either; it is of one robot, where the two are all touches say
-        second = touched[each.between[1]]
-        first = touched[each.between[0]]
+        first, second = (touched[name] for name in each.between)
         if second.robot != first.robot:
             first = second
-        own = {}
+        own = {"q": np.concatenate([first.q, second.q], axis=1), "torque": None, "approach": None}
         for what in ("torque", "approach"):
             both = [getattr(one, what) for one in (first, second)]
-            own[what] = None if any(values is None for values in both) else np.concatenate(both, axis=1)
-        relation = Block(
-            each.measurement,
-            q=np.concatenate([first.q, second.q], axis=1),
-            y=np.array([[each.value]]),
-            covariance=each.sigma**2 * np.eye(len(each.measurement.components))[None],
-            row=np.array([len(data) + i]),
-            markers=(*first.markers, *second.markers),
-            payload=first.payload,
-            robot=first.robot,
+            if all(values is not None for values in both):
+                own[what] = np.concatenate(both, axis=1)
+        covariance = each.sigma**2 * np.eye(len(each.measurement.components))[None]
+        relation = replace(
+            first, measurement=each.measurement, y=np.array([[each.value]]), covariance=covariance, columns={}, **own,
+            row=np.array([len(data) + i]), markers=(*first.markers, *second.markers), fixture="", session=None,
             point=np.array([each.between], dtype=object),
-            **own,
-        )
+        )  # fmt: skip
         blocks.append(relation)
         label = " to ".join(each.between)
         if label in labels:  # planes may have both an angle and a distance
@@ -216,8 +206,7 @@ def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool =
     >>> data.configuration.tolist()
     [0, 1, 0, 1]
     """
-    data = Dataset.of(q, np.empty((len(q), 0)), sigma, measurement=revisit_plane if planes else revisit)
-    if len(point) != len(data):
-        raise InputError("point", f"{len(point)} names", f"{len(data)}, one per touch")
-    names = np.array([str(name) for name in point], dtype=object)[:, None]
-    return replace(data, blocks=(replace(data.blocks[0], point=names),)).grouped_by_points()
+    kind = revisit_plane if planes else revisit
+    if not len(point):
+        raise InputError("point", "no names", f"{len(q)}, one per touch")
+    return Dataset.of(q, np.empty((len(q), 0)), sigma, measurement=kind, point=point).grouped_by_points()

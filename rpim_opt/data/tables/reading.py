@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, quantities, split_unit, with_unit
-from rpim_opt.data.dataset import Block, Dataset, named_sessions
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.mdh import Robot
@@ -104,19 +104,12 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     if kind.touching and len(naming) != 1:
         accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: the touched point"
         raise InputError("the header", ", ".join(table), accepted)
-    whole = Block(
-        kind,
-        q=q,
-        y=y,
-        covariance=covariances(columns, declared, kind, y, label),
-        row=np.arange(N),
-        torque=torque,
-        payload=payload,
-        approach=approach,
-        columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
-        point=np.array(_names(table, naming, N), dtype=object)[:, None] if naming else None,
-        session=named_sessions(texts(table.get("session", ()), "session"), N),
-    )
+    further = {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
+    session, point = (texts(table.get(column, ()), column) for column in ("session", *(naming or ["point"])))
+    whole = Dataset.of(
+        q, y, covariances(columns, declared, kind, y, label), label, kind, torque=torque, payload=payload,
+        approach=approach, columns=further, session=session, point=point if naming else (),
+    )  # fmt: skip
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     if kind.points == 2:
         for i, name in enumerate(label):
@@ -130,14 +123,14 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
         configuration = np.empty(N, dtype=int)
         configuration[order] = np.cumsum(np.any(np.diff(joints[order], axis=0, prepend=joints[order[:1]]) != 0, axis=1))
-    blocks: tuple[Block, ...] = (replace(whole, markers=("",) * kind.points),)
+    blocks = whole.blocks
     if {"marker", "to_marker", "fixture"} & set(table):
         groups: dict[tuple[str, ...], list[int]] = {}  # by reflectors and fixture, in the order of their first rows
         for i, key in enumerate(zip(*markers, _names(table, ["fixture"], N), strict=True)):
             groups.setdefault(key, []).append(i)
         parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
         blocks = tuple(
-            replace(whole.take(index, index), markers=tuple(names), fixture=place) for names, place, index in parts
+            replace(blocks[0].take(index, index), markers=tuple(names), fixture=place) for names, place, index in parts
         )
     data = Dataset(blocks, label, configuration)
     return data.grouped_by_points() if kind.touching else data
