@@ -28,19 +28,10 @@ class RpimError(Exception):
 class InputError(RpimError):
     """Invalid input: an argument, a file, a key, a column or a row.
 
-    Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes.
+    Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes. ``where``
+    is the key, column, row or argument, ``found`` and ``accepted`` what stands there and what could, ``file`` the file
+    that it stands in, None where there is none.
 
-    Parameters
-    ----------
-    where
-        The key, column, row or argument.
-    found, accepted
-        What stands there, and what could.
-    file
-        The file it stands in; None where there is none.
-
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> error = ro.InputError("key joint 2.d_mm", "'long'", "a finite number")
     >>> print(error.within("robot.toml"))
@@ -128,19 +119,10 @@ class Conflict(NamedTuple):
 class NoSolutionFound(RpimError):
     """A convex program has no solution, or the solver found none.
 
-    Parameters
-    ----------
-    formulation, weight
-        Name of the formulation, and the regularization weight.
-    status
-        Status of the solver, such as ``"infeasible"``.
-    conflict
-        The contradicting constraints; None if unknown.
-    advice
-        A remedy, if there is no contradiction.
+    ``formulation`` is the name of the formulation and ``weight`` the regularization weight, ``status`` that of the
+    solver, such as ``"infeasible"``; ``conflict`` are the contradicting constraints, None if unknown, and ``advice`` is
+    a remedy, if there is no contradiction.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> problem = ro.load("paper_arm").problem
     >>> tight = problem.parameters.toleranced({"length_mm": 0.5, "angle_mrad": 0.5})

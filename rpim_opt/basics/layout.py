@@ -54,33 +54,21 @@ UNITS_LINE = re.compile(r"\W*(?:units?|einheit(?:en)?|unités?|unidades|unità)\
 class TableOptions:
     """Options for reading raw tables; an empty option is detected from the files.
 
-    Parameters
-    ----------
-    sheet
-        An Excel sheet's name, or its number from 1.
-    encoding, separator, decimal
-        Of a text file: ``"cp1252"``, ``"semicolon"``, ``","``.
-    columns
-        The columns' names, instead of a header; a column called ``-`` is left out.
-    units
-        Of columns whose name carries none, ``"rad,m"``, or by dimension or the columns' stem (`parse_units`).
-    quaternion
-        Order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against the robot.
-    rotation
-        What rx, ry, rz are: ``"vector"`` (Universal Robots), or turns about axes that stand still or turn with the
-        body, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``.
-    prefix
-        Of the names of the joints, where columns of several robots are there.
-    constants
-        Values of joints that did not move and have no column, by headers with units: ``("torso_lift [m]=0.15",)``.
-    key, within
-        The column by which several files are joined, ``"row"`` for the number of the row; tolerance [s] where they are
-        joined by the nearest time.
-    joints
-        What the robot's file calls its joints.
+    ``sheet`` is an Excel sheet's name, or its number from 1; ``encoding``, ``separator`` and ``decimal`` are those of a
+    text file: ``"cp1252"``, ``"semicolon"``, ``","``. ``columns`` are the columns' names, instead of a header; one
+    called ``-`` is left out. ``units`` are those of columns whose name carries none, ``"rad,m"``, or by dimension or
+    the columns' stem (`parse_units`).
 
-    Examples
-    --------
+    ``quaternion`` is the order of components that are numbered, ``"wxyz"`` or ``"xyzw"``; empty to check both against
+    the robot. ``rotation`` is what rx, ry, rz are: ``"vector"`` (Universal Robots), or turns about axes that stand
+    still or turn with the body, ``"intrinsic zyx"``; by default roll, pitch, yaw, which is ``"extrinsic xyz"``.
+    ``prefix`` is that of the names of the joints, where columns of several robots are there, ``joints`` what the
+    robot's file calls them; ``constants`` are values of joints that did not move and have no column, by headers with
+    units: ``("torso_lift [m]=0.15",)``.
+
+    ``key`` is the column by which several files are joined, ``"row"`` for the number of the row, and ``within`` the
+    tolerance [s] where they are joined by the nearest time.
+
     >>> import rpim_opt as ro
     >>> options = ro.data.TableOptions(separator="semicolon", units="rad,m", quaternion="xyzw")
     >>> options.texts()

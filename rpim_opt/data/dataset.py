@@ -78,17 +78,9 @@ class Block(Brief):
 class Dataset(Tabled):
     """Rows of measurements, of one kind or several.
 
-    Parameters
-    ----------
-    blocks
-        The rows, grouped by what evaluates them.
-    label
-        N row labels, unique.
-    configuration
-        (N,) number of the configuration a row belongs to: rows of one configuration stay together in cross-validation.
+    ``blocks`` are the rows, grouped by what evaluates them, ``label`` their N unique labels, and ``configuration`` (N,)
+    the numbers of their configurations: rows of one stay together in cross-validation.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> data = ro.load("paper_arm").problem.data
     >>> len(data), data.q.shape, data.label[:3]
@@ -258,37 +250,21 @@ class Dataset(Tabled):
     ) -> Dataset:
         """Return a dataset from arrays.
 
-        Parameters
-        ----------
-        q
-            (N, dof) joint values of the controller [rad or m]; (N, p, dof) where a row involves p points.
-        y
-            (N, c) measured values [SI]; poses also as transforms (N, 4, 4).
-        sigma
-            Standard deviation [SI] of all k components of the residual, of each, (k,), of every row, (N,), or both,
-            (N, k); or their covariance, (k, k) or (N, k, k). Of k rows they are those of the components. A position has
-            the components x, y, z, a pose x, y, z [m], rx, ry, rz [rad].
-        label
-            N row labels; numbers from 1 by default.
-        measurement
-            What the instrument sees, or the name of a ready type, ``"cable"``.
-        torque, approach
-            Joint torques [Nm], and directions of the last movement (-1, 0 or +1), (N, dof) or (N, p, dof) as q.
-        payload
-            (N,) mass at the flange [kg].
-        columns
-            Further columns by name, (N,) each [SI], which terms and measurements of your own see.
-        session, point
-            N names of the sessions in which they were measured, and of the points that were touched or seen.
+        ``q`` (N, dof) are joint values of the controller [rad or m], (N, p, dof) where a row involves p points; ``y``
+        (N, c) are measured values [SI], poses also as transforms (N, 4, 4). ``sigma`` is the standard deviation [SI] of
+        all k components of the residual, of each, (k,), of every row, (N,), or both, (N, k); or their covariance,
+        (k, k) or (N, k, k). Of k rows they are those of the components. A position has the components x, y, z, a pose
+        x, y, z [m], rx, ry, rz [rad].
 
-        Raises
-        ------
-        InputError
-            For an unknown name, shapes that do not fit together, numbers that are not finite, or a deviation that is
-            not positive.
+        ``label`` are N row labels, numbers from 1 by default; ``measurement`` is what the instrument sees, or the name
+        of a ready type, ``"cable"``. ``torque`` [Nm] and ``approach``, the directions of the last movement (-1, 0 or
+        +1), are (N, dof) or (N, p, dof) as q, ``payload`` (N,) is the mass at the flange [kg], ``columns`` are further
+        columns by name, (N,) each [SI], which terms and measurements of your own see; ``session`` and ``point`` are N
+        names of the sessions, and of the points that were touched or seen.
 
-        Examples
-        --------
+        InputError for an unknown name, shapes that do not fit together, numbers that are not finite, or a deviation
+        that is not positive.
+
         >>> import numpy as np
         >>> import rpim_opt as ro
         >>> data = ro.Dataset.of(np.zeros((2, 6)), [[0.3, 0.0, 0.6], [0.3, 0.1, 0.6]], sigma=3e-5)

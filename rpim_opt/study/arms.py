@@ -53,23 +53,13 @@ def simulated_arm(
     (log-uniform, one an arm), its angles with 1 to 30 mrad a mm of that (at most 5 mrad), each times exp(N(0, 1)) of
     its own; joints are off by three such angles more. The base is known to 2 mm and 2 mrad, the reflector to 3 mm.
 
-    Parameters
-    ----------
-    seed
-        Of the arm; the number of configurations changes neither its truth nor those it shares with a smaller one.
-    count
-        Configurations to identify from.
-    noise
-        Standard deviation of a coordinate [m], declared as it is.
-    offset
-        Angle [rad] by which one joint, neither the first nor the last, is off besides.
-    physics
-        Angle [rad] of what no geometry holds: joints sag by up to so much under the weight of all that they carry, and
-        their encoders are off by a third of it times the cosine of their angle. Links weigh what they please: each as
-        much as the one behind it or more, by an unknown factor.
+    The ``seed`` is that of the arm; ``count``, the number of configurations to identify from, changes neither its truth
+    nor those it shares with a smaller one. ``noise`` is the standard deviation of a coordinate [m], declared as it is,
+    ``offset`` the angle [rad] by which one joint, neither the first nor the last, is off besides. ``physics`` is the
+    angle [rad] of what no geometry holds: joints sag by up to so much under the weight of all that they carry, and
+    their encoders are off by a third of it times the cosine of their angle. Links weigh what they please: each as much
+    as the one behind it or more, by an unknown factor.
 
-    Examples
-    --------
     >>> import rpim_opt as ro
     >>> arm = ro.study.simulated_arm(seed=1, count=25, offset=0.017)
     >>> result = ro.calibrate(arm.problem)

@@ -74,56 +74,36 @@ def compare(
     be (a lasso with REML) and what fails is a replicate with its reason. All methods see the same data: the same
     configurations held out, drawn and disturbed, so that their errors are compared in pairs.
 
-    Parameters
-    ----------
-    problems
-        A folder, a name that comes with the package, ``ro.load(...)``, a problem, a pair of a problem and validation
-        data, a folder of problem folders, a generator (a function of a seed that returns one of these, or a
-        `SimulatedArm`); or several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``.
-    formulations
-        Ready ones by name, objects, ``"folder"`` for the folder's own; one or several, or by names of your own.
-    selectors
-        Names, selectors, numbers, ``"learned"``, ``"folder"``; likewise. A formulation without penalty has no weight
-        and is there once, with the selector ``none``.
-    methods
-        Other methods: baselines by name (``"levenberg_marquardt"``; ``"nominal"`` fits frames alone) and functions of
-        the problem that return deviations (n,) [SI], a calibration, or a function from joint values (N, dof) to
-        positions (N, 3) [m]; in a list or by names of your own.
-    splits
-        What is held out, always whole configurations: ``"folder"``, the validation data of the problem; a part of its
-        data (``0.25``); in how many folds (``5``), one replicate a fold; or several of them.
-    counts
-        Of how many configurations to identify from, drawn from those that are not held out; all of them by default.
-    noise
-        Factors, 1 or more, on the noise of the data to fit: the missing part is added, and declared.
-    seeds
-        How many, or which: of generated problems, of splits, of draws and of noise. What no seed changes is there once.
-    metrics
-        Of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``, ``"fit_rms_mm"``
-        (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or functions of a
-        `Fitted`, by names that carry their unit. Summaries are of the first one, of which less is better.
-    options
-        Further options of every calibration: ``{"model": "auto"}``.
-    workers
-        Processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config`` names one.
-    journal
-        A file that every finished replicate is written to at once. A call with the same code and arguments goes on
-        with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is refused, and
-        so is an argument that cannot be pickled. Code is that of the Python files that are loaded; other files
-        that a function reads are not known to it.
-    resume
-        False to begin the journal anew; None refuses to drop what an interrupted run has computed.
-    progress
-        Whether a bar with the time left is shown where a person is watching; or a function that is told how many
-        replicates of how many are done.
+    ``problems`` are a folder, a name that comes with the package, ``ro.load(...)``, a problem, a pair of a problem and
+    validation data, a folder of problem folders, a generator (a function of a seed that returns one of these, or a
+    `SimulatedArm`); or several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``. ``formulations`` are
+    ready ones by name, objects, ``"folder"`` for the folder's own; ``selectors`` names, selectors, numbers,
+    ``"learned"``, ``"folder"``; one or several, or by names of your own. A formulation without penalty has no weight
+    and is there once, with the selector ``none``. ``methods`` are others: baselines by name (``"levenberg_marquardt"``;
+    ``"nominal"`` fits frames alone) and functions of the problem that return deviations (n,) [SI], a calibration, or a
+    function from joint values (N, dof) to positions (N, 3) [m]. ``options`` are further ones of every calibration:
+    ``{"model": "auto"}``.
 
-    Raises
-    ------
-    InputError
-        Before anything is computed: for unknown names, words and numbers, and a journal of something else.
+    ``splits`` say what is held out, always whole configurations: ``"folder"``, the validation data of the problem; a
+    part of its data (``0.25``); in how many folds (``5``), one replicate a fold; or several of them. ``counts`` are of
+    how many configurations to identify from, drawn from those that are not held out; all of them by default. ``noise``
+    are factors, 1 or more, on the noise of the data to fit: the missing part is added, and declared. ``seeds`` are how
+    many, or which: of generated problems, of splits, of draws and of noise. What no seed changes is there once.
 
-    Examples
-    --------
+    ``metrics`` are of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``,
+    ``"fit_rms_mm"`` (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or
+    functions of a `Fitted`, by names that carry their unit. Summaries are of the first one, of which less is better.
+
+    ``workers`` are processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config``
+    names one. Every finished replicate is written to the file ``journal`` at once. A call with the same code and
+    arguments goes on with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is
+    refused, and so is an argument that cannot be pickled. Code is that of the Python files that are loaded; other files
+    that a function reads are not known to it. ``resume`` is False to begin the journal anew; None refuses to drop what
+    an interrupted run has computed. ``progress`` is whether a bar with the time left is shown where a person is
+    watching; or a function that is told how many replicates of how many are done.
+
+    InputError before anything is computed: for unknown names, words and numbers, and a journal of something else.
+
     >>> import rpim_opt as ro
     >>> found = ro.compare(["position", "seven_axis"], ["tikhonov", "lasso"], ["learned", "reml"])
     >>> for row in found.rows[:4]:

@@ -45,69 +45,37 @@ REFLECTOR = Words()
 class Measurement(Brief):
     """A measurement model: the residual of a row is ``minus(y, model(T, **own))``.
 
-    Parameters
-    ----------
-    name
-        What a problem file calls it.
-    model
-        ``model(*T, **own)``: the modelled values (c, 1), from the transform T (4 x 4) of the reflector in the
-        instrument's frame, one for each point, and the measurement's own parameters by name.
-    columns
-        The columns of a data table that hold the measured values y, name to dimension: ``{"x": "length"}``
-        stands for a column ``x_mm`` or ``x_m``; dimension ``""`` for one without unit. None for a constraint,
-        whose measured value is zero.
-    components
-        The components of the residual, name to dimension, in order; the columns by default. Their names are
-        the keys of the noise per axis (``sigma_x_mm``, ``[noise] x_mm``).
-    noise
-        The keys of the noise common to all components of a dimension: ``{"position": "length"}`` stands for
-        ``[noise] position_mm``; ``{"distance": "length"}`` by default.
-    parameters
-        The measurement's own parameters, name to dimension; ``anchor_x`` is given as ``x`` of a table ``[anchor]``.
-    frames
-        The prefixes of those parameters that are frames, six each: the model gets one transform instead.
-    points
-        How many points of the robot a row involves: 2 for the distance between two.
-    minus, plus
-        Measured minus modelled (k, 1), symbolic; and its inverse on rows of numbers, ``plus(modelled, e) = y``
-        with ``minus(y, modelled) = e``, for simulations. Difference and sum by default.
-    start
-        ``start(points, y)``: own parameters by name from nominal positions (N, 3) in the instrument's frame and
-        measured values (N, c), in closed form.
-    forms
-        Other columns in which a table may state the values, each with the function to y (N, c).
-    prepare
-        Checks and normalizes y (N, c); raises `RowError` for a row that is wrong.
-    sees
-        What the model gets besides, by keyword: ``"q"`` for the joint values of the model, (dof, 1), of two points
-        (dof, 2); ``"torque"`` for the measured joint torques in the same shape; and columns of the data by name.
-    extra
-        Those columns, name to dimension.
-    touching
-        Whether a row says no more than which point was touched: its equations are differences to the other rows of
-        the point, in the robot's own base frame.
-    planar
-        Whether what was touched is a plane.
-    names
-        Columns of names that a table of it may have besides, ``("point",)``; a touch has one of them.
-    variants
-        The type that it is where a table has a column of that name.
-    parts
-        Types of tables that state less and can validate it: positions of poses.
-    accepted
-        What a message says is accepted where a column of ``extra`` that it sees is missing, by the column's name.
-    words
-        How readers hear of it.
-    shown_by
-        ``shown_by(tables)``: whether the columns of raw tables can only be of this type, before names are understood.
-    registers, turning
-        Whether rows tell where the robot's base is, and how the tool is turned.
-    metres
-        ``metres(*T, **own)``: how long a unit of the residual is at the thing that was measured [m], for residuals that
-        are no lengths: errors in millimetres are the residual times it. None for lengths and angles.
+    ``name`` is what a problem file calls it. ``model(*T, **own)`` are the modelled values (c, 1), from the transform T
+    (4 x 4) of the reflector in the instrument's frame, one for each of the ``points`` of the robot that a row involves
+    (2 for the distance between two), and the measurement's own ``parameters``, name to dimension; ``anchor_x`` is given
+    as ``x`` of a table ``[anchor]``. ``frames`` are the prefixes of those that are frames, six each: the model gets one
+    transform instead. It also gets what it ``sees``, by keyword: ``"q"`` for the joint values of the model, (dof, 1),
+    of two points (dof, 2), ``"torque"`` for the measured joint torques in the same shape, and columns of the data by
+    name; ``extra`` has those columns, name to dimension, and ``accepted`` what a message says where one is missing.
 
-    Examples
-    --------
+    ``columns`` of a data table hold the measured values y, name to dimension: ``{"x": "length"}`` stands for a column
+    ``x_mm`` or ``x_m``; dimension ``""`` for one without unit; empty for a constraint, whose measured value is zero.
+    ``forms`` are other columns in which a table may state the values, each with the function to y (N, c); ``prepare``
+    checks and normalizes y (N, c), and raises `RowError` for a row that is wrong. ``components`` are those of the
+    residual, name to dimension, in order; the columns by default. Their names are the keys of the noise per axis
+    (``sigma_x_mm``, ``[noise] x_mm``). ``noise`` has the keys of the noise common to all components of a dimension:
+    ``{"position": "length"}`` stands for ``[noise] position_mm``; ``{"distance": "length"}`` by default.
+
+    ``minus`` is measured minus modelled (k, 1), symbolic; ``plus`` its inverse on rows of numbers,
+    ``plus(modelled, e) = y`` with ``minus(y, modelled) = e``, for simulations; difference and sum by default.
+    ``start(points, y)`` are own parameters by name from nominal positions (N, 3) in the instrument's frame and measured
+    values (N, c), in closed form. ``metres(*T, **own)`` is how long a unit of the residual is at the thing that was
+    measured [m], for residuals that are no lengths: errors in millimetres are the residual times it. None for lengths
+    and angles.
+
+    A ``touching`` row says no more than which point was touched, a ``planar`` one which plane: its equations are
+    differences to the other rows of the point, in the robot's own base frame. ``names`` are columns of names that a
+    table of it may have besides, ``("point",)``, of which a touch has one; ``variants`` the type that it is where a
+    table has a column of that name; ``parts`` types of tables that state less and can validate it: positions of poses.
+    ``registers`` and ``turning`` say whether rows tell where the robot's base is, and how the tool is turned.
+    ``shown_by(tables)`` is whether the columns of raw tables can only be of this type, before names are understood;
+    ``words`` are how readers hear of it.
+
     A probe that reads heights alone. On the nominal robot, residuals of such readings are zero.
 
     >>> import rpim_opt as ro

@@ -47,26 +47,12 @@ def read_data(
     - what terms (`Model`) of the robot and a measurement of your own name as their columns;
     - for a second point ``to_q1_deg``, ..., ``to_marker``, ``to_tau1_Nm``, ``to_approach1``.
 
-    Parameters
-    ----------
-    source
-        A path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column names
-        to cells.
-    robot
-        Its joints' number and types decide the joint columns.
-    noise
-        Standard deviations where no column states them: ``{"position_mm": 0.03}``, ``{"x_mm": 0.03, ...}``, and
-        ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker (`LaserTracker`), added to them.
-    measurement
-        Decides the columns of measured values.
+    The ``source`` is a path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from
+    column names to cells. Number and types of the ``robot``'s joints decide the joint columns, ``measurement`` those of
+    measured values. ``noise`` has standard deviations where no column states them: ``{"position_mm": 0.03}``,
+    ``{"x_mm": 0.03, ...}``, and ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker
+    (`LaserTracker`), added to them. InputError names the file, the row or column, what was found and what is accepted.
 
-    Raises
-    ------
-    InputError
-        Naming the file, the row or column, what was found and what is accepted.
-
-    Examples
-    --------
     >>> import numpy as np
     >>> import rpim_opt as ro
     >>> arm = ro.robot.Robot("two links", np.array([[0, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
