@@ -13,10 +13,8 @@ from typing import NamedTuple, ParamSpec, TypeVar
 Named = TypeVar("Named")
 Answer = TypeVar("Answer")
 Options = ParamSpec("Options")
-LONGEST = 1000
-"""Characters of a part of a sentence."""
-MANY = 24
-"""Names that are listed one by one."""
+LONGEST = 1000  # characters of a part of a sentence
+MANY = 24  # names that are listed one by one
 LONGEST_COMPARED = 200
 """Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
 

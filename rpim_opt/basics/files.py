@@ -20,14 +20,12 @@ from rpim_opt.basics.exceptions import InputError, RpimError, choices
 
 LARGEST_TEXT = 2**24
 """Bytes that a description may have: a hundred times what the largest public ones need."""
-LARGEST_DATA = 2**30
-"""Bytes that a table or a result may have: some million rows."""
+LARGEST_DATA = 2**30  # bytes that a table or a result may have: some million rows
 _DEEP = re.compile(r"(?<![\w\"'.-])(?:[\w\"'-]++\s*+\.\s*+){100}")
 """Dotted keys, which are read in a time that grows with the square of their length."""
 _HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 """Escapes that JSON reads one by one, whether or not two of them make a character."""
-ENDING = ".part"
-"""Of folders in which files are written."""
+ENDING = ".part"  # of folders in which files are written
 
 
 # Reading

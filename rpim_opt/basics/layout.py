@@ -17,16 +17,12 @@ from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
-FULL = 0.6
-"""A row belongs to the data if it has this part of the numbers of the fullest row."""
-MOSTLY = 0.8
-"""A column is one of numbers if this part of its cells are."""
+FULL = 0.6  # a row belongs to the data if it has this part of the numbers of the fullest row
+MOSTLY = 0.8  # a column is one of numbers if this part of its cells are
 LINES_OF_HEADER = 6
-LISTS = ("columns", "constants", "joints")
-"""Options that list names."""
+LISTS = ("columns", "constants", "joints")  # options that list names
 DIMENSIONS = frozenset(unit.dimension for unit in UNITS.values())
-MOST_NAMED = 5
-"""Lines that are left out and named one by one."""
+MOST_NAMED = 5  # lines that are left out and named one by one
 SUMMARIES = frozenset({
     "mean", "average", "avg", "std", "stddev", "stdev", "sigma", "min", "max", "minimum", "maximum", "range", "rms",
     "sum", "total", "median", "standarddeviation", "mittelwert", "mittel", "summe", "stdabw", "standardabweichung",

@@ -34,14 +34,12 @@ WIDEST = 1000
 MOST_CELLS = 2**27
 MOST_TEXT = 2**27
 """Cells of a Parquet file, and bytes of a column's texts: a dictionary of one value repeats it in every row."""
-LARGEST_WORKBOOK = 2**27
-"""Bytes that a workbook may unpack to: some three hundred thousand rows."""
+LARGEST_WORKBOOK = 2**27  # bytes that a workbook may unpack to: some three hundred thousand rows
 EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE_LINES = 200
-SAMPLE_CHARACTERS = 2**16
-"""Of the lines from which the separator is found."""
+SAMPLE_CHARACTERS = 2**16  # of the lines from which the separator is found
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
@@ -57,8 +55,7 @@ FOREIGN = re.compile(rb"[\x80-\xff]{4,}")
 """So many letters beyond ASCII follow each other in no Western European word."""
 LIST_OPENS = re.compile(r"[a-zA-Z]*[\[({][\s\d.+\-\[({]")
 ENCODINGS = "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chinese), cp1251 (Russian), utf-16, ..."
-ZEROS = bytes(8)
-"""No text has so many zeros in a row, in whatever encoding."""
+ZEROS = bytes(8)  # no text has so many zeros in a row, in whatever encoding
 ROW_OF_NUMBERS = 1 / 3
 """Part of a row's cells that are numbers, from which on it tells what separates them."""
 BLANKS_CLEARLY = 1.5

@@ -14,10 +14,8 @@ from unicodedata import category
 
 BOX = "max-height: 24em; max-width: 100%; width: fit-content; overflow: auto; border: thin solid #8886"
 """Style of a table in a notebook: a long one scrolls."""
-MOST = 60
-"""Rows of a table in a notebook."""
-LONGEST = 60
-"""Characters of a title in one line."""
+MOST = 60  # rows of a table in a notebook
+LONGEST = 60  # characters of a title in one line
 
 
 def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
@@ -157,8 +155,7 @@ def _cell(value: Any) -> str:
 # Progress
 
 
-Progress = Callable[[int, int], None]
-"""Receives how many of how many are done."""
+Progress = Callable[[int, int], None]  # receives how many of how many are done
 
 
 @contextmanager

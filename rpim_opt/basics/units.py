@@ -45,8 +45,7 @@ UNITS = {
     for name, si in units.items()
 }
 
-CELSIUS = "temperature_C"
-"""What everybody calls a temperature in degrees Celsius."""
+CELSIUS = "temperature_C"  # what everybody calls a temperature in degrees Celsius
 LARGEST = 1e7
 """Size of what can be measured or drawn [m, rad, ...]: map coordinates in metres, a million turns. Beyond it a double
 has no digits left for micrometres."""
@@ -61,8 +60,7 @@ DISPLAY = {
 """The unit in which a dimension is shown and written."""
 
 WITH_UNIT = re.compile(rf"_({'|'.join(sorted(UNITS, key=len, reverse=True))})\Z")
-LONGEST = 200
-"""Characters of a pattern or a name: longer ones would take too long to match."""
+LONGEST = 200  # characters of a pattern or a name: longer ones would take too long to match
 
 
 @cache

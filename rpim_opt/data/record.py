@@ -17,8 +17,7 @@ from rpim_opt.data.dataset import Dataset
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
 Side = tuple[float, float]
-CONFIDENCE = 0.95
-"""Probability with which a limit is to be kept, where no other is stated."""
+CONFIDENCE = 0.95  # probability with which a limit is to be kept, where no other is stated
 
 
 @dataclass(frozen=True)

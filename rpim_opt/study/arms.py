@@ -23,8 +23,7 @@ SCALES = {"length_mm": 1.0, "angle_mrad": 1.0, "tool_mm": 10.0, "base_mm": 100.0
 BASE = (1.5, -0.8, 0.3, 0.0, 0.0, 0.6)
 TOOL = (0.04, -0.02, 0.11, 0.0, 0.0, 0.0)
 REACH = np.radians(120)
-VALIDATION_COUNT = 200
-"""Configurations that an arm is judged at."""
+VALIDATION_COUNT = 200  # configurations that an arm is judged at
 
 
 class SimulatedArm(NamedTuple):

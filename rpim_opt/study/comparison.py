@@ -35,14 +35,10 @@ from rpim_opt.study.methods import (
     splits_of,
 )
 
-MOST_DRAWS = 100_000
-"""Each is a calibration of its own, and is listed before the first begins."""
-LARGEST = float(np.finfo(float).max)
-"""Whole numbers may be larger than any double."""
-TIE = 0.01
-"""Errors that differ by no more than this part are a tie."""
-ENOUGH = 5
-"""Problems from which on an interval speaks of problems like them; with fewer, of these."""
+MOST_DRAWS = 100_000  # each is a calibration of its own, and is listed before the first begins
+LARGEST = float(np.finfo(float).max)  # whole numbers may be larger than any double
+TIE = 0.01  # errors that differ by no more than this part are a tie
+ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 BOOTSTRAP_DRAWS = 4000
 CONFIDENCE = 0.95
 SAME_DATA = ("problem", "split", "fold", "count", "noise_factor", "seed")

@@ -13,10 +13,8 @@ from matplotlib.figure import Figure
 from rpim_opt.basics.arrays import Array
 from rpim_opt.report.plot import logarithmic
 
-ROW_INCHES = 0.25
-"""Height of a method."""
-LARGEST_RATIO = 30.0
-"""Ratios beyond are drawn at the edge, with an arrow."""
+ROW_INCHES = 0.25  # height of a method
+LARGEST_RATIO = 30.0  # ratios beyond are drawn at the edge, with an arrow
 
 
 def picture(figure: Any, name: str, kind: str) -> bytes:

@@ -32,12 +32,9 @@ from rpim_opt.use.validation import validate
 ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed that returns one"
 RETURNS = "an instance, a simulated arm, a problem, or a pair of a problem and validation data"
 FOLDER = "folder"
-MOST_FOLDS = 10_000
-"""Each is a calibration of its own, and is listed before the first begins."""
-NOISE_STREAM = 11
-"""Stream of the noise that is added, apart from those that draw configurations."""
-NONE = "none"
-"""The selector of what has no weight."""
+MOST_FOLDS = 10_000  # each is a calibration of its own, and is listed before the first begins
+NOISE_STREAM = 11  # stream of the noise that is added, apart from those that draw configurations
+NONE = "none"  # the selector of what has no weight
 BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
     "nominal": fitted_frames,
     **{name: getattr(baselines, name) for name in baselines.__all__},
@@ -47,10 +44,8 @@ OK = "ok"
 UNCONVERGED = "not converged"
 IMPOSSIBLE = "impossible"
 FAILED = "failed"
-WITH_FIGURES = (OK, UNCONVERGED)
-"""Statuses of replicates that have figures."""
-Row = dict[str, Any]
-"""A replicate: its case, status and figures."""
+WITH_FIGURES = (OK, UNCONVERGED)  # statuses of replicates that have figures
+Row = dict[str, Any]  # a replicate: its case, status and figures
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]
 """A problem, or a function of a seed with another problem for every seed."""

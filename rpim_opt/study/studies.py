@@ -35,8 +35,7 @@ from rpim_opt.store.problem_file import problems_folder
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 """What a study has: a text, a `Metric` for each figure that is held, and three functions."""
-FILE = "study.py"
-"""The study of a folder."""
+FILE = "study.py"  # the study of a folder
 MOST_FILES = 10_000
 """Of the files beside a study, each of which is read before its replicates are resumed."""
 REPLICATES = "replicates"
@@ -70,15 +69,12 @@ class Report:
     figures: Mapping[str, Any] = field(default_factory=dict)
 
 
-Row = dict[str, Any]
-"""A case with its figures."""
-Work = Callable[[], Row]
-"""Computation of a replicate; it travels to wherever it is computed."""
+Row = dict[str, Any]  # a case with its figures
+Work = Callable[[], Row]  # computation of a replicate; it travels to wherever it is computed
 PACKAGE = Path(__file__).resolve().parents[1]
 LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
 """Where Python files lie that the versions of packages stand for."""
-SHORT = 12
-"""Digits of a digest that a reader compares by eye."""
+SHORT = 12  # digits of a digest that a reader compares by eye
 SCHEMA = """
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS code (part TEXT PRIMARY KEY, digest TEXT);

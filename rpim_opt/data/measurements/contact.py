@@ -18,8 +18,7 @@ from rpim_opt.data.measurements.measurement import XYZ, Measurement, Words, orig
 
 COORDINATE = re.compile(r"(?<![a-z])[xyz](?![a-z])")
 """In the name of a column that holds a measured coordinate."""
-TOUCHED = ("point", "plane")
-"""Columns that name the touched point or plane."""
+TOUCHED = ("point", "plane")  # columns that name the touched point or plane
 
 
 def names_touches(tables: Sequence[Columns]) -> bool:
@@ -74,8 +73,7 @@ known_parallel = Measurement(
 TYPES = (revisit,)
 KNOWN = (known_distance, known_square, known_parallel)
 """What a drawing knows of things that were touched: no measurements, though they have equations."""
-UNNAMED = (revisit_plane, *KNOWN)
-"""Ready types that no problem file names as its measurement."""
+UNNAMED = (revisit_plane, *KNOWN)  # ready types that no problem file names as its measurement
 
 
 @dataclass(frozen=True)
@@ -126,8 +124,7 @@ class KnownAngle:
         return known_parallel if self.parallel else known_square
 
 
-Known = KnownDistance | KnownAngle
-"""What a drawing or a certificate states of two touched things."""
+Known = KnownDistance | KnownAngle  # what a drawing or a certificate states of two touched things
 
 
 def _require_sound(known: Known) -> None:

@@ -20,8 +20,7 @@ from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import Brief
 from rpim_opt.robot.terms import require_columns
 
-XYZ = {"x": "length", "y": "length", "z": "length"}
-"""A position's coordinates."""
+XYZ = {"x": "length", "y": "length", "z": "length"}  # a position's coordinates
 
 
 class Words(NamedTuple):

@@ -29,8 +29,7 @@ class Reading(NamedTuple):
     kind: str = ""
 
 
-Readings = dict[str, Reading]
-"""What every column holds, by its name."""
+Readings = dict[str, Reading]  # what every column holds, by its name
 
 
 _WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|coords?|coordinates?|cartesian|cart|tcp)_?)*"
@@ -96,8 +95,7 @@ JOINTS = (
 """Joints from the base, where all of them are there."""
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 """Universal Robots' joints, from the base; ROS lists them in the alphabet's order."""
-MOST_PREFIXES = 6
-"""Words before a name that is known."""
+MOST_PREFIXES = 6  # words before a name that is known
 VALUE = frozenset({"position", "pos", "angle", "value"})
 """What may stand behind the name of a joint for its value."""
 
@@ -156,8 +154,7 @@ SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 """Rows and columns of a matrix by its number of entries."""
 EULER = re.compile(r"(?:extrinsic|intrinsic) ([xyz])(?!\1)([xyz])(?!\2)[xyz]")
 """Three turns about axes that stand still, or that turn with it."""
-ROUNDED = 1e-6
-"""The last row of a matrix is 0 0 0 1 within this."""
+ROUNDED = 1e-6  # the last row of a matrix is 0 0 0 1 within this
 
 
 def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:

@@ -22,12 +22,9 @@ Numbers = dict[tuple[str, str], Array]
 TRACKER = {"range": ("length", "ratio"), "transverse": ("length",), "angle": ("angle",),
            "x": ("length",), "y": ("length",), "z": ("length",)}  # fmt: skip
 """The keys of ``[noise.tracker]`` and their dimensions."""
-DEFINITE = 1e-9
-"""A correlation matrix whose smallest eigenvalue is not above this is no covariance."""
-COVERAGE = 2.0
-"""Coverage factor of expanded uncertainties, the columns u95."""
-SPREADS = ("sigma", "u95")
-"""Stems of standard and expanded uncertainties."""
+DEFINITE = 1e-9  # a correlation matrix whose smallest eigenvalue is not above this is no covariance
+COVERAGE = 2.0  # coverage factor of expanded uncertainties, the columns u95
+SPREADS = ("sigma", "u95")  # stems of standard and expanded uncertainties
 
 
 def read_data(

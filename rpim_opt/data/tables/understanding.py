@@ -28,8 +28,7 @@ INSTRUMENT = re.compile(r"tracker|leica|laser|meas|mess", re.IGNORECASE)
 """In the name of a coordinate that is not the robot's own; actual may be either."""
 CONTROLLER = re.compile(r"\$?pos_act|actual_tcp", re.IGNORECASE)
 """Beginning of coordinates that a controller computes: KUKA's and Universal Robots'."""
-INCOMPLETE = 0.25
-"""Share of the rows that may lack one of several values, and are left out then."""
+INCOMPLETE = 0.25  # share of the rows that may lack one of several values, and are left out then
 MEANINGS = {
     "label": "label of the row", "configuration": "configuration", "marker": "reflector", "fixture": "fixture",
     "session": "session of the measurements", "to_marker": "reflector of the second point",
