@@ -137,18 +137,10 @@ class RawTable:
 
 
 def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
-    r"""Return the table of a raw file (text of any layout, Excel, Parquet), or of columns of texts.
+    """Return the table of a raw file (text of any layout, Excel, Parquet), or of columns of texts.
 
     A column whose cells list several numbers, ``[1.5, 2, 3]``, becomes a column each; rows that hold one coordinate
     each, ``P1, X, 1.5``, become one.
-
-    >>> from pathlib import Path
-    >>> from rpim_opt.basics.layout import read_table
-    >>> text = "Cell 7;;;\nJoints;;Position;\nJ1;J2;X;Y\n[deg];[deg];[mm];[mm]\n1,5;2;3;4\n"
-    >>> _ = Path("raw.csv").write_text(text)
-    >>> raw = read_table(Path("raw.csv"))
-    >>> list(raw.columns), raw.columns["Joints J1 [deg]"]
-    (['Joints J1 [deg]', 'Joints J2 [deg]', 'Position X [mm]', 'Position Y [mm]'], ['1.5'])
     """
     options = options or TableOptions()
     readers = {".parquet": read_columns, ".mat": array_columns, ".npz": array_columns}

@@ -408,12 +408,12 @@ def _filled(sheet: Any) -> Iterator[tuple[int, list[str]]]:
             yield number, cells
 
 
-def library(name: str, what: str) -> Any:
-    """Return a module of an optional package."""
+def library(name: str, what: str, extra: str = "tables") -> Any:
+    """Return a module of an optional package, which an extra of this one installs."""
     try:
         return import_module(name)
     except ImportError:
-        raise InputError(what, f"no package {name.split('.')[0]}", "pip install 'rpim-opt[tables]'") from None
+        raise InputError(what, f"no package {name.split('.')[0]}", f"pip install 'rpim-opt[{extra}]'") from None
 
 
 def _first_line(error: Exception) -> str:

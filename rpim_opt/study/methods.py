@@ -284,9 +284,8 @@ def errors_by(returned: Any, problem: CalibrationProblem, label: str) -> Callabl
     That is a calibration, a baseline, x (n,), or a function of q (N, dof); instead of x alone it may be a problem that
     identifies other parameters, and x. InputError for anything else.
     """
-    match returned:
-        case (CalibrationProblem() as problem, returned):
-            pass
+    if isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[0], CalibrationProblem):
+        problem, returned = returned
     if isinstance(returned, Calibration):
         return returned.errors
     if callable(returned):

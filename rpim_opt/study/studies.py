@@ -21,7 +21,6 @@ from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
 from hashlib import file_digest, sha256
-from importlib.util import find_spec
 from itertools import product
 from pathlib import Path
 from types import ModuleType
@@ -29,6 +28,7 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError, choices
 from rpim_opt.basics.files import LARGEST_DATA, json_text, parse_json, read_json, refused, require_file, write_files
+from rpim_opt.basics.tables import library
 from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
 from rpim_opt.store.problem_file import problems_folder
@@ -215,10 +215,7 @@ def run_study(
     ``results/NAME-quick`` beside the study.
     """
     path = find_study(name)
-    require_package("pyarrow", "the study")
-    import pyarrow
-    from pyarrow import parquet
-
+    parquet = library("pyarrow.parquet", "the study", "studies")
     study = load_study(path)
     folder = out or path.parent / "results" / _label(path, quick)
     with refused(folder):
@@ -247,7 +244,7 @@ def run_study(
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, progress, journal, code, resume)
     report = study.report(rows)
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    table = pyarrow.table({key: [row.get(key) for row in rows] for key in columns})
+    table = library("pyarrow", "the study").table({key: [row.get(key) for row in rows] for key in columns})
     stream = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
     write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})
@@ -383,12 +380,6 @@ def remove_journal(path: Path) -> None:
         path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
 
 
-def require_package(name: str, where: str) -> None:
-    """Refuse to start without a required package of the extra ``studies``."""
-    if find_spec(name) is None:
-        raise InputError(where, f"no package {name}", "pip install 'rpim-opt[studies]'")
-
-
 # --- who computes ----------------------------------------------------------------------------------------------------
 
 
@@ -403,14 +394,13 @@ def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[s
     if workers == 1:
         yield from (_computed(*task) for task in tasks)
         return
-    require_package("joblib", "workers")
-    from joblib import Parallel, delayed
-
+    joblib = library("joblib", "workers", "studies")
     answer = None
     with suppress(ValueError):  # of a thread that is not the main one
         answer = signal.signal(signal.SIGINT, signal.SIG_IGN)  # as processes inherit: Ctrl-C is this one's to answer
     try:
-        finished: Any = Parallel(n_jobs=workers, return_as="generator_unordered")(delayed(_computed)(*t) for t in tasks)
+        parallel = joblib.Parallel(n_jobs=workers, return_as="generator_unordered")
+        finished = parallel(joblib.delayed(_computed)(*task) for task in tasks)
     finally:
         if answer is not None:
             signal.signal(signal.SIGINT, answer)
@@ -498,7 +488,7 @@ def provenance() -> dict[str, str]:
 
 def code_of(inputs: Mapping[str, Any]) -> dict[str, str]:
     """Return digests of the package, of a script, and of what it compares, by what that is called."""
-    require_package("joblib", "journal")
+    library("joblib", "journal", "studies")
     hashes = {f"set of {name}": content_hash(value, "journal") for name, value in inputs.items()}
     return package_code() | script_code() | hashes
 

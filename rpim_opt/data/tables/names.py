@@ -148,8 +148,7 @@ def ur_joint(name: str) -> int:
 
 ORDERS = ("wxyz", "xyzw")
 QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
-MATRIX = re.compile(r"(?:m|t|h|r|mat|matrix|tf|pose)[_ \[(]*([0-4])[_ ,\]\[]*([0-4])[\])]?")
-ENTRIES = re.compile(r"(?:m|t|h|mat|matrix|tf|pose)[_ \[]*(\d{1,2})\]?")
+ENTRY = re.compile(r"(?:m|t|h|r(?=\D*\d\D*\d)|mat|matrix|tf|pose)[_ \[(]*(\d)[_ ,\]\[]*(\d?)[\])]?")
 SHAPES = {9: (3, 3), 12: (3, 4), 16: (4, 4)}
 """Rows and columns of a matrix by its number of entries."""
 EULER = re.compile(r"(?:extrinsic|intrinsic) ([xyz])(?!\1)([xyz])(?!\2)[xyz]")
@@ -189,22 +188,18 @@ def numbered(read: Readings, table: Columns, dof: int, order: str) -> None:
 
 def _entries(read: Readings) -> dict[str, tuple[int, int]]:
     """Return the columns of a matrix with their row and column from 0; empty if there is none."""
-    pairs: dict[str, tuple[int, int]] = {}
-    single: dict[str, int] = {}
+    digits: dict[str, str] = {}
     for name in read:
-        plain = re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower())
-        pair, alone = MATRIX.fullmatch(plain), ENTRIES.fullmatch(plain)
-        if pair:
-            pairs[name] = (int(pair[1]), int(pair[2]))
-        elif alone:
-            single[name] = int(alone[1])
+        match = ENTRY.fullmatch(re.sub(r"[_ ](mm|m)$", "", name.partition("[mm]")[0].strip().lower()))
+        if match:
+            digits[name] = match[1] + match[2]
+    pairs = {name: (int(two[0]), int(two[1])) for name, two in digits.items() if len(two) == 2}
     first = min((i for i, _ in pairs.values()), default=0)
     places = {name: (i - first, j - first) for name, (i, j) in pairs.items()}
     if len(pairs) in SHAPES and set(places.values()) == set(product(*map(range, SHAPES[len(pairs)]))):
         return places
-    single |= {name: 10 * i + j for name, (i, j) in pairs.items()}
-    ordered = sorted(single, key=lambda name: single[name])
-    if len(ordered) not in (12, 16) or single[ordered[-1]] - single[ordered[0]] != len(ordered) - 1:
+    ordered = sorted(digits, key=lambda name: int(digits[name]))
+    if len(ordered) not in (12, 16) or int(digits[ordered[-1]]) - int(digits[ordered[0]]) != len(ordered) - 1:
         return {}
     return {name: divmod(k, 4) for k, name in enumerate(ordered)}
 

@@ -23,8 +23,7 @@ TRACKER = {"range": ("length", "ratio"), "transverse": ("length",), "angle": ("a
            "x": ("length",), "y": ("length",), "z": ("length",)}  # fmt: skip
 """The keys of ``[noise.tracker]`` and their dimensions."""
 DEFINITE = 1e-9  # a correlation matrix whose smallest eigenvalue is not above this is no covariance
-COVERAGE = 2.0  # coverage factor of expanded uncertainties, the columns u95
-SPREADS = ("sigma", "u95")  # stems of standard and expanded uncertainties
+SPREADS = {"sigma": 1.0, "u95": 2.0}  # coverage factors of standard and of expanded uncertainties, by their stems
 
 
 def read_data(
@@ -221,7 +220,7 @@ def quantities_of(
         values = si * numbers(table[name], name, label) + (unit.zero if unit else 0.0)
         fits = np.abs(values) <= LARGEST
         accepted = f"a magnitude of at most {LARGEST / si:g}"
-        if stem.startswith(SPREADS) and fits.all():
+        if stem.startswith(tuple(SPREADS)) and fits.all():
             fits = values >= SMALLEST
             accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
         if not fits.all():
@@ -347,34 +346,23 @@ def covariances(
     lacking = np.zeros(k, dtype=bool)
     for i, (name, dimension) in enumerate(kind.components.items()):
         # what rows state: of this component before those of all of its dimension
-        sources = {
-            (f"sigma_{name}", ""): 1.0,
-            ("sigma", dimension): 1.0,
-            (f"u95_{name}", ""): COVERAGE,
-            ("u95", dimension): COVERAGE,
-        }
-        own = next((columns[key] / factor for key, factor in sources.items() if key in columns), None)
-        common = ""
-        if own is None:
-            common = next((key for key, of in kind.noise.items() if of == dimension), "")
-            own = declared.get(name, declared.get(common))
-            lacking[i] = True
-        if own is None:
-            if not instrument[:, i, i].any() and (f"cov_{name}_{name}", "") not in columns:
-                column = with_unit(f"sigma_{name}", dimension, count=2)[-1]
-                accepted = f"{with_unit(common, dimension, count=2)[-1]}, or a column {column}"
-                raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
-            own = 0.0  # the tracker or a column has it all
-        spread.append(own)
+        sources = [(key, factor) for of, factor in SPREADS.items() for key in ((f"{of}_{name}", ""), (of, dimension))]
+        stated = [columns[key] / factor for key, factor in sources if key in columns]
+        common = next((key for key, of in kind.noise.items() if of == dimension), "")
+        own = stated[0] if stated else declared.get(name, declared.get(common))
+        lacking[i] = not stated
+        if own is None and not instrument[:, i, i].any() and (f"cov_{name}_{name}", "") not in columns:
+            column = with_unit(f"sigma_{name}", dimension, count=2)[-1]
+            accepted = f"{with_unit(common, dimension, count=2)[-1]}, or a column {column}"
+            raise InputError("table noise", f"no standard deviation for '{name}'", accepted)
+        spread.append(0.0 if own is None else own)  # the tracker or a column has it all
     deviation = np.stack(np.broadcast_arrays(*map(np.atleast_1d, spread)), axis=1)
     covariance = deviation[:, :, None] ** 2 * np.eye(k) + instrument * np.outer(lacking, lacking)
-    pairs = [(a, b) for a in names for b in names if (f"cov_{a}_{b}", "") in columns]
-    if pairs:
-        covariance = np.broadcast_to(covariance, (len(y), k, k)).copy()
-    for a, b in pairs:
-        i, j = names.index(a), names.index(b)
-        covariance[:, i, j] = columns[f"cov_{a}_{b}", ""]
-        covariance[:, j, i] = covariance[:, i, j]
+    for i, j in np.ndindex(k, k):
+        values = columns.get((f"cov_{names[i]}_{names[j]}", ""))
+        if values is not None:
+            covariance = np.tile(covariance, (1 if len(covariance) == len(y) else len(y), 1, 1))
+            covariance[:, i, j] = covariance[:, j, i] = values
     unit = np.sqrt(np.einsum("nii->ni", covariance))
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.nan_to_num(covariance / (unit[:, :, None] * unit[:, None, :]))

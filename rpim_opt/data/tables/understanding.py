@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layout import RawTable, TableOptions, is_missing
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import FOREIGN, UNITS, dimension_of, split, split_unit
+from rpim_opt.basics.units import DISPLAY, FOREIGN, UNITS, dimension_of, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
 from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize, ur_joint
@@ -245,16 +245,15 @@ def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Seque
         return
     new: dict[str, str] = {}
     for i, column in named.items():
-        called = {str(cell) for cell in table[column]}
-        if len(called) > 1:
-            raise InputError("the header", f"column '{column}' with {len(called)} names", "one joint per column")
-        (joint,) = called
+        joint, *others = {str(cell) for cell in table[column]}
+        if others:
+            raise InputError("the header", f"column '{column}' with {len(others) + 1} names", "one joint per column")
         place = joints.index(joint) + 1 if joint in joints else 0
-        if not joints:
-            place = ur_joint(joint) if dof == len(known_names.UR_JOINTS) else 0
-            if not place:
-                accepted = "a robot from a URDF, which names its joints"
-                raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
+        if not joints and dof == len(known_names.UR_JOINTS):
+            place = ur_joint(joint)
+        if not joints and not place:
+            accepted = "a robot from a URDF, which names its joints"
+            raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
         new[f"q{i}"] = f"q{place}" if place else f"another q{i}"
     _rename(read, new, "the joint named in its name column")
 
@@ -417,8 +416,7 @@ def _under_our_names(
         words_of_column = kind.words.columns.get(reading.stem) or meaning(reading.stem)
         meant.append(Meant(name, words_of_column, new, unit, f"{reading.why}; unit {why}" if why else reading.why))
     if unitless:
-        examples = {"angle": "deg", "length": "mm", "torque": "Nm", "mass": "kg"}
-        missing = ",".join(examples.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
+        missing = ",".join(DISPLAY.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
         accepted = f"--units, such as {missing}, or names with a unit, such as q1_deg and x_mm"
         raise InputError("the header", f"columns without a unit ({', '.join(unitless)})", accepted)
     return columns, meant
@@ -443,9 +441,9 @@ def _unit(name: str, read: Reading, dimensions: Sequence[str], units: Mapping[st
             return units[key]
     if only == "pixel":
         return "px", "the only unit"
-    why = next((why for pattern, why in known_names.IN_SI.items() if re.fullmatch(pattern, name)), "")
     unit = {"angle": "rad", "length": "m"}.get(only, "")
-    return (unit, why) if unit and why else ("", "")
+    dialects = (why for pattern, why in known_names.IN_SI.items() if unit and re.fullmatch(pattern, name))
+    return next(((unit, why) for why in dialects), ("", ""))
 
 
 def _values(cells: Sequence[Any], name: str) -> np.ndarray:

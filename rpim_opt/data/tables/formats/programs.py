@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import scipy
 
@@ -23,25 +23,33 @@ FANUC = re.compile(r'P\[(\d+)(?::"([^"]*)")?\]\s*\{(.*?)\};', re.DOTALL)
 KUKA = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^{}]{0,500})\}", re.IGNORECASE)
 ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\]", re.IGNORECASE)
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
+ABB_TARGET = re.compile(f"{ABB_JOINTS.pattern}|{ABB_POSES.pattern}", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
 KAWASAKI = re.compile(r"^\.JOINTS[^\n]*\n(.*?)^\.END", re.MULTILINE | re.DOTALL | re.IGNORECASE)
 MITSUBISHI = re.compile(r"^[ \t]*(J\w*)[ \t]*=[ \t]*\(([-+\d.][-+\d., \t]*)\)", re.MULTILINE | re.IGNORECASE)
 STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
-KUKA_NAMES = {**{f"A{i}": f"A{i} [deg]" for i in range(1, 7)}, **dict(zip("XYZ", PLACE, strict=True)),
-              **{turn: f"commanded {turn} [deg]" for turn in "ABC"}}  # fmt: skip
-STAUBLI_NAMES = {**{f"j{i}": f"J{i} [deg]" for i in range(1, 7)}, **dict(zip("xyz", PLACE, strict=True))}
+TURN = [f"commanded q{part}" for part in "wxyz"]
+PAIRS = {**{f"{letter}{i}": f"{letter}{i} [deg]" for i in range(1, 7) for letter in "AJ"},
+         **dict(zip("XYZ", PLACE, strict=True)), **{turn: f"commanded {turn} [deg]" for turn in "ABC"}}  # fmt: skip
+"""What is stated by name, in capitals, and the header that says so."""
+Targets = Sequence[tuple[str, Mapping[str, str]]]
 
 
-def _rows(joints: Sequence[tuple[str, Mapping[str, str]]], poses: Sequence[tuple[str, Mapping[str, str]]] = ()) -> Rows:
+def _rows(joints: Targets, poses: Targets = ()) -> Rows:
     """Return one row per joint target, or per pose if there are none; unnamed targets are numbered."""
     return [{"label": name or str(i), **values} for i, (name, values) in enumerate(joints or poses, start=1)]
 
 
-def _joints(cells: str, name: str = "J") -> dict[str, str]:
-    """Return joint values [deg] that are separated by commas."""
-    return {f"{name}{i} [deg]": cell.strip() for i, cell in enumerate(cells.split(","), start=1)}
+def _listed(cells: str, names: Sequence[str] = ()) -> dict[str, str]:
+    """Return values that are separated by commas, by default of joints [deg]."""
+    values = [cell.strip() for cell in cells.split(",")]
+    return dict(zip(names or [f"J{i} [deg]" for i in range(1, len(values) + 1)], values, strict=False))
+
+
+def _paired(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
+    return {PAIRS[name.upper()]: value for name, value in pairs if name.upper() in PAIRS}
 
 
 def read_fanuc(text: str) -> Rows:
@@ -62,23 +70,16 @@ def read_kuka(text: str) -> Rows:
     targets = KUKA.findall(text)
     targets = [each for each in targets if re.search(r"\bA1\b", each[1], re.IGNORECASE)] or targets
     inline = all(name.upper().startswith("X") for name, _ in targets)
-    rows = []
-    for name, fields in targets:
-        pairs = re.findall(rf"\b([A-Z]\d?)\s+({NUMBER})", fields, re.IGNORECASE)
-        values = {KUKA_NAMES[key.upper()]: value for key, value in pairs if key.upper() in KUKA_NAMES}
-        rows.append((name[1:] if inline else name, values))
-    return _rows(rows)
+    pair = re.compile(rf"\b([A-Z]\d?)\s+({NUMBER})", re.IGNORECASE)
+    return _rows([(name[1:] if inline else name, _paired(pair.findall(fields))) for name, fields in targets])
 
 
 def read_abb(text: str) -> Rows:
     """Return the targets; a quaternion has w first."""
     text = re.sub(r"!.*", "", text)
-    names = [*PLACE, *(f"commanded q{part}" for part in "wxyz")]
-    poses = [(name, [*place.split(","), *turn.split(",")]) for name, place, turn in ABB_POSES.findall(text)]
-    return _rows(
-        [(name, _joints(cells, "rax_")) for name, cells in ABB_JOINTS.findall(text)],
-        [(name, dict(zip(names, map(str.strip, values), strict=False))) for name, values in poses],
-    )
+    joints = [f"rax_{i} [deg]" for i in range(1, 10)]
+    poses = [(name, _listed(f"{place},{turn}", [*PLACE, *TURN])) for name, place, turn in ABB_POSES.findall(text)]
+    return _rows([(name, _listed(cells, joints)) for name, cells in ABB_JOINTS.findall(text)], poses)
 
 
 def _plain_urscript(text: str) -> str:
@@ -99,9 +100,9 @@ def read_urscript(text: str) -> Rows:
             row = {f"joint_{i} [rad]": repr(value) for i, value in enumerate(values, start=1)}
             joints.append((name.removesuffix("_q"), row))
         else:
-            turn = scipy.spatial.transform.Rotation.from_rotvec(values[3:]).as_quat().tolist()
+            w_last = scipy.spatial.transform.Rotation.from_rotvec(values[3:]).as_quat().tolist()
             row = {f"commanded {axis} [m]": repr(value) for axis, value in zip("xyz", values, strict=False)}
-            row |= {f"commanded q{part}": repr(value) for part, value in zip("xyzw", turn, strict=True)}
+            row |= {part: repr(value) for part, value in zip([*TURN[1:], TURN[0]], w_last, strict=True)}
             poses.append((name.removesuffix("_p"), row))
     return _rows(joints, poses)
 
@@ -111,16 +112,14 @@ def read_yaskawa(text: str) -> Rows:
     kind = re.search(r"///POSTYPE\s+(\w+)", text)
     if kind is None or kind[1] == "PULSE":
         raise InputError("the positions", "encoder pulses", "a job that was exported with ///POSTYPE ANGLE or BASE")
-    points = YASKAWA.findall(text)
-    if kind[1] == "ANGLE":
-        return _rows([(name, _joints(cells)) for name, cells in points])
-    return _rows([(name, dict(zip(PLACE, map(str.strip, cells.split(",")), strict=False))) for name, cells in points])
+    names = () if kind[1] == "ANGLE" else PLACE
+    return _rows([(name, _listed(cells, names)) for name, cells in YASKAWA.findall(text)])
 
 
 def read_kawasaki(text: str) -> Rows:
     """Return the points of joint values of an AS program or of what a controller saved."""
     lines = [line.split() for section in KAWASAKI.findall(text) for line in section.splitlines()]
-    return _rows([(words[0].removeprefix("#"), _joints(",".join(words[1:]))) for words in lines if len(words) > 1])
+    return _rows([(words[0].removeprefix("#"), _listed(",".join(words[1:]))) for words in lines if len(words) > 1])
 
 
 def read_staubli(text: str) -> Rows:
@@ -133,32 +132,24 @@ def read_staubli(text: str) -> Rows:
             array, i = attributes.get("name", ""), -1
             continue
         i += 1
-        values = {new: attributes[name] for name, new in STAUBLI_NAMES.items() if name in attributes}
-        targets.append((array, attributes.get("key", str(i)), values))
+        targets.append((array, attributes.get("key", str(i)), _paired(attributes.items())))
     targets = [each for each in targets if "J1 [deg]" in each[2]] or targets
     several = len({array for array, _, _ in targets}) > 1
     return _rows([(f"{array}[{key}]" if several else key, values) for array, key, values in targets])
 
 
+def read_mitsubishi(text: str) -> Rows:
+    """Return the points of joint values."""
+    return _rows([(name, _listed(cells)) for name, cells in MITSUBISHI.findall(text)])
+
+
 FORMATS = (
-    TableFormat("FANUC program", (".ls",), lambda text: FANUC.search(text) is not None, read_fanuc),
-    TableFormat("KUKA data list", (".dat", ".src"), lambda text: KUKA.search(text) is not None, read_kuka),
-    TableFormat(
-        "RAPID module",
-        (".mod", ".modx", ".prg", ".sys"),
-        lambda text: bool(ABB_JOINTS.search(text) or ABB_POSES.search(text)),
-        read_abb,
-    ),
-    TableFormat(
-        "URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)) is not None, read_urscript
-    ),
-    TableFormat("Yaskawa job", (".jbi",), lambda text: YASKAWA.search(text) is not None, read_yaskawa),
-    TableFormat("Kawasaki AS program", (".as", ".pg"), lambda text: KAWASAKI.search(text) is not None, read_kawasaki),
-    TableFormat(
-        "MELFA program",
-        (".prg", ".mb4", ".mb5", ".mb6"),
-        lambda text: MITSUBISHI.search(text) is not None,
-        lambda text: _rows([(name, _joints(cells)) for name, cells in MITSUBISHI.findall(text)]),
-    ),
+    TableFormat("FANUC program", (".ls",), FANUC.search, read_fanuc),
+    TableFormat("KUKA data list", (".dat", ".src"), KUKA.search, read_kuka),
+    TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), ABB_TARGET.search, read_abb),
+    TableFormat("URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)), read_urscript),
+    TableFormat("Yaskawa job", (".jbi",), YASKAWA.search, read_yaskawa),
+    TableFormat("Kawasaki AS program", (".as", ".pg"), KAWASAKI.search, read_kawasaki),
+    TableFormat("MELFA program", (".prg", ".mb4", ".mb5", ".mb6"), MITSUBISHI.search, read_mitsubishi),
     TableFormat("VAL3 data", (".dtx",), lambda text: "<Value" in text, read_staubli),
 )

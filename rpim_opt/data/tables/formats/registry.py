@@ -31,7 +31,7 @@ class TableFormat(NamedTuple):
 
     name: str
     endings: tuple[str, ...]
-    shown_by: Callable[[str], bool]
+    shown_by: Callable[[str], object]
     read: Callable[[str], Rows]
 
 
