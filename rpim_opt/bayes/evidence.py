@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -12,6 +12,7 @@ import scipy
 from scipy.linalg import block_diag, get_lapack_funcs, solve_triangular
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes.prior import BASE
 from rpim_opt.problem.noise import Repeatability, Stack
 
 CENTRES = {"position": 5e-5, "orientation": 1e-4, "joint": 5e-5, "instrument": 1.0}
@@ -81,14 +82,13 @@ class Hierarchy:
     """Hierarchical prior of p deviations, in units of their scales.
 
     Normal, those ``heavy`` (p,) Student's t with ``tails`` degrees of freedom, those ``replaced`` (p,) without a prior
-    of their own. The scale of a group ``names[group]`` (p,) multiplies a deviation's, none at -1; ``covariance`` (g, g)
-    is that of the scales' logarithms. The last deviations may have a ``spectrum``. rows z - values ~ N(0, I) besides.
+    of their own. The scale of a group ``names[group]`` (p,) multiplies a deviation's, none at -1. The last deviations
+    may have a ``spectrum``. rows z - values ~ N(0, I) besides.
     """
 
     group: np.ndarray
     heavy: np.ndarray
     names: tuple[str, ...]
-    covariance: Array
     tails: float
     replaced: np.ndarray
     rows: Array
@@ -99,6 +99,16 @@ class Hierarchy:
     def geometry(self) -> np.ndarray:
         """Indices of the groups with Student-t priors."""
         return np.unique(self.group[self.heavy])
+
+    @property
+    def covariance(self) -> Array:
+        """Prior covariance (g, g) of the logarithms of the scales."""
+        geometry = np.isin(np.arange(len(self.names)), self.geometry)
+        base = np.array([name == BASE for name in self.names], dtype=bool)
+        covariance = np.diag(np.select([geometry, base], [GEOMETRY_SD, BASE_SD], EXTENSION_SD) ** 2)
+        own = RATIO_SD**2 / 2
+        covariance[np.ix_(geometry, geometry)] = GEOMETRY_SD**2 - own + own * np.eye(int(geometry.sum()))
+        return covariance
 
     @property
     def hyperparameters(self) -> tuple[str, ...]:
@@ -132,18 +142,9 @@ class Hierarchy:
             group=number[group],
             heavy=self.heavy[keep],
             names=tuple(self.names[i] for i in used),
-            covariance=self.covariance[np.ix_(used, used)],
             replaced=self.replaced[keep],
             rows=self.rows[:, keep],
         )
-
-
-def scale_covariance(geometry: np.ndarray, base: np.ndarray) -> Array:
-    """Return the prior covariance (s, s) of logarithms of scales, some (s,) of the geometry or the base."""
-    covariance = np.diag(np.select([geometry, base], [GEOMETRY_SD, BASE_SD], EXTENSION_SD) ** 2)
-    own = RATIO_SD**2 / 2
-    covariance[np.ix_(geometry, geometry)] = GEOMETRY_SD**2 - own + own * np.eye(int(geometry.sum()))
-    return covariance
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,24 +165,16 @@ class Whitened(NamedTuple):
     logdet: float
 
 
-def whitened(data: Linearized, repeatability: Repeatability, noise: Mapping[str, float]) -> list[Whitened]:
-    """Return whitened equations, with derivatives of the noise by the logarithms of its variance components."""
+def whitened(data: Linearized, repeatability: Repeatability, noise: Sequence[str]) -> list[Whitened]:
+    """Return whitened equations, with derivatives of the noise by the logarithms of some of its components."""
     models = []
+    each = [replace(repeatability, **{kind: 0.0}) for kind in noise]  # the covariance is a sum of their squares
     for stack in data.stacks:
         N, k = stack.index.shape
-        L = np.linalg.cholesky(stack.covariance(repeatability))
+        covariance = stack.covariance(repeatability)
+        L = np.linalg.cholesky(covariance)
         inverse = np.linalg.inv(L)
-        slopes = []
-        for kind, log in noise.items():  # what a unit of a noise adds to the covariances
-            mask = stack.angle if kind == "orientation" else stack.length
-            share = mask[:, :, None] * np.eye(k)
-            if kind == "joint":
-                share = stack.joint @ stack.joint.transpose(0, 2, 1)
-            elif kind == "instrument":
-                share = stack.instrument
-            elif kind == "position" and stack.unit is not None:
-                share = stack.unit
-            slopes.append(2 * np.exp(2 * log) * share)
+        slopes = [2 * (covariance - stack.covariance(without)) for without in each]
         by_noise = inverse @ np.reshape(slopes, (-1, N, k, k)) @ inverse.transpose(0, 2, 1)
         y = (inverse @ data.y[stack.index][:, :, None])[:, :, 0]
         logdet = 2 * float(np.sum(np.log(np.diagonal(L, axis1=1, axis2=2))))
@@ -234,7 +227,7 @@ class Evidence:
                   + sum over heavy of  (nu + 1) ln((nu tau^2 + z^2 + C) / (nu + 1)) - nu ln tau^2 - ln v
                                        + 1 - (z^2 + C) / v
 
-    and logarithms of hyperparameters are normal around those of `CENTRES` and 1 (`scale_covariance`). Student's t
+    and logarithms of hyperparameters are normal around those of `CENTRES` and 1 (`Hierarchy.covariance`). Student's t
     enters by its mean field (a variational bound); a deviation that nothing decides adds nothing.
 
     Derivatives, with P = R^-1 - R^-1 X C X'R^-1, u = R^-1 (y - X z), R_a = dR / da and e^2 = z^2 + diag C::
@@ -287,7 +280,7 @@ class Evidence:
             return near
         prior = self.prior
         s = len(prior.hyperparameters)
-        parts = whitened(self.data, self.repeatability(logs), dict(zip(self.noise, logs[s:], strict=True)))
+        parts = whitened(self.data, self.repeatability(logs), self.noise)
         size2, of_size, bend = prior.variances(logs)
         v = size2
         if near is not None:

@@ -19,10 +19,9 @@ from rpim_opt.bayes.evidence import (
     Point,
     Spectrum,
     extrapolation,
-    scale_covariance,
     tail_widening,
 )
-from rpim_opt.bayes.prior import BASE, SESSIONS, Prior
+from rpim_opt.bayes.prior import SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
@@ -207,13 +206,10 @@ class Estimator:
         unit = free.scale * stated.scale
         stacks = problem.stacks(joints="joint" in self.noise, at=parameter_values(problem, x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
-        heavy = np.isin(np.arange(len(stated.names)), stated.group[stated.heavy])
-        base = np.array([name == BASE for name in stated.names], dtype=bool)
         hierarchy = Hierarchy(
             group=stated.group,
             heavy=stated.heavy,
             names=stated.names,
-            covariance=scale_covariance(heavy, base),
             tails=self.prior.tails,
             replaced=stated.replaced,
             rows=stated.rows * stated.scale,

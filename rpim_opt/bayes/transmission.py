@@ -122,7 +122,6 @@ def _given(evidence: Evidence, keep: np.ndarray, v: Array, columns: Array, curve
         group=np.full(len(v) + c, FIXED),
         heavy=np.zeros(len(v) + c, dtype=bool),
         names=(),
-        covariance=np.zeros((0, 0)),
         replaced=np.append(prior.replaced, np.zeros(c, dtype=bool)),
         rows=np.pad(prior.rows * width, ((0, 0), (0, c))),
         spectrum=spectrum_of(curves, np.ones(c)) if curves else None,
@@ -164,7 +163,7 @@ def _integrated(evidence: Evidence, columns: Array, point: Point) -> Evidence:
     scaled = columns * np.sqrt(point.v[len(point.v) - c :])
     noise = dict(zip(evidence.noise, np.exp(point.logs[len(CURVES) :]).tolist(), strict=True))
     data = replace(evidence.data, X=np.hstack([scaled, evidence.data.X]))
-    parts = whitened(data, replace(evidence.fixed, **noise), {})
+    parts = whitened(data, replace(evidence.fixed, **noise), ())
     rows = np.vstack([part.X.reshape(-1, data.X.shape[1]) for part in parts])
     y = np.concatenate([part.y.ravel() for part in parts])
     table = np.vstack([np.column_stack([rows, y]), np.eye(c, data.X.shape[1] + 1)])

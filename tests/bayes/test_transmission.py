@@ -108,7 +108,7 @@ def test_coefficients_stand_for_ripple_and_waves(travel):
     free = np.zeros(count, dtype=bool)
     nothing = np.zeros((0, count))
     spectrum = spectrum_of([curve], np.ones(count))
-    prior = Hierarchy(np.full(count, -1), free, (), np.zeros((0, 0)), 3.0, free, nothing, np.zeros(0), spectrum)
+    prior = Hierarchy(np.full(count, -1), free, (), 3.0, free, nothing, np.zeros(0), spectrum)
     variances = prior.variances(np.log([3e-4, 0.05]))[0]
     apart = np.array([0.02, 0.1, 0.3])
     columns = series([curve], np.append(0.0, apart)[:, None], np.ones((4, 1)))
