@@ -14,6 +14,7 @@ from rpim_opt.convex.robust_loss import RARE, kept_equations
 from rpim_opt.data.dataset import Block
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.noise import Equations
 from rpim_opt.problem.problem import CalibrationProblem, error_dimensions
 
 BEYOND, LOOK = 6.0, 3.0
@@ -26,8 +27,6 @@ WELL_DETERMINED = 10.0
 """Equations a parameter from which on no single row can pull the fit to itself."""
 FULL_WEIGHT, STEPS = 1.5, 50
 """Medians up to which a resistant fit gives a row its full weight; reweighted fits, at most."""
-KINDS = {"angle": 1, "pixel": 2}
-"""Numbers of the dimensions whose errors are compared with their own medians; 0 for all others."""
 SAME = 1e-3
 """Largest change of weights of rows that have converged."""
 RUN = 0.01
@@ -93,16 +92,15 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
     residual, jacobian = problem.slopes(x)
     X = jacobian * scale
     y = residual + jacobian @ x
-    components = [list(block.measurement.components.values()) for block in problem.data.blocks]
-    rows = np.concatenate([np.repeat(b.row, len(c)) for b, c in zip(problem.data.blocks, components, strict=True)])
-    numbers = [[KINDS.get(dimension, 0) for dimension in c] for c in components]
-    kinds = np.concatenate([np.tile(n, len(b.row)) for b, n in zip(problem.data.blocks, numbers, strict=True)])
+    equations = Equations.of(problem.data)
+    rows, length, angle = equations.row, equations.length, equations.angle
+    kinds = [kind for kind in (length, angle, ~(length | angle)) if kind.any()]
     z = x / scale
     weight = np.ones(len(problem.data))
     for _ in range(STEPS):
         e = y - X @ z
         unit = np.empty_like(e)  # median error of an equation's kind
-        for kind in (kinds == number for number in np.unique(kinds)):
+        for kind in kinds:
             count = np.bincount(rows[kind])
             mean = np.bincount(rows[kind], e[kind] ** 2) / np.maximum(count, 1)
             unit[kind] = max(float(np.sqrt(np.median(mean[count > 0]))), 1e-12)
