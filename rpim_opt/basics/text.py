@@ -152,9 +152,6 @@ def _cell(value: Any) -> str:
     return known.get(str(value), str(value))
 
 
-# Progress
-
-
 Progress = Callable[[int, int], None]  # receives how many of how many are done
 
 

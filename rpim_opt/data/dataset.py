@@ -105,11 +105,9 @@ class Dataset(Tabled):
             for row, y, session in zip(block.row, block.y, block.session_names, strict=True):
                 cells = {"label": self.label[row], "configuration": int(self.configuration[row])}
                 cells |= {"measurement": block.measurement.name, "marker": " ".join(block.markers)}
-                if session:
-                    cells["session"] = str(session)
-                for (column, (unit, si)), value in zip(units.items(), y, strict=True):
-                    cells[f"{column}_{unit}"] = float(value / si)
-                rows[row] = cells
+                cells |= {"session": str(session)} if session else {}
+                values = zip(units.items(), y, strict=True)
+                rows[row] = cells | {f"{column}_{unit}": float(value / si) for (column, (unit, si)), value in values}
         return rows
 
     def __len__(self) -> int:

@@ -51,9 +51,6 @@ Problem = Instance | Callable[[int], Any]
 """A problem, or a function of a seed with another problem for every seed."""
 
 
-# --- by names --------------------------------------------------------------------------------------------------------
-
-
 def listed(stated: Any) -> list[tuple[str, Any]]:
     """Return what stands alone, in a list or under names, with its name, which is empty without one."""
     if isinstance(stated, Mapping):
@@ -284,7 +281,7 @@ def errors_by(returned: Any, problem: CalibrationProblem, label: str) -> Callabl
     That is a calibration, a baseline, x (n,), or a function of q (N, dof); instead of x alone it may be a problem that
     identifies other parameters, and x. InputError for anything else.
     """
-    if isinstance(returned, tuple) and len(returned) == 2 and isinstance(returned[0], CalibrationProblem):
+    if isinstance(returned, tuple | list) and len(returned) == 2 and isinstance(returned[0], CalibrationProblem):
         problem, returned = returned
     if isinstance(returned, Calibration):
         return returned.errors
@@ -382,9 +379,6 @@ def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
     if not metrics:
         raise InputError("metrics", "none", f"functions of a fit, or {', '.join(METRICS)}")
     return metrics
-
-
-# --- a replicate -----------------------------------------------------------------------------------------------------
 
 
 def replicate(

@@ -198,9 +198,6 @@ def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> st
     return f"Made by `{command}`{source}: {count} replicates, {versions()}. {known}."
 
 
-# --- a run -----------------------------------------------------------------------------------------------------------
-
-
 def run_study(
     name: str | Path, quick: bool = False, workers: int = 1, resume: bool | None = None,
     redraw: bool = False, out: Path | None = None, progress: Progress = lambda _done, _every: None,
@@ -378,9 +375,6 @@ def remove_journal(path: Path) -> None:
     with refused(path):
         path.unlink(missing_ok=True)
         path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
-
-
-# --- who computes ----------------------------------------------------------------------------------------------------
 
 
 def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:

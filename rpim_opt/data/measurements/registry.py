@@ -8,12 +8,9 @@ from pkgutil import iter_modules
 
 from rpim_opt.data.measurements.measurement import Measurement
 
-_FOLDER = str(Path(__file__).parent)
-_modules = [import_module(f"{__package__}.{each.name}") for each in iter_modules([_FOLDER])
-            if each.name not in ("measurement", "registry")]  # fmt: skip
+_names = [each.name for each in iter_modules([str(Path(__file__).parent)])]
+_modules = [import_module(f"{__package__}.{name}") for name in _names if name not in ("measurement", "registry")]
 MEASUREMENTS: dict[str, Measurement] = {each.name: each for module in _modules for each in module.TYPES}
 """What a problem file may name."""
-READY: dict[str, Measurement] = {
-    **MEASUREMENTS, **{each.name: each for module in _modules for each in getattr(module, "UNNAMED", ())}
-}  # fmt: skip
+READY = MEASUREMENTS | {each.name: each for module in _modules for each in getattr(module, "UNNAMED", ())}
 """All that come with the package."""

@@ -234,31 +234,28 @@ def quantities_of(
 
 def values_form(columns: Numbers, kind: Measurement) -> tuple[list[str], Callable[[Array], Array]]:
     """Return the columns that state the measured values, and the function from them to y."""
-    plain = all((stem, "") in columns for stem in kind.columns)
-    for form, convert in () if plain else kind.forms:
-        if all((stem, "") in columns for stem in form):
-            return list(form), convert
-    return list(kind.columns), lambda y: y
+    plain = (kind.columns, lambda y: y)
+    there = (each for each in (plain, *kind.forms) if all((stem, "") in columns for stem in each[0]))
+    form, convert = next(there, plain)
+    return list(form), convert
 
 
 def labels(table: Columns, N: int) -> tuple[str, ...]:
     """Return the rows' labels, by default numbers from 1; refuse missing and duplicate ones."""
-    label = tuple(map(str, range(1, N + 1)))
-    if "label" in table:
-        label = texts(table["label"], "label")
-        require_unique(label, "label")
+    label = texts(table.get("label", range(1, N + 1)), "label")
+    require_unique(label, "label")
     for column in ("marker", "to_marker", "fixture", "configuration", "point", "plane", "session"):
-        for i, name in enumerate(texts(table.get(column, ()), column)):
-            if not name:
-                raise InputError(f"row {label[i]}, column {column}", "''", "a name")
+        names = texts(table.get(column, ()), column)
+        if "" in names:
+            raise InputError(f"row {label[names.index('')]}, column {column}", "''", "a name")
     return label
 
 
 def require_unique(names: Sequence[str], column: str) -> None:
     """Refuse a missing or duplicate label."""
-    seen: set[str] = set()
+    seen = {""}
     for i, name in enumerate(names, start=1):
-        if not name or name in seen:
+        if name in seen:
             raise InputError(f"row {i}, column {column}", f"'{name}'", f"a unique {column}")
         seen.add(name)
 

@@ -453,9 +453,6 @@ def _values(cells: Sequence[Any], name: str) -> np.ndarray:
     return np.where(missing, np.nan, values)
 
 
-# --- rows ----------------------------------------------------------------------------------------------------------
-
-
 def row_stems(robot: Robot, kind: Measurement) -> dict[str, set[str]]:
     """Return the names of measured and of joint values without units: a row needs both."""
     forms = {stem for form, _ in kind.forms for stem in form}
