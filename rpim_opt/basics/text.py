@@ -133,7 +133,6 @@ class Tabled(Brief):
         return frame_of(self._frame_rows())
 
     def _repr_html_(self) -> str:
-        """Return the table for a notebook, without empty columns."""
         rows = self._frame_rows()
         notes = list(self._notes())
         if len(rows) > MOST:

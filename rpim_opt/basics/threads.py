@@ -14,14 +14,12 @@ from threadpoolctl import ThreadpoolController
 
 Item = TypeVar("Item")
 Answer = TypeVar("Answer")
-_worker = threading.local()
+WORKER = "rpim_opt"  # what the names of threads begin with
 
 
 def cores() -> int:
     """Return the number of processor cores that this process may use."""
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> list[Answer]:
@@ -32,13 +30,9 @@ def on_all_cores(function: Callable[[Item], Answer], items: Iterable[Item]) -> l
     """
     waiting = list(items)
     workers = min(cores(), len(waiting))
-    if workers < 2 or getattr(_worker, "busy", False):
+    if workers < 2 or threading.current_thread().name.startswith(WORKER):
         return [function(item) for item in waiting]
-
-    def begin() -> None:
-        _worker.busy = True
-
-    with ThreadPoolExecutor(workers, initializer=begin) as pool:
+    with ThreadPoolExecutor(workers, WORKER) as pool:
         return list(pool.map(function, waiting))
 
 

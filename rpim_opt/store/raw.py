@@ -75,7 +75,7 @@ class Understanding:
     @property
     def count(self) -> int:
         """The number of rows."""
-        return len(next(iter(self.columns.values())))
+        return len(next(iter(self.columns.values()), ()))
 
     def __str__(self) -> str:
         parts = []

@@ -84,7 +84,7 @@ def simulated_arm(
     moved = _moved(robot, physics, np.random.default_rng([seed, 5]))
 
     def measured(joints: Array, level: float, stream: int) -> Dataset:
-        T = base @ flange(robot, moved(joints), errors)
+        T = base @ frames(robot, moved(joints), errors)[-1]
         points = T[:, :3, :3] @ tool + T[:, :3, 3]
         draws = np.random.default_rng([seed, stream]).standard_normal(points.shape)
         return Dataset.of(joints, points + level * draws, noise)
@@ -95,22 +95,17 @@ def simulated_arm(
     return SimulatedArm(problem, measured(there, 0.0, 4), measured(there, noise, 4))
 
 
-def flange(robot: Robot, q: Array, errors: Array) -> Array:
-    """Return flanges (N, 4, 4) of an arm of revolute joints with a small transform, a row of (dof, 6), behind each."""
-    return _frames(robot, q, errors)[-1]
-
-
-def _frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
-    """Return the frames (N, 4, 4) behind the joints."""
+def frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
+    """Return the frames (N, 4, 4) behind revolute joints, each with a small transform, a row of (dof, 6), behind it."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    frames = []
+    behind_joints = []
     for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, (q @ robot.joint_map.T).T, errors, strict=True):
         turn = np.tile(np.eye(4), (len(q), 1, 1))
         turn[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ behind @ _small(error)
-        frames.append(T)
-    return frames
+        behind_joints.append(T)
+    return behind_joints
 
 
 def _moved(robot: Robot, size: float, rng: np.random.Generator) -> Callable[[Array], Array]:
@@ -132,12 +127,12 @@ def _moved(robot: Robot, size: float, rng: np.random.Generator) -> Callable[[Arr
 
 def _torque(robot: Robot, mass: Array, q: Array) -> Array:
     """Return torques (N, dof) of gravity about the joints; links' masses sit half way to the next joint."""
-    frames = _frames(robot, q, np.zeros((robot.dof, 6)))
-    places = [frame[:, :3, 3] for frame in frames]
+    behind = frames(robot, q, np.zeros((robot.dof, 6)))
+    places = [frame[:, :3, 3] for frame in behind]
     centres = [(here + there) / 2 for here, there in zip(places, [*places[1:], places[-1]], strict=True)]
     down = np.array([0.0, 0.0, -1.0])
     torque = np.zeros(q.shape)
-    for i, frame in enumerate(frames):
+    for i, frame in enumerate(behind):
         for each, centre in zip(mass[i:], centres[i:], strict=True):
             torque[:, i] += each * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
     return torque

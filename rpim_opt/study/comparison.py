@@ -287,7 +287,6 @@ class Comparison:
         return f"{self!r}\n\n{self.summary()}" if self._has_figures else repr(self)
 
     def _repr_html_(self) -> str | None:
-        """Return the summary for a notebook."""
         return f"<p><b>{self!r}</b></p>{self.summary()._repr_html_()}" if self._has_figures else None
 
     @property
@@ -385,7 +384,6 @@ class Summary:
         return "\n".join([table(self.header, self.cells()), "", *self.notes])
 
     def _repr_html_(self) -> str:
-        """Return the same for a notebook."""
         return html_table(self.header, self.cells(), self.notes)
 
 

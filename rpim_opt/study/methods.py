@@ -131,7 +131,6 @@ def _instance(given: Any, label: str) -> Instance | None:
 
 
 def _drawn(problem: Problem, label: str, seed: int) -> Instance:
-    """Return a problem, or that of a seed."""
     if isinstance(problem, Instance):
         return problem
     instance = _instance(problem(seed), label)

@@ -356,7 +356,6 @@ def _resumed(
 
 
 def _digest(code: Mapping[str, str], key: str, found: str) -> str:
-    """Return the SHA-256 of a replicate and of the code that computed it."""
     text = json.dumps(dict(code), sort_keys=True)
     return sha256("\0".join([text, str(key), str(found)]).encode()).hexdigest()
 

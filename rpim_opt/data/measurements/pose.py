@@ -60,10 +60,9 @@ def rotation_between(p: Any, q: Any) -> Any:
 
 def turned(y: Array, e: Array) -> Array:
     """Move poses (N, 7) by e (N, 6), the positions and then the rotations about the instrument's axes."""
-    rotation = scipy.spatial.transform.Rotation.from_rotvec(e[:, 3:]) * scipy.spatial.transform.Rotation.from_quat(
-        y[:, [4, 5, 6, 3]]
-    )
-    return _posed(y[:, :3] + e[:, :3], rotation)
+    rotations = scipy.spatial.transform.Rotation
+    turned_by = rotations.from_rotvec(e[:, 3:]) * rotations.from_quat(y[:, [4, 5, 6, 3]])
+    return _posed(y[:, :3] + e[:, :3], turned_by)
 
 
 def _posed(y: Array, rotation: scipy.spatial.transform.Rotation) -> Array:

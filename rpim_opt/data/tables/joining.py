@@ -121,7 +121,6 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
 
 
 def _lower(table: Understood) -> Columns:
-    """Return the columns of the file by names in lower case."""
     return {name.lower(): cells for name, cells in table.raw.items()}
 
 
@@ -237,7 +236,6 @@ def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.n
 
 
 def _by_time(joints: Understood, values: Understood, key: str, within: float) -> Match:
-    """Return the rows of the nearest times."""
     if not (np.isfinite(within) and within >= 0):
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     clocks, (there, then) = zip(*(_times(side, key) for side in (joints, values)), strict=True)

@@ -238,5 +238,5 @@ def quaternions(angles: np.ndarray, rotation: str) -> dict[str, list[str]]:
         places = ["xyz".index(axis) for axis in order] if len(set(order)) == 3 else [0, 1, 2]
         turned = rotations.from_euler(order.upper() if how == "intrinsic" else order, angles[finite][:, places])
     cells = np.full((len(angles), 4), "", dtype=object)
-    cells[finite] = [list(map(repr, row)) for row in turned.as_quat().tolist()]
+    cells[finite] = np.array([list(map(repr, row)) for row in turned.as_quat().tolist()], dtype=object).reshape(-1, 4)
     return {f"q{part}": list(cells[:, "xyzw".index(part)]) for part in "wxyz"}

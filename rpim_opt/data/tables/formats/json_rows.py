@@ -38,7 +38,6 @@ def read_yaml(text: str) -> Rows:
 
 
 def _rows(found: Any) -> Rows:
-    """Return the rows of a document."""
     if isinstance(found, dict):
         lists = {name: cells for name, cells in found.items() if isinstance(cells, list)}
         inner = [cells for cells in lists.values() if cells and all(isinstance(row, dict) for row in cells)]
