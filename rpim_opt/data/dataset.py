@@ -280,11 +280,9 @@ class Dataset(Tabled):
         N = len(q)
         points, c = measurement.points, len(measurement.columns)
         for name, values in (("q", q), ("y", y)):
-            wrong = np.flatnonzero(~(np.abs(values) <= LARGEST).reshape(len(values), -1).all(axis=1))
-            if len(wrong):
-                found = f"{values[wrong[0]].ravel().tolist()}"
+            for row in np.flatnonzero(~(np.abs(values) <= LARGEST).reshape(len(values), -1).all(axis=1)).tolist():
                 accepted = f"finite numbers of at most {LARGEST:g} m or rad"
-                raise InputError(f"{name}, row {wrong[0] + 1}", found, accepted)
+                raise InputError(f"{name}, row {row + 1}", f"{values[row].ravel().tolist()}", accepted)
         if y.shape[1:] == (4, 4) and measurement.columns == pose.columns:
             try:
                 y = from_matrices(np.hstack([y[:, :3, 3], y[:, :3, :3].reshape(len(y), 9)]))

@@ -212,6 +212,7 @@ def run_study(
     ``results/NAME-quick`` beside the study.
     """
     path = find_study(name)
+    pyarrow = library("pyarrow", "the study", "studies")
     parquet = library("pyarrow.parquet", "the study", "studies")
     study = load_study(path)
     folder = out or path.parent / "results" / _label(path, quick)
@@ -241,7 +242,7 @@ def run_study(
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, progress, journal, code, resume)
     report = study.report(rows)
     columns = list(dict.fromkeys(key for row in rows for key in row))
-    table = library("pyarrow", "the study").table({key: [row.get(key) for row in rows] for key in columns})
+    table = pyarrow.table({key: [row.get(key) for row in rows] for key in columns})
     stream = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
     write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})

@@ -73,9 +73,7 @@ def _posed(y: Array, rotation: scipy.spatial.transform.Rotation) -> Array:
 def unit_quaternions(y: Array) -> Array:
     """Return poses (N, 7) with normalized quaternions; refuse other norms."""
     norm = np.linalg.norm(y[:, 3:], axis=1)
-    wrong = np.flatnonzero(np.abs(norm - 1) > 1e-3)
-    if len(wrong):
-        row = int(wrong[0])
+    for row in np.flatnonzero(np.abs(norm - 1) > 1e-3).tolist():
         raise RowError(row, f"a quaternion of norm {norm[row]:.4g}", "norm 1 within 0.001, w first")
     return np.hstack([y[:, :3], y[:, 3:] / norm[:, None]])
 
@@ -84,9 +82,7 @@ def from_matrices(y: Array) -> Array:
     """Return poses (N, 7) from matrices, row by row (N, 12); refuse matrices that are not rotations."""
     R = y[:, 3:].reshape(-1, 3, 3)
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
-    if len(wrong):
-        row = int(wrong[0])
+    for row in np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0)).tolist():
         found = f"a matrix that violates R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
     return _posed(y, scipy.spatial.transform.Rotation.from_matrix(R))

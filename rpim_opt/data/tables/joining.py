@@ -296,8 +296,7 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
             with suppress(ValueError):
                 date = datetime.fromisoformat(GERMAN.sub(r"\3-\2-\1 ", text).replace(",", "."))
                 times[i] = date.replace(tzinfo=date.tzinfo or UTC).timestamp()
-    if np.isnan(times).any():
-        i = int(np.isnan(times).argmax())
+    for i in np.flatnonzero(np.isnan(times)).tolist():
         accepted = "numbers, or dates as 2026-05-31T12:00:00 or 31.05.2026 12:00:00"
         raise InputError(f"column '{name}', row {i + 1}", f"'{texts[i]}'", accepted)
     if dates:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations_with_replacement
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         raise error.named(f"row {label[error.row]}") from None
     q = _of_joints("q", columns, robot, kind, N)
     payload = columns.get(("payload", ""))
-    if payload is not None and not (payload >= 0).all():
+    if payload is not None and payload.min() < 0:
         row = int(np.argmin(payload))
         raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
     torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("tau", "approach"))
@@ -87,7 +88,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: the touched point"
         raise InputError("the header", ", ".join(table), accepted)
     further = {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
-    session, point = (texts(table.get(column, ()), column) for column in ("session", *(naming or ["point"])))
+    session, point = (texts(table.get(column, ()), column) for column in ("session", *(naming[:1] or ["point"])))
     whole = Dataset.of(
         q, y, covariances(columns, declared, kind, y, label), label, kind, torque=torque, payload=payload,
         approach=approach, columns=further, session=session, point=point if naming else (),
@@ -164,10 +165,8 @@ def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
     for spread in SPREADS:
         known[spread] = sorted(set(kind.components.values()))
         known |= {f"{spread}_{name}": [dimension] for name, dimension in kind.components.items()}
-    components = list(kind.components.items())
-    for i, (a, of_a) in enumerate(components):
-        for b, of_b in components[i:]:
-            known[f"cov_{a}_{b}"] = [f"{of_a}2" if of_a == of_b else f"{of_a} {of_b}"]
+    for (a, of_a), (b, of_b) in combinations_with_replacement(kind.components.items(), 2):
+        known[f"cov_{a}_{b}"] = [f"{of_a}2" if of_a == of_b else f"{of_a} {of_b}"]
     return known
 
 
@@ -223,8 +222,7 @@ def quantities_of(
         if stem.startswith(tuple(SPREADS)) and fits.all():
             fits = values >= SMALLEST
             accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
-        if not fits.all():
-            i = int(np.argmin(fits))
+        for i in np.flatnonzero(~fits).tolist():
             raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", accepted)
         columns[stem, dimension] = values
         if len(known[stem]) == 1:
@@ -364,7 +362,7 @@ def covariances(
     with np.errstate(divide="ignore", invalid="ignore"):
         correlation = np.nan_to_num(covariance / (unit[:, :, None] * unit[:, None, :]))
     definite = np.linalg.eigvalsh(correlation)[:, 0] > DEFINITE
-    if not definite.all():
-        row = label[int(np.argmin(definite))]
-        raise InputError(f"row {row}, columns cov_...", "a covariance that is not positive definite", "one that is")
+    for i in np.flatnonzero(~definite).tolist():
+        found = "a covariance that is not positive definite"
+        raise InputError(f"row {label[i]}, columns cov_...", found, "one that is")
     return covariance
