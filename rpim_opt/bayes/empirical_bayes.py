@@ -18,13 +18,11 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
 
-ROUNDS = 6
-"""Linearizations at which hyperparameters are estimated."""
+ROUNDS = 6  # linearizations at which hyperparameters are estimated
 ASKED = 6.0
 """By how much -2 ln L must fall for a optional prior: a likelihood ratio of twenty, which by Markov's inequality an arm
 of another kind shows once in twenty times at most."""
-LOOKS = 4
-"""How often outliers are looked for again without those that were found: they mask each other."""
+LOOKS = 4  # how often outliers are looked for again without those that were found: they mask each other
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,28 +24,24 @@ WAVES, WAVES_LENGTH = 1.5e-4, 1.0
 hardly distinguishes them from its offset and eccentricity."""
 NOISE_SD, GEOMETRY_SD, EXTENSION_SD = 2.0, 3.0, 2.0
 """Prior standard deviations of the natural logarithms of the hyperparameters."""
-BASE_SD = 1.0
-"""That of the base: wider, eight configurations take it for nearer than it is."""
+BASE_SD = 1.0  # that of the base: wider, eight configurations take it for nearer than it is
 RATIO_SD = 1.0
 """That of the ratio of two scales of the geometry: lengths, angles and joint offsets are made by different means, but
 few data do not identify each scale alone."""
-FARTHEST = 7.0
-"""Logarithms of hyperparameters farther from their prior medians are implausible."""
+FARTHEST = 7.0  # logarithms of hyperparameters farther from their prior medians are implausible
 SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
 """Largest change of logarithms of local variances at their fixed point, and on the way to an optimum; iterations."""
 STEEPEST = 0.8
 """Bound on the slope of the fixed-point map of one local variance: its steps are at most five times the map's."""
 COUPLED, LONGEST_COUPLED = 0.3, 1.0
 """Changes of logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
-BASIN = 0.3
-"""Logarithms of hyperparameters within which of a known optimum no other is looked for."""
+BASIN = 0.3  # logarithms of hyperparameters within which of a known optimum no other is looked for
 FIRST_RADIUS, LARGEST_RADIUS = 2.0, 3.0
 """Trust region of the logarithms of hyperparameters: how far the first step and any other may go."""
 WIDEST = 1e8
 """Upper bound on local variances, and on them over the square of a scale above 1; above it, unobservable combinations
 are rounding."""
-RIDGE = 1e-13
-"""Added to the scaled information matrix against rounding in unobservable directions."""
+RIDGE = 1e-13  # added to the scaled information matrix against rounding in unobservable directions
 PRECISIONS = np.linspace(-14.0, 8.0, 200)
 """Logarithms of the precisions, times a squared scale, of the normals that nearly all of a t_3 is a mixture of."""
 MOST_WIDENED = 100.0
@@ -541,19 +537,11 @@ def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, floa
 def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Array, float]:
     """Integrate coefficients c ~ N(0, diag(v)) out of equations G ~ U c + e, e ~ N(0, I).
 
-    Return the information G'K^-1 G of the equations, K = I + U diag(v) U', the regression C U'G of the coefficients on
-    them, C = (U'U + diag(1 / v))^-1 and -ln|C|; by Cholesky's factor of K or of C^-1, whichever is smaller.
+    Return the information G'(I + U diag(v) U')^-1 G of the equations, the regression C U'G of the coefficients on them,
+    C = (U'U + diag(1 / v))^-1 and -ln|C|.
     """
     if not len(v):
         return equations.T @ equations, np.zeros((0, equations.shape[1])), np.zeros((0, 0)), 0.0
-    if len(U) < len(v):
-        root = np.sqrt(v)
-        scaled = U * root
-        L, d = _factored(scaled @ scaled.T, np.ones(len(U)))
-        W, G = _half_solved(L, d, scaled), _half_solved(L, d, equations)
-        C = np.diag(v) - np.outer(root, root) * (W.T @ W)
-        logdet = 2 * float(np.sum(np.log(L.diagonal() / d))) - float(np.sum(np.log(v)))
-        return G.T @ G, root[:, None] * (W.T @ G), C, logdet
     right = U.T @ equations
     factor, d = _factored(U.T @ U, 1 / v)
     Y = _half_solved(factor, d, right)

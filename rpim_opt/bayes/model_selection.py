@@ -24,30 +24,21 @@ from rpim_opt.robot.parameters import EXPANSION, frame_of, of_session, own_name,
 FIRST, SECOND, MOMENTS = "first harmonic", "second harmonic", "moments"
 TURNED = {FIRST: 2.0, SECOND: 4.0}
 """Travel of a joint [rad] from which its harmonics are looked for: what less tells of them fails elsewhere."""
-MANY = 40
-"""Configurations from which on first moments and second harmonics are compared."""
-CANDIDATES = ((), ("gravity",), (FIRST,), ("gravity", FIRST))
-"""The models of the arm that are compared first."""
+MANY = 40  # configurations from which on first moments and second harmonics are compared
+CANDIDATES = ((), ("gravity",), (FIRST,), ("gravity", FIRST))  # the models of the arm that are compared first
 FURTHER = {MOMENTS: "gravity", SECOND: FIRST}
 """Extensions that are asked for one by one beside the best of those, and what each stands beside."""
-ARM = ("gravity", FIRST, SECOND, MOMENTS)
-"""All extensions of the arm, in the order in which they are said."""
-SESSIONS = "sessions"
-"""The extension by what the readings of a session have in common, which is none of the arm."""
-WARMTH = "temperature"
-"""The extension by what grows with temperature."""
-CONDITIONS = (SESSIONS, WARMTH)
-"""Extensions by how and when was measured; each is a question of its own."""
+ARM = ("gravity", FIRST, SECOND, MOMENTS)  # all extensions of the arm, in the order in which they are said
+SESSIONS = "sessions"  # the extension by what the readings of a session have in common, which is none of the arm
+WARMTH = "temperature"  # the extension by what grows with temperature
+CONDITIONS = (SESSIONS, WARMTH)  # extensions by how and when was measured; each is a question of its own
 GAIN = 6.0
 """By how much -2 ln L must fall for a model with extensions: of 306 simulated arms without them one gained more.
 
 For sessions and for temperature once more each: they are other questions."""
-LARGE = 3.0
-"""By how much larger, in its logarithm, the scale of an extension is in another start."""
-COMPARED = 1e-2
-"""Slopes of -2 ln L by the logarithms of hyperparameters at which models are compared."""
-ROUNDS = 3
-"""Linearizations at which the hyperparameters of the selected model are estimated."""
+LARGE = 3.0  # by how much larger, in its logarithm, the scale of an extension is in another start
+COMPARED = 1e-2  # slopes of -2 ln L by the logarithms of hyperparameters at which models are compared
+ROUNDS = 3  # linearizations at which the hyperparameters of the selected model are estimated
 SPEAK = 10.0
 """By how much -2 ln L must fall for an extension to be spoken of: 4 is what a false pick gains, 10 none in many."""
 OWNED = {
@@ -60,10 +51,8 @@ OWNED = {
 """Extensions whose evidence is asked for at a result, and the terms that stand for them.
 
 First moments of links are gravity's, too: either would stand for the other."""
-NOISE = ("position", "orientation", "joint")
-"""Parts of the noise of a comparison at a result."""
-KNOWN = Prior(joint_offset=1.0, frames=1.0)
-"""The prior once scales were estimated: they are as the problem says."""
+NOISE = ("position", "orientation", "joint")  # parts of the noise of a comparison at a result
+KNOWN = Prior(joint_offset=1.0, frames=1.0)  # the prior once scales were estimated: they are as the problem says
 
 
 class Candidate(NamedTuple):

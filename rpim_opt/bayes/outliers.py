@@ -21,16 +21,12 @@ BEYOND, LOOK = 6.0, 3.0
 """Medians of the errors beyond which a position is an outlier; and from which on any is looked for."""
 FALSE_RATE = float(chdtrc(3, BEYOND**2 * chdtri(3, 0.5)))
 """How rarely the error of a good position, of three components, is beyond."""
-SPARE = 0.4
-"""Part of the equations that must be left over: errors that the fit has swallowed tell nothing."""
-WELL_DETERMINED = 10.0
-"""Equations a parameter from which on no single row can pull the fit to itself."""
+SPARE = 0.4  # part of the equations that must be left over: errors that the fit has swallowed tell nothing
+WELL_DETERMINED = 10.0  # equations a parameter from which on no single row can pull the fit to itself
 FULL_WEIGHT, STEPS = 1.5, 50
 """Medians up to which a resistant fit gives a row its full weight; reweighted fits, at most."""
-SAME = 1e-3
-"""Largest change of weights of rows that have converged."""
-RUN = 0.01
-"""Probability with which chance makes neighbours of outliers: below, they are a cluster."""
+SAME = 1e-3  # largest change of weights of rows that have converged
+RUN = 0.01  # probability with which chance makes neighbours of outliers: below, they are a cluster
 NEIGHBOURS, ALIKE = 3, 0.7
 """Outliers from which on they may be a cluster, and the cosine of errors that point the same way."""
 WIDE = 30.0

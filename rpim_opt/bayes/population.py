@@ -12,12 +12,10 @@ from rpim_opt.basics.units import UNITS, accepted_units
 from rpim_opt.bayes.prior_terms import FAR, Result, default_widths, marginal
 from rpim_opt.problem.linear import reduced_rows
 
-PRIOR_ROBOTS = 3.0
-"""Degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for."""
+PRIOR_ROBOTS = 3.0  # degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for
 PRIOR_RATIO, PRIOR_PARAMETERS = 1.0, 2.0
 """Prior mean square of what robots share over that of what is their own; as many parameters it counts for."""
-ITERATIONS, SETTLED = 1000, 1e-6
-"""Of expectation and maximization; relative change of the variances that ends them."""
+ITERATIONS, SETTLED = 1000, 1e-6  # of expectation and maximization; relative change of the variances that ends them
 
 
 def random_effects(arms: Sequence[tuple[Array, Array]]) -> tuple[Array, Array]:

@@ -18,10 +18,8 @@ from rpim_opt.robot.chain import ORIGIN
 from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session, overlay, own_name
 
-OFFSETS = "joint offsets"
-"""The group of what is set at assembly; what is machined are ``lengths`` and ``angles``."""
-SESSIONS = {"length": "sessions' shifts", "angle": "sessions' turns"}
-"""Groups of session offsets."""
+OFFSETS = "joint offsets"  # the group of what is set at assembly; what is machined are lengths and angles
+SESSIONS = {"length": "sessions' shifts", "angle": "sessions' turns"}  # groups of session offsets
 BASE = "base"
 """The group of the base, which is registered with the nominal robot: as far off as its deviations lead.
 

@@ -19,12 +19,9 @@ from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
-FIXED = -1
-"""The group of a parameter whose prior scale is not estimated: of frames, but for the base, and of curves."""
-JOINT_OFFSET, FRAMES = 3.0, 10.0
-"""Factors on the scales of joint offsets, which are set at assembly, and of frames."""
-FAR = 100.0
-"""Prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
+FIXED = -1  # the group of a parameter whose prior scale is not estimated: of frames, but for the base, and of curves
+JOINT_OFFSET, FRAMES = 3.0, 10.0  # factors on the scales of joint offsets, which are set at assembly, and of frames
+FAR = 100.0  # prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong
 
 
 def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, frames: float = FRAMES) -> Array:

@@ -14,7 +14,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
-from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, parameter_values, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
 from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, extended, named, questions
 from rpim_opt.bayes.prior_terms import FIXED
@@ -22,8 +22,7 @@ from rpim_opt.problem.noise import Repeatability, Stack
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
-TRANSMISSION = "transmission error"
-"""The extension by curves of the joints' transmission error."""
+TRANSMISSION = "transmission error"  # the extension by curves of the joints' transmission error
 GAIN = 12.0
 """By how much -2 ln L must fall for curves: real arms without them gain up to 10, of 162 simulated ones none 12."""
 MOMENTS_GAIN = 20.0
@@ -31,18 +30,12 @@ MOMENTS_GAIN = 20.0
 the measured range 1.44 times as large; with all data of that arm they gain 70, and are needed."""
 COLUMNS, FINEST = 68, 128
 """Harmonics a joint in the mean at most, sines and cosines, of six joints at least; cycles a turn of the finest one."""
-SHORTEST = 0.05
-"""Travel of a joint [rad] from which its curve is looked for."""
-BEYOND = 0.3
-"""How far curves go on beyond the measured angles [rad], where they are unknown."""
-STARTS = (0.3, 0.03)
-"""Length scales [rad] from which the optimum is looked for."""
-ACCURACY = 0.3
-"""Slope of -2 ln L by the logarithms of hyperparameters at which curves are admitted."""
-ROUNDS = 3
-"""Linearizations at which curves are estimated."""
-LEAST = 2e-6
-"""Noise [m or rad] from which its optimum is looked for at least."""
+SHORTEST = 0.05  # travel of a joint [rad] from which its curve is looked for
+BEYOND = 0.3  # how far curves go on beyond the measured angles [rad], where they are unknown
+STARTS = (0.3, 0.03)  # length scales [rad] from which the optimum is looked for
+ACCURACY = 0.3  # slope of -2 ln L by the logarithms of hyperparameters at which curves are admitted
+ROUNDS = 3  # linearizations at which curves are estimated
+LEAST = 2e-6  # noise [m or rad] from which its optimum is looked for at least
 
 
 def possible(problem: CalibrationProblem) -> bool:
@@ -134,10 +127,9 @@ def _most_likely(
     given: Callable[[Array, Sequence[Curve]], Evidence], models: Models, plain: Point
 ) -> tuple[Point, tuple[Curve, ...], Array] | None:
     """Return the optimum of curves and noise, the curves and columns (m, c); None where they gain too little."""
-    problem, data = models.whole, models.columns.data
-    slopes = np.zeros((len(data.y), len(problem.robot.joint_types)))
-    by_joints = "joint" in models.columns.noise
-    for stack in data.stacks if by_joints else problem.stacks():  # other noise needs no slopes by joints
+    problem = models.whole
+    slopes = np.zeros((len(models.columns.data.y), len(problem.robot.joint_types)))
+    for stack in problem.stacks(at=parameter_values(problem, models.x)):
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]
     centre, travel = (q.min(axis=0) + q.max(axis=0)) / 2, np.ptp(q, axis=0)

@@ -132,7 +132,7 @@ def test_second_derivatives_and_slopes_are_differences(seed: int, noise: tuple[s
 
 @pytest.mark.parametrize("count", [3, 60])
 def test_posterior_and_derivatives_beside_a_spectrum(count: int) -> None:
-    """Of fewer coefficients than the 36 equations, and of more, which are integrated out in another way."""
+    """Of fewer coefficients than the 36 equations, and of more."""
     plain = hierarchy([0, 0, 0] + [-1] * count, [True, True] + [False] * (1 + count), ("a",))
     spectrum = Spectrum(np.geomspace(1.0, 900.0, count), np.full(count, 2e-8))
     evidence = Evidence(linearized(1, 6, 3 + count), replace(plain, spectrum=spectrum), NOISE)
