@@ -77,7 +77,7 @@ def certified(
     objective = program.objective(z, weight)
     violation = program.violation(z)
     try:
-        best = program.inside(program.solve(weight).z, z, weight)
+        best = program.solve(weight).z
     except NoSolutionFound:
         return Certificate(float("inf"), violation)
     step = float(np.linalg.norm(best - z) / (1 + np.linalg.norm(z)))

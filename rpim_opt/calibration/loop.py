@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -156,7 +155,7 @@ class Loop:
         source = in_parts(problem.frozen())
         solved, reweigh = formulation, None
         if not source.keeps_rows:
-            solved, reweigh = in_blocks(formulation, lambda: sum(len(part.owners) for part in source.rows()))
+            solved, reweigh = in_blocks(formulation)
         return cls(source, formulation, solved, reweigh, options)
 
     @property
@@ -249,9 +248,8 @@ class Loop:
         straight, promised = self._promise(state)
         choice, length = state.choice, state.relative(float(np.linalg.norm(straight - state.z)))
         accuracy, best = self._accuracy(state)
-        nothing = promised <= accuracy
-        over = nothing or length <= self.options.tolerance
-        if state.damping > 0 and over:
+        short, nothing = length <= self.options.tolerance, promised <= accuracy
+        if state.damping > 0 and (short or nothing):
             return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
         state = replace(state, idle=state.idle + 1 if nothing else 0)
         at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.stalled(accuracy, np.isfinite(best))
@@ -260,12 +258,13 @@ class Loop:
         waiting = choice.settled and not choice.final and not choice.answers
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
             return self.answered(replace(state, idle=0))
-        return self._stepped(state, straight, promised, over, nothing)
+        return self._stepped(state, straight, promised, short, nothing)
 
     def _promise(self, state: State) -> tuple[Array, float]:
         """Return the minimum (n,) of the convex program, and by how much the objective falls there if that holds."""
         # the first linearization is good for a rough minimum, unless that promises too little to judge by
-        rough = 0.0 if state.history or state.refused or self.options.solver else FIRST_ACCURACY
+        first = state.program.separable and not (state.history or state.refused or self.options.solver)
+        rough = FIRST_ACCURACY if first else 0.0
         straight = self._solved(state.program, state, rough)
         promised = state.merit - state.program.objective(straight, state.choice.weight)
         if rough and promised <= 10 * rough * abs(state.merit):
@@ -273,8 +272,8 @@ class Loop:
             promised = state.merit - state.program.objective(straight, state.choice.weight)
         return straight, promised
 
-    def _stepped(self, state: State, straight: Array, promised: float, over: bool, nothing: bool) -> State:
-        """Step to a minimum if the nonlinear objective falls, else damp; ``over``: a short step, or no fall."""
+    def _stepped(self, state: State, straight: Array, promised: float, short: bool, nothing: bool) -> State:
+        """Step to a minimum if the nonlinear objective falls, else damp; ``nothing``: no fall is promised."""
         z = self._curved(state, straight)
         candidate = state.program.on(self.linearized(z, state.z))
         after = candidate.objective(z, state.choice.weight)
@@ -285,13 +284,12 @@ class Loop:
             gain = fall / promised
         effect = float(np.sum((state.size * (z - state.z)) ** 2))
         damping = damped(state.damping, gain, promised, effect)
-        state = replace(state, damping=damping, evaluations=state.evaluations + 1)
+        state = replace(state, evaluations=state.evaluations + 1)
         if after <= state.merit + rounding:
-            short = state.relative(float(np.linalg.norm(straight - state.z))) <= self.options.tolerance
-            return self._accepted(state, candidate, z, after, short)
-        state = replace(state, refused=state.refused + 1)
+            return replace(self._accepted(state, candidate, z, after, short), damping=damping)
+        state = replace(state, refused=state.refused + 1, damping=damping)
         hopeless = state.refused > MANY_REFUSED and promised <= DECREASE * max(abs(state.merit), 1.0)
-        if over or hopeless:  # none was promised: the loop is at rest
+        if short or nothing or hopeless:  # the loop is at rest
             if state.choice.settled:
                 return replace(state, outcome="rest")
             return replace(state, choice=state.choice.after(0.0))
@@ -301,10 +299,10 @@ class Loop:
 
     def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
         weight = state.choice.weight
-        how = {key: getattr(self.options, key) for key in ("solver", "settings", "verbose")}
+        o = self.options
         damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
-        estimate = program.solve(weight, damping=damping, accuracy=accuracy, **how)
-        return program.inside(estimate.z, state.z, weight)
+        how = {"solver": o.solver, "settings": o.settings, "verbose": o.verbose}
+        return program.solve(weight, damping=damping, accuracy=accuracy, **how).z
 
     def _curved(self, state: State, straight: Array) -> Array:
         """Let a step follow the curve of the residual: the convex program again, b moved by half the curvature.
@@ -422,16 +420,17 @@ def nearby(problem: Source, formulation: Formulation, start: Array, steps: int) 
 
 
 def _certified(loop: Loop, problem: Source, state: State) -> Ended:
-    """Certify the end of a loop by the formulation's functions and the measurements' model, asked anew."""
-    model, residual, formulation = state.program.model, None, loop.formulation
-    if loop.reweigh is not None:
-        formulation, _ = in_blocks(formulation, lambda: model.equations)
+    """Certify the end of a loop by the formulation's functions and the measurements' model, asked anew.
+
+    Of data in blocks by the squares that stand for the loss.
+    """
+    model, residual = state.program.model, None
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
         anew = in_parts(problem.frozen())
         if isinstance(anew, CalibrationProblem):
-            residual = partial(_whitened, anew)
+            residual = lambda z: anew.whitened_residual(loop.scale * z)  # noqa: E731
         model = around(anew.linearize(loop.scale * state.z), *loop.about)
-    certificate = certified(formulation, model, state.z, state.choice.weight, state.floor, residual, state.program)
+    certificate = certified(loop.solved, model, state.z, state.choice.weight, state.floor, residual, state.program)
     return Ended(state, loop.scale * state.z, certificate)
 
 
@@ -464,7 +463,3 @@ def require_finite(*arrays: Array) -> None:
     """Refuse non-finite residuals or derivatives."""
     if not all(np.isfinite(values).all() for values in arrays):
         raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
-
-
-def _whitened(problem: CalibrationProblem, z: Array) -> Array:
-    return problem.whitened_residual(problem.parameters.free.scale * z)

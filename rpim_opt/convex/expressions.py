@@ -362,7 +362,7 @@ class Term:
 def term(function: Callable[[Any], Any], size: int, where: str) -> Term:
     """Return a function of a vector of given length as a term, with the current parameter values."""
     variable = cp.Variable(size)
-    expression = Frozen([variable], where)(scalar(function(variable), where))
+    expression = Frozen([variable], where)(scalar(called(function, where, variable), where))
     return Term(expression, variable)
 
 

@@ -31,7 +31,8 @@ class Formulation(Brief):
         minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
 
     The functions may hold variables and parameters of their own, and read whatever they like: every calibration calls
-    them anew, once for its iterations and once for its certificate (of data in blocks once a block and iteration).
+    them anew, once for its iterations and once for its certificate, in every round where constraints use positions, and
+    in every iteration for some thousand rows at a time of data in blocks.
 
     Parameters
     ----------

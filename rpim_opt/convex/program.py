@@ -230,17 +230,16 @@ class Program(Brief):
         loss, penalty = self.value(z, weight)
         return loss if weight == 0 else loss + weight * penalty
 
-    def inside(self, z: Array, towards: Array, weight: float) -> Array:
+    def inside(self, z: Array, weight: float) -> Array:
         """Return z (n,), or a nearby point inside the functions' domain.
 
         An interior point ends at a boundary within its accuracy, and on either side of it: the point is moved a little
-        towards another, or towards nominal, or away from it where that lies outside.
+        towards nominal, or away from it where that lies outside.
         """
-        for share in (0.0, 1e-9, 1e-7, 1e-5, 1e-3, 1e-1):
-            for anchor in (np.zeros_like(z), towards, 2 * z):
-                nearer = z + share * (anchor - z)
-                if np.isfinite(self.objective(nearer, weight)):
-                    return nearer
+        for share in (0.0, 1e-9, -1e-9, 1e-7, -1e-7, 1e-5, -1e-5, 1e-3, -1e-3, 1e-1, -1e-1):
+            nearer = z - share * z
+            if np.isfinite(self.objective(nearer, weight)):
+                return nearer
         return z
 
     def norms(self, z: Array) -> Array:
@@ -259,9 +258,9 @@ class Program(Brief):
         4.0
         """
         projection = self._projected(z)
-        return (
-            np.inf if projection is None else float(np.linalg.norm(projection - z, 2 if self.box is None else np.inf))
-        )
+        if projection is None:
+            return np.inf
+        return float(np.linalg.norm(projection - z, 2 if self.box is None else np.inf))
 
     def nearest(self, z: Array) -> Array:
         """Return the projection of z (n,) on the constraints; z itself if it fails."""
@@ -435,7 +434,7 @@ class Program(Brief):
         self, z: Array, weight: float, multipliers: Callable[[], tuple[Array, ...]] = tuple, iterations: int = 0
     ) -> Estimate:
         if not self.quadratic:  # a quadratic is finite everywhere
-            z = self.inside(z, np.zeros_like(z), weight)
+            z = self.inside(z, weight)
         return Estimate(z, weight, *self.value(z, weight), multipliers, iterations=iterations)
 
     def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
@@ -527,9 +526,7 @@ class Program(Brief):
         from rpim_opt.convex.infeasible import advice, conflict  # of programs without a solution
 
         contradiction = None
-        if (
-            self.structure.constrained
-        ):  # a solver may stop in other words, and the constraints contradict each other all the same
+        if self.structure.constrained:  # which may contradict each other, whatever the solver stopped with
             contradiction = conflict(self.structure)
         elif status.startswith("infeasible"):
             status = "stalled"  # a program without constraints always has a point

@@ -1,8 +1,9 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
-What is canonicalized lives as long as its `Structure`, until `MOST_KEPT` others came. Functions of a user are called
-for every program; where they return what they returned before, the structure of that serves again. Warm starts and
-Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
+What is canonicalized lives as long as its `Structure`: programs keep theirs, and `MOST_KEPT` are kept for the next
+ones, then all are forgotten. Functions of a user are called for every program; where they return what they returned
+before, the structure of that serves again. Warm starts and Clarabel's solvers live as long as the programs that
+`Program.on` makes of one another.
 """
 
 from __future__ import annotations
@@ -190,7 +191,7 @@ class Structure:
     def on_squares(self) -> Structure:
         """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
         made = copy.copy(self)
-        for name in ("loss_form", "loss", "joint", "inner"):
+        for name in ("loss_form", "loss", "joint", "inner", "_over_own"):
             vars(made).pop(name, None)
         if self._called is not None:  # the functions of penalty and constraints are not called again
             own = made._called = copy.copy(self._called)
@@ -363,7 +364,7 @@ def structure(
     if formulation.loss in INVARIANT and formulation.loss_over == "equation":
         m = n + 1
     p, groups = model.parameters, model.members[0]
-    key: tuple[Any, ...] = (n, m, groups.tobytes())
+    key: tuple[Any, ...] = (n, m, groups.tobytes() if formulation.loss_over == "configuration" else b"")
     made = None
     if formulation.ready:
         key = (formulation, *key)
@@ -408,14 +409,13 @@ def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formula
     return replace(formulation, loss=lambda r: factor * cp.sum_squares(r) + constant)
 
 
-def in_blocks(formulation: Formulation, equations: Callable[[], int]) -> tuple[Formulation, QuadraticModel | None]:
+def in_blocks(formulation: Formulation) -> tuple[Formulation, QuadraticModel | None]:
     """Return the formulation by which blocks of rows are solved, and what makes its squares of their equations.
 
-    A loss that sees only the length of the residual needs nothing; ``equations`` counts them. InputError for a loss
-    that is no sum over rows.
+    A loss that sees only the length of the residual needs nothing. InputError for one that is no sum over rows.
     """
-    if formulation.loss in INVARIANT or of_length(formulation, equations) is not None:
-        return formulation, None
+    if formulation.loss in INVARIANT:
+        return replace(formulation, loss_over="equation"), None
     where = f"formulation '{formulation.name}'"
     accepted = "a squared loss, or a sum over configurations or equations (robust)"
     if not separable(formulation.loss, formulation.loss_over):

@@ -167,13 +167,13 @@ def test_a_point_outside_a_domain_is_moved_inside() -> None:
     assert not np.isfinite(program.objective(outside, 1.0))
     for distance in (3e-10, 5e-8, 5e-6, 5e-4):
         outside = edge - distance
-        inside = program.inside(outside, Z, 1.0)
+        inside = program.inside(outside, 1.0)
         assert np.isfinite(program.objective(inside, 1.0))
         assert np.abs(inside - outside).max() < 200 * distance
-    assert program.inside(0.5 * edge, Z, 1.0) is not None
-    assert (program.inside(0.5 * edge, Z, 1.0) == 0.5 * edge).all()
+    assert program.inside(0.5 * edge, 1.0) is not None
+    assert (program.inside(0.5 * edge, 1.0) == 0.5 * edge).all()
     far = np.full(N, -30.0)
-    assert (program.inside(far, far, 1.0) == far).all()
+    assert (program.inside(far, 1.0) == far).all()
 
 
 def test_multipliers_go_to_the_box_that_states_the_bound() -> None:

@@ -126,7 +126,7 @@ def test_what_is_a_sum_over_residuals() -> None:
 
 def test_what_triangles_cannot_hold_is_refused() -> None:
     with pytest.raises(ro.InputError, match="found a loss that is not a sum, with data in blocks"):
-        in_blocks(ro.minimax, lambda: 120)
+        in_blocks(ro.minimax)
     squares = QuadraticModel(cp.norm1, "bent", "equation")
     flat: Any = SimpleNamespace(slope=lambda v: None)
     with pytest.raises(ro.InputError, match="formulation 'bent': found a loss without gradient"):
@@ -134,7 +134,7 @@ def test_what_triangles_cannot_hold_is_refused() -> None:
 
 
 def test_a_loss_over_triangles_is_a_sum_of_squares_and_its_maker() -> None:
-    solved, squares = in_blocks(ro.robust, lambda: 120)
+    solved, squares = in_blocks(ro.robust)
     assert (solved.loss, solved.loss_over, solved.penalty) == (SQUARES, "equation", ro.robust.penalty)
     assert squares is not None
     assert (squares.loss, squares.over, squares.before) == (ro.robust.loss, "configuration", None)

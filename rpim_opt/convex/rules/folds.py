@@ -48,12 +48,8 @@ def leave_one_out(program: Program) -> Selection:
     mixed = form is not None and not form.diagonal  # a square then belongs to no configuration
     if program.closed_form and not mixed:
         return linear_rule(program, "leave_one_out", _of_squares(program), "smallest leave-one-out error")
-    return _least(
-        program,
-        "leave_one_out",
-        held_out_error(program, _singly(program)),
-        held_out_error(program, _drawn(program, FOLDS)),
-    )
+    begin = held_out_error(program, _drawn(program, FOLDS))
+    return _least(program, "leave_one_out", "smallest leave-one-out error", held_out_error(program), begin)
 
 
 @on_squares
@@ -70,16 +66,17 @@ def k_fold(program: Program, folds: int = FOLDS, seed: int = 0, parts: Sequence[
     >>> f"{result.weight:.2g}", result.selection.interior
     ('0.93', True)
     """
+    note = "smallest k-fold cross-validation error"
     groups = np.unique(with_rows(program, "k_fold").group)
     if parts is not None:
         present = [each for each in (np.intersect1d(part, groups) for part in parts) if len(each)]
         if len(present) < 2 or not np.array_equal(np.sort(np.concatenate(present)), groups):
             found = f"{len(present)} parts with {sum(map(len, present))} of {len(groups)} configurations"
             raise InputError("selector k_fold, parts", found, "two or more, with every configuration in exactly one")
-        return _least(program, "k_fold", held_out_error(program, present))
+        return _least(program, "k_fold", note, held_out_error(program, present))
     if len(groups) < folds:
         raise InputError("selector k_fold", f"{len(groups)} configurations", f"at least {folds}, or fewer folds")
-    return _least(program, "k_fold", held_out_error(program, _drawn(program, folds, seed)))
+    return _least(program, "k_fold", note, held_out_error(program, _drawn(program, folds, seed)))
 
 
 @on_squares
@@ -116,7 +113,7 @@ def two_step(program: Program) -> Selection:
     return choice("two_step", fine, score, int(np.nanargmin(score)), note, at_edge=note + edge)
 
 
-def _least(program: Program, name: str, error: Score, begin: Score | None = None) -> Selection:
+def _least(program: Program, name: str, note: str, error: Score, begin: Score | None = None) -> Selection:
     """Return the choice of the least error of configurations held out; a cheaper one tells where to ``begin``."""
     if program.closed_form:
         weights = weight_grid(program)
@@ -124,7 +121,7 @@ def _least(program: Program, name: str, error: Score, begin: Score | None = None
         best = int(np.argmin(score))
     else:
         weights, score, best = searched(error, weight_grid(program, COARSE), begin)
-    return choice(name, weights, score, best, "smallest k-fold cross-validation error")
+    return choice(name, weights, score, best, note)
 
 
 # --- errors of what is left out --------------------------------------------------------------------------------
@@ -137,11 +134,6 @@ def _drawn(program: Program, count: int, seed: int = 0) -> list[np.ndarray]:
     return np.array_split(np.random.default_rng(seed).permutation(groups), count)
 
 
-def _singly(program: Program) -> list[np.ndarray] | None:
-    """Return None for every configuration alone, or parts of too many."""
-    return _drawn(program, PARTS) if len(np.unique(program.model.group)) > PARTS else None
-
-
 def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) -> Score:
     """Return a function for the RMS (K,) of whitened residuals of held-out parts, predicted by solving without them.
 
@@ -151,8 +143,8 @@ def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) 
     groups = np.unique(model.group)
     if len(groups) < 2:
         raise InputError("data", "one configuration", "two or more to hold one out")
-    if parts is None:
-        parts = list(groups[:, None])
+    if parts is None:  # each alone, of too many so many parts
+        parts = list(groups[:, None]) if len(groups) <= PARTS else _drawn(program, PARTS)
     part_of = np.full(int(groups.max()) + 1, -1)
     for k, part in enumerate(parts):
         part_of[part] = k

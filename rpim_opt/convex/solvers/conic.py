@@ -150,7 +150,7 @@ class Canonical:
         return (np.sqrt(np.where(curved, values, 0.0)) * vectors).T[curved]
 
     @cached_property
-    def linear_cones(self) -> list[Any]:
+    def clarabel_cones(self) -> list[Any]:
         """The cones as Clarabel has them."""
         if self.cones is not None:
             return list(self.cones)
@@ -441,7 +441,7 @@ class _ConicData:
 
     def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
         clarabel = import_module("clarabel")
-        cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.linear_cones]
+        cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.clarabel_cones]
         top, size = k + len(p.b), p.size + k
         squares = np.arange(k)
         # entries as (rows, columns, numbers): R and A, which other programs have other numbers of, and the rest
@@ -449,7 +449,7 @@ class _ConicData:
         entries = [(squares, p.size + squares, -np.ones(k)), _entries(p.A, k, 0)]
         curvature = [_entries(p.P, 0, 0, upper=True), (p.size + squares, p.size + squares, np.full(k, 2.0))]
         if loss is not None:
-            cones += loss.linear_cones
+            cones += loss.clarabel_cones
             entries += [_entries(loss.A, top, size)]
             curvature += [_entries(loss.P, size, size, upper=True)]
             begin = top + len(loss.b)
@@ -543,7 +543,7 @@ def nearest(p: Canonical, z: Array) -> Array:
     bound = np.concatenate([p.b, [0.0], -z])  # (t, x - z) in a second-order cone, the least t
     cone = import_module("clarabel").SecondOrderConeT(n + 1)
     flat = sparse.csc_matrix((N + 1, N + 1))
-    clarabel = Clarabel([*p.linear_cones, cone], (*ATTEMPTS, LOOSE))
+    clarabel = Clarabel([*p.clarabel_cones, cone], (*ATTEMPTS, LOOSE))
     solution = clarabel.solve(flat, np.append(np.zeros(N), 1.0), A, bound)
     return np.array(solution.x)[p.at]
 

@@ -59,10 +59,10 @@ class WarmStart:
             self.small[key] = ReducedProgram(self.penalty, rows, loss, sizes)
         return self.small[key]
 
-    def begin(self, z: Array | None) -> WarmStart:
-        """Forget all but z (n,), where the next minimum is looked for, or that too."""
+    def begin(self, z: Array) -> WarmStart:
+        """Look for the next minimum from z (n,) on, with solvers set up anew."""
         with self.lock:
-            self.z = self.x = z if z is not None and len(self.penalty.at) == self.penalty.size else None
+            self.z = self.x = z if len(self.penalty.at) == self.penalty.size else None
             self.width, self.count, self.small = 0.0, 0, {}
         return self
 
@@ -70,14 +70,14 @@ class WarmStart:
 def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
     """Return the minimum of a convex program; the structure of the loss selects the solver.
 
-    ========================== =====================================================
-    quadratic                  the small program of its QR factor
-    separable, smooth          proximal Newton, a sequence of small programs
-    separable, non-smooth      the same on the smoothed loss, then rows near kinks
-    at most `FEW_ENTRIES`      all rows as they are, where that is quicker
-    with a threshold           entries near a kink as they are, tangents of others
-    any other                  all rows
-    ========================== =====================================================
+    ============================ ===================================================
+    quadratic                    the small program of its QR factor
+    separable, few entries       all rows as they are, where that is quicker
+    separable, smooth            proximal Newton, a sequence of small programs
+    separable, non-smooth        the same on the smoothed loss, then rows near kinks
+    with a threshold             entries near a kink as they are, tangents of others
+    any other                    all rows
+    ============================ ===================================================
 
     ``accuracy`` is the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is
     found, also by a small program of proximal Newton: then CVXPY solves all rows (`Program.solve`).
@@ -91,7 +91,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
         else:
             try:
                 point = _by_newton(loss, rows, warm, weight, damping, accuracy)
-            except (OutsideDomain, np.linalg.LinAlgError, FloatingPointError):
+            except (OutsideDomain, np.linalg.LinAlgError):
                 point = _all_rows(loss, rows, warm, weight, damping)
         warm.z, warm.x = point.x[warm.penalty.at], point.x
         return point
