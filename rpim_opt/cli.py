@@ -114,11 +114,8 @@ MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
 Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
 RULES = "learned (estimated prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
-Selector = Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)]
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
-Formulation = Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)]
 PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated noise), free (both), declared (none)."
-Noise = Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)]
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or its folder.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
@@ -127,10 +124,8 @@ Sheet = Annotated[str, Option(help="Excel sheet, by name or number; several as J
 Key = Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")]
 TimeTolerance = Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")]
 Several = "several files are stacked, or joined as by rpim-opt new."
-Type = Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")]
 Tolerance = Annotated[Number, Option(help="Acceptance tolerance [mm]: exit code 1 if rejected, 4 if inconclusive.")]
 Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
-Largest = Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
 Marker = Annotated[Text, Option(help="Name of the reflector, if there are several.")]
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
@@ -179,7 +174,7 @@ class Answer(NamedTuple):
         lines += [f"Written: {file}" for file in self.written or ()]
         more = {"left_out": self.left_out, "tables": self.notes or None, "written": self.written}
         document = {**self.document, **{key: value for key, value in more.items() if value is not None}}
-        console.show("\n".join(lines), document, as_json)
+        console.show(document if as_json else "\n".join(lines))
 
 
 class Tables(NamedTuple):
@@ -190,7 +185,7 @@ class Tables(NamedTuple):
     time_tolerance: TimeTolerance = None
     sheet: Sheet = ""
     decimal: Decimal = ""
-    measurement: Type = None
+    measurement: Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")] = None
 
     def read(self, result: "ro.calibration.Calibration", sources: list[Path]) -> "Measured":
         """Return the measurements of tables."""
@@ -278,7 +273,7 @@ def new(
             made = ro.store.new_problem(
                 folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
-                understood=None if "--json" in sys.argv else lambda found: console.show(f"{found}\n", {}, False),
+                understood=None if "--json" in sys.argv else lambda found: console.show(f"{found}\n"),
             )  # fmt: skip
     document = made.understood.content()
     document["notes"] += made.notes
@@ -321,10 +316,10 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
 def calibrate(
     problem: Problem,
     variant: Variant = None,
-    selector: Selector = None,
+    selector: Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)] = None,
     model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.", autocompletion=MODELS)] = None,
-    formulation: Formulation = None,
-    noise: Noise = None,
+    formulation: Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)] = None,
+    noise: Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
     use_validation: Annotated[Choice, Option(help="Refit with the validation rows; default: if held out.")] = None,
     limit: Tolerance = None,
@@ -381,7 +376,7 @@ def validate(
     result: Result,
     data: Annotated[list[Path], Argument(help=f"New measurements; {Several}")],
     tables: Tables = TABLES,
-    limit: Largest = None,
+    limit: Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")] = None,
     register: Register = False,
     out: Table = None,
 ) -> Answer:

@@ -24,26 +24,21 @@ if TYPE_CHECKING:
 # --- output ------------------------------------------------------------------------------------------------
 
 
-def show(text: object, document: dict[str, Any], as_json: bool) -> None:
-    """Print the text, or the document as JSON."""
-    _print(document if as_json else str(text), sys.stdout)
+def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
+    """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
+    if not isinstance(text, str):
+        text = json_text(text).rstrip("\n")
+    encoding = getattr(stream or sys.stdout, "encoding", None) or "utf-8"
+    print(visible(text).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
 
 def fail(text: str, code: int) -> None:
     """Print an error on stderr, as JSON with ``--json``, and end with an exit code."""
     try:
-        _print({"error": text} if "--json" in sys.argv else text, sys.stderr)
+        show({"error": text} if "--json" in sys.argv else text, sys.stderr)
     except OSError:  # the reader has closed it
         _close(sys.stderr)
     sys.exit(code)
-
-
-def _print(text: str | dict[str, Any], stream: TextIO) -> None:
-    """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
-    if not isinstance(text, str):
-        text = json_text(text).rstrip("\n")
-    encoding = getattr(stream, "encoding", None) or "utf-8"
-    print(visible(text).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
 
 @contextmanager

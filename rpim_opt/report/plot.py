@@ -191,13 +191,10 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     'residual norm [standard deviations of the noise]'
     >>> ax.figure.savefig("l_curve.pdf")
     """
-    program = of.program if isinstance(of, Calibration) else of
+    program, own = (of.program, of.selector) if isinstance(of, Calibration) else (of, "")
     marked = {name: choice.weight for name, choice in (selections or {}).items()}
-    own = ""
     if isinstance(of, Calibration):
-        own = of.selector
-        if own not in marked:
-            marked = {own: of.weight, **marked}
+        marked.setdefault(own, of.weight)
 
     def at(weight: float) -> list[Array]:
         """Return the curve's point at a weight, or none: far from the chosen one a solver may fail."""
@@ -219,9 +216,8 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
                 continue
             style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
             ax.plot([x], [y], color=f"C{k}", label=label, **style)
-    ax.set(
-        xlabel="residual norm [standard deviations of the noise]", ylabel="deviation norm [prior standard deviations]"
-    )
+    ax.set(xlabel="residual norm [standard deviations of the noise]")
+    ax.set(ylabel="deviation norm [prior standard deviations]")
     logarithmic(ax, "x")
     logarithmic(ax, "y")
     return _with_legend(ax)
@@ -276,10 +272,9 @@ def checks(found: Monitoring, ax: Axes) -> None:
     """Draw every check against its limit."""
     place = _times(found, ax)
     ax.plot(place, found.allowed, color=COLORS["mark"], lw=1.5, label="limit, checks beyond it")
-    beyond = list(found.beyond)
-    within = np.setdiff1d(np.arange(len(place)), beyond).tolist()
-    for at, role, label in ((within, "after", "check"), (beyond, "mark", "")):
-        if at:
+    beyond = found.sigmas > found.allowed
+    for at, role, label in ((~beyond, "after", "check"), (beyond, "mark", "")):
+        if at.any():
             _dots(ax, place[at], found.sigmas[at], role, label)
     ax.set(ylabel="residual [standard deviations]")
     ax.set_ylim(bottom=0)

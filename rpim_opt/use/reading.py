@@ -14,7 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import EXCEL, read_columns
-from rpim_opt.basics.units import UNITS, accepted_units, joint_columns, split_unit
+from rpim_opt.basics.units import display, joint_columns, split_unit
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
@@ -169,9 +169,9 @@ def read_measurements(
     variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in known], axis=0)
     noise = {}
     for (component, dimension), sigma in zip(calibrated.components.items(), np.sqrt(variance), strict=True):
+        unit, si = display(dimension)
         if component in kind.components:
-            unit = next(unit for unit in accepted_units(dimension) if UNITS[unit].si == 1.0)
-            noise[f"{component}_{unit}"] = float(sigma)
+            noise[f"{component}_{unit}"] = float(sigma) / si
     data = rows_of(understanding, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))

@@ -13,7 +13,7 @@ from scipy.special import fdtrc, logsumexp
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, table
-from rpim_opt.basics.units import UNITS, accepted_units, display
+from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
@@ -297,9 +297,9 @@ def posterior_as_prior(
     widths = _widths(result, problem)
     centre, scale = {}, {}
     for i in [free.names.index(name) for name in released]:
-        unit = next(u for u in accepted_units(free.dimensions[i]) if UNITS[u].si == 1.0)
-        centre[f"{free.names[i]}_{unit}"] = float(x[i])
-        scale[f"{free.names[i]}_{unit}"] = float(SIZES[-1] * widths[i])  # so wide that readings alone decide
+        unit, si = display(free.dimensions[i])
+        centre[f"{free.names[i]}_{unit}"] = float(x[i]) / si
+        scale[f"{free.names[i]}_{unit}"] = float(SIZES[-1] * widths[i]) / si  # so wide that readings alone decide
     prior = Prior(centre=centre, scale=scale)
     if len(released) < len(free):
         known = set(result.problem.parameters.free.names)
