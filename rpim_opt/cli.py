@@ -357,8 +357,7 @@ def calibrate(
 
 @command
 def report(
-    result: Result,
-    out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
+    result: Result, out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None
 ) -> Answer:
     """Write the calibration report: one self-contained HTML page, ready to be signed."""
     with _loaded(result) as (loaded, say):

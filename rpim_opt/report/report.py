@@ -200,7 +200,7 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
         "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
         "of the configurations that reach it, at any depth. Axes of the robot's base. Not included is what no reading "
-        "varied: the instrument's scale, temperature and loads other than those measured.",
+        "varied: the instrument's scale, temperature and loads other than those measured."
     ]
     required = result.record.requirement is not None
     limit = 1e3 * map_.requirement.limit if required else None
