@@ -20,6 +20,7 @@ from rpim_opt.data.tables.names import recognize
 CYCLES, POSES = 30, 5  # how often the standard has how many poses approached
 ANGLES = ("a", "b", "c")  # the standard's names of the rotations
 AXES = ("x", "y", "z")
+NONE = (None, None, None)
 ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
 """What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
 ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
@@ -105,16 +106,14 @@ class Performance(Tabled):
         return lines
 
     def _frame_rows(self) -> list[dict[str, Any]]:
-        turned = any(each.RP_angles is not None for each in self.poses)
+        keys = ["AP_p_mm", *(f"AP_{axis}_mm" for axis in AXES), "RP_l_mm"]
+        if any(each.RP_angles is not None for each in self.poses):
+            keys += [f"{kind}_{name}_mrad" for kind in ("AP", "RP") for name in self.names]
         rows = []
         for each in self.poses:
-            figures: dict[str, float | None] = {"AP_p_mm": each.AP}
-            figures |= {f"AP_{axis}_mm": v for axis, v in zip(AXES, each.AP_axes or [None] * 3, strict=True)}
-            figures["RP_l_mm"] = each.RP
-            for kind, values in (("AP", each.AP_angles), ("RP", each.RP_angles)) if turned else ():
-                angles = zip(self.names, values or [None] * 3, strict=True)
-                figures |= {f"{kind}_{name}_mrad": value for name, value in angles}
-            rows.append({"pose": each.pose, "cycles": each.cycles, **{k: _milli(v) for k, v in figures.items()}})
+            positions = [each.AP, *(each.AP_axes or NONE), each.RP]
+            figures = zip(keys, [*positions, *(each.AP_angles or NONE), *(each.RP_angles or NONE)], strict=False)
+            rows.append({"pose": each.pose, "cycles": each.cycles, **{key: _milli(value) for key, value in figures}})
         return rows
 
 
@@ -240,9 +239,8 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
             dimension = "length" if meaning.stem in AXES else "angle"
             unit = unit or units.get(dimension, "")
             if not unit or dimension_of(unit) != dimension:
-                raise InputError(
-                    "the header", f"column '{name}' without a unit of {dimension}", "x_mm, or --units deg,mm"
-                )
+                found = f"column '{name}' without a unit of {dimension}"
+                raise InputError("the header", found, "x_mm, or --units deg,mm")
             ours, size = FOREIGN.get(unit, (unit, 1.0))
             of[meaning.stem] = name, size * UNITS[ours].si
     attained, commanded = figures.values()
