@@ -65,12 +65,6 @@ class Instance(Tabled):
     role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
     tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,
     all rows are used.
-
-    >>> import rpim_opt as ro
-    >>> instance = ro.load("paper_arm")
-    >>> result = instance.calibrate()
-    >>> instance.record.title, instance.record.excluded["T8-7"], instance.published["validation"]["RPIM"]
-    ("The paper's cooperative manipulator", 'z misprinted, off by 15.0 mm', 0.468)
     """
 
     problem: CalibrationProblem

@@ -42,12 +42,7 @@ PACKAGE = Path(__file__).resolve().parents[1]
 
 
 def problems_folder() -> Path:
-    """Return the folder of the shipped problems: inside the package, or beside it in a checkout.
-
-    >>> import rpim_opt as ro
-    >>> (ro.store.problems_folder() / "position" / "problem.toml").is_file()
-    True
-    """
+    """Return the folder of the shipped problems: inside the package, or beside it in a checkout."""
     inside = PACKAGE / "problems"
     return inside if inside.is_dir() else PACKAGE.parent / "problems"
 

@@ -41,22 +41,11 @@ Files = Sequence[tuple[Path | None, RawTable]]
 
 @dataclass(frozen=True, eq=False)
 class Understanding:
-    r"""Interpretation of raw tables.
+    """Interpretation of raw tables, as `understand_tables` returns it.
 
     ``kind`` is what was measured, ``columns`` one table with our names (texts and numbers as the files have them),
     ``raw`` the same rows with theirs, ``tables`` what was understood of every file, ``notes`` how they were joined and
     what was checked, ``options`` what was stated of them, ``file`` the first of them.
-
-    >>> from pathlib import Path
-    >>> import rpim_opt as ro
-    >>> rows = ["Point;" + ";".join(f"J{i} [deg]" for i in range(1, 7)) + ";X [mm];Y [mm];Z [mm]"]
-    >>> rows += [f"P{k};{k},5;-90;10;20;30;40;{k}00,125;200;300" for k in range(1, 4)]
-    >>> _ = Path("raw.csv").write_text("\n".join(rows))
-    >>> found = ro.store.understand_tables("ur5e", ["raw.csv"])
-    >>> print(str(found).splitlines()[2])
-    Point      label of the row   label         a known name
-    >>> found.columns["x_mm"], found.kind.name
-    (['100.125', '200.125', '300.125'], 'position')
     """
 
     kind: Measurement

@@ -75,12 +75,6 @@ def save_result(result: Calibration, path: str | Path) -> None:
 
     The file is written completely or not at all. The calibration's record has title, validation data and input files.
     InputError for a `PartitionedProblem`, whose measurements the file cannot repeat.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.load("paper_arm").calibrate(weight=1e-3)
-    >>> ro.store.save_result(result, "result.json")
-    >>> ro.load_result("result.json").record.title
-    "The paper's cooperative manipulator"
     """
     if not result.problem.keeps_rows:
         raise InputError("save_result", "data in blocks", "data in memory, which the file repeats")

@@ -443,12 +443,7 @@ def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple
 
 
 def noted(text: str, ending: str, note: str) -> str:
-    r"""Return the text of a file with a note: a comment, a column of CSV, or the key ``source`` of JSON.
-
-    >>> from rpim_opt.use.export import noted
-    >>> noted("a: 1\n", ".yaml", "Not delivered.").splitlines()
-    ['# Not delivered.', 'a: 1']
-    """
+    """Return the text of a file with a note: a comment, a column of CSV, or the key ``source`` of JSON."""
     if not note or note in text:
         return text
     if ending == ".json":
