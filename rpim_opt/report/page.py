@@ -98,9 +98,6 @@ def render(
     )  # fmt: skip
 
 
-# --- checks over time --------------------------------------------------------------------------------------
-
-
 def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     """Write checks over time, as `use.monitor` returns them, as one HTML page that works offline.
 

@@ -30,11 +30,12 @@ if TYPE_CHECKING:
 __all__ = ["error_vectors", "errors", "l_curve", "parameters"]
 
 Axes = Any  # matplotlib's, imported where axes are made
-
-# --- errors ------------------------------------------------------------------------------------------------
-
 MODELS = {"before": "nominal", "after": "identified"}  # model that errors before and after calibration are of
 MANY_ROWS = 100  # above it each row is a small point without a name
+TIMES = ((86400.0, "days"), (3600.0, "hours"))  # units of an axis of time [s]
+CELLS, SHADES = 24, 5  # of a map: cells along the longer side, and levels
+VIEWS = {"from above": (0, 1), "from the side": (0, 2)}  # axes to the right and up
+VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
 
 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
@@ -106,9 +107,6 @@ def error_vectors(result: Calibration, data: Dataset | None = None, nominal: boo
     return ax
 
 
-# --- parameters --------------------------------------------------------------------------------------------
-
-
 def parameters(result: Calibration, dimension: str = "length", confidence: float = 0.95, ax: Axes = None) -> Axes:
     """Draw the deviations of the robot's parameters of a dimension with their intervals and tolerances.
 
@@ -171,11 +169,6 @@ def active_tolerance(result: Calibration) -> Array:
     return np.full(len(tolerance), np.inf)
 
 
-# --- the regularization weight -----------------------------------------------------------------------------
-
-VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
-
-
 def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | None = None, ax: Axes = None) -> Axes:
     """Draw the L-curve: root of the penalty against root of the loss over the weight, with the selectors' choices.
 
@@ -223,14 +216,6 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     return _with_legend(ax)
 
 
-# --- uncertainty in the workspace --------------------------------------------------------------------------
-
-CELLS = 24  # cells along the longer side
-SHADES = 5
-VIEWS = {"from above": (0, 1), "from the side": (0, 2)}
-"""Axes to the right and up."""
-
-
 def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | None, view: str, ax: Axes) -> None:
     """Draw a map of the expanded uncertainties (N,) at positions (N, 3), all in mm, as a `VIEWS` sees it.
 
@@ -261,11 +246,6 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
         ax.plot([a, b, b, a, a], [c, c, d, d, c], color=COLORS["ink"])
     ax.set(xlabel=f"{'xyz'[across]} [mm]", ylabel=f"{'xyz'[up]} [mm]", aspect="equal")
     _with_legend(ax)
-
-
-# --- checks over time --------------------------------------------------------------------------------------
-
-TIMES = ((86400.0, "days"), (3600.0, "hours"))  # units of an axis of time [s]
 
 
 def checks(found: Monitoring, ax: Axes) -> None:

@@ -39,6 +39,11 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
 
+MOST_FLAGGED = 200  # flagged rows that are named, the worst first
+FEW_NUMBERS = 8  # longer arguments of a penalty or constraint are said by their length: an earlier result is a matrix
+WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
+L_CURVE_HEIGHT = 430.0
+
 
 def write_report(calibration: Calibration, path: str | Path, validation: Dataset | None = None) -> None:
     """Write a calibration report: one HTML file that needs no network, written whole or not at all.
@@ -93,9 +98,6 @@ def page(result: Calibration) -> str:
     )
 
 
-# --- verdict and headline ----------------------------------------------------------------------------------
-
-
 def _headline(content: Content) -> Iterator[Block]:
     result = content.result
     accepted = content.accepted
@@ -136,9 +138,6 @@ def _mean_interval(errors: Array) -> str:
         return ""
     half = stdtrit(len(known) - 1, 0.975) * known.std(ddof=1) / np.sqrt(len(known))
     return f"95 % CI {mm(max(known.mean() - half, 0.0))} to {mm(known.mean() + half)}"
-
-
-# --- accuracy and uncertainty ------------------------------------------------------------------------------
 
 
 def _accuracy(content: Content) -> Iterator[Block]:
@@ -240,9 +239,6 @@ def _budget(map_: Workspace, result: Calibration) -> Table:
     return Table(title, head, rows)
 
 
-# --- parameters --------------------------------------------------------------------------------------------
-
-
 def _parameters(content: Content) -> Iterator[Block]:
     result = content.result
     free = result.problem.parameters.free
@@ -298,11 +294,6 @@ def _transmission(result: Calibration) -> Iterator[Block]:
         caption = f"Joint {each.joint}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
         drawn.append(figure(draw, f"Transmission error of joint {each.joint}", caption, 200.0))
     yield "figures", drawn
-
-
-# --- diagnostics -------------------------------------------------------------------------------------------
-
-MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 
 
 def _diagnostics(content: Content) -> Iterator[Block]:
@@ -386,9 +377,6 @@ def _convergence(result: Calibration) -> Iterator[Block]:
     yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 
-# --- provenance --------------------------------------------------------------------------------------------
-
-
 def _provenance(content: Content) -> Iterator[Block]:
     result = content.result
     record = result.record
@@ -430,10 +418,6 @@ def _robot(name: str, robot: Robot) -> str:
     return " - ".join(filter(None, [named, f"{robot.dof} joints", robot.source]))
 
 
-FEW_NUMBERS = 8
-"""Arguments of a penalty or constraint that are longer are said by their length: an earlier result is a matrix."""
-
-
 def _formulation(result: Calibration) -> str:
     """Return what is minimized, in the terms of the result's file."""
 
@@ -463,12 +447,6 @@ def _noise(block: Rows) -> str:
         value = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
         components.setdefault(f"{value} {unit}".strip(), []).append(name)
     return "; ".join(f"{value} ({', '.join(names)})" for value, names in components.items())
-
-
-# --- appendix: the weight ----------------------------------------------------------------------------------
-
-WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices that have no note; others were given
-L_CURVE_HEIGHT = 430.0
 
 
 def _regularization(content: Content) -> Iterator[Block]:

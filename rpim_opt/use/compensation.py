@@ -300,9 +300,6 @@ def compensate_file(result: Calibration, targets: str | Path, out: str | Path, *
     return compensation
 
 
-# --- arguments ---------------------------------------------------------------------------------------------
-
-
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
     """Return the targets as arrays, labelled, or say what does not fit."""
     rows = stated.q if stated.poses is None else stated.poses
