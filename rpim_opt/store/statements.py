@@ -255,25 +255,22 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
 
 def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:
     """Return the stated values [SI] of the measurements' own parameters: ``[anchor] x_mm``, ``[anchor.A] x_mm``."""
-    used: dict[str, dict[str, dict[str, str]]] = {}  # dimension by table, fixture and coordinate
+    used: dict[str, dict[str, dict[str, tuple[str, ...]]]] = {}  # dimensions by table, fixture and coordinate
     for block in data.blocks:
         for name, dimension in block.measurement.parameters.items():
             table, _, coordinate = name.partition("_")
-            used.setdefault(table, {}).setdefault(block.fixture, {})[coordinate] = dimension
+            used.setdefault(table, {}).setdefault(block.fixture, {})[coordinate] = (dimension,)
     own: dict[str, float] = {}
     for table, content in placed.items():
         if table not in used:
             raise InputError(f"table {table}", "a fixture that no measurement here has", choices(table, used))
         for fixture, coordinates in used[table].items():
-            part: Any = content
-            where = f"table {table}"
-            if fixture:
-                part = content.get(fixture, {})
-                where = f"table {table}.{fixture}"
+            where = f"table {table}.{fixture}" if fixture else f"table {table}"
+            part: Any = content.get(fixture, {}) if fixture else content
             if not isinstance(part, dict):
                 raise InputError(where, repr(part)[:60], "a table")
-            values = quantities(part, {name: (dimension,) for name, dimension in coordinates.items()}, where)
-            own |= {of_fixture(f"{table}_{name}", fixture): value for (name, _), value in values.items()}
+            for (name, _), value in quantities(part, coordinates, where).items():
+                own[of_fixture(f"{table}_{name}", fixture)] = value
         unknown = [key for key, value in content.items() if isinstance(value, dict) and key not in used[table]]
         if unknown:
             raise InputError(f"table {table}", f"'{unknown[0]}'", choices(unknown[0], used[table]))

@@ -45,9 +45,8 @@ BESIDE = 0.05  # distance [m] of a stated position from the joint values beside 
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 AT_FAULT = {UNREACHABLE: " in the robot's base frame", ABOVE: ""}  # states of commands that miss, and of which target
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
-BANK = 2000
-TRIALS = 12
-"""Configurations among which a pose without a start looks for the nearest ones, and how many of them it tries."""
+BANK, TRIALS = 2000, 12  # configurations among which a pose without a start looks for near ones; how many it tries
+WEIGHED = "a calibration with compliances identified from torques of gravity, or a term that depends on the payload"
 
 
 @dataclass(frozen=True, eq=False)
@@ -258,10 +257,7 @@ def compensate(
     mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
     if payload is not None or payload_centre is not None:
         if not cell.loads.payload:
-            accepted = (
-                "a calibration with compliances identified from torques of gravity, or a term that depends on the "
-            )
-            raise InputError("payload", "a payload without effect on the model", f"{accepted}payload")
+            raise InputError("payload", "a payload without effect on the model", WEIGHED)
         if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
             raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
     if cell.loads.payload:
@@ -410,10 +406,8 @@ class _Cell(NamedTuple):
         p, x, covariance, marker, point = _tooled(result, which, tool, marker)
         values = p.values(x)
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
-        moved = np.eye(4)
-        if base:
-            stated, located = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
-            moved = np.linalg.inv(stated) @ located
+        stated, located = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
+        moved = np.linalg.inv(stated) @ located if base else np.eye(4)
         measured = result.problem.sample().alone(which) if which else result.problem
         repeatability = measured.repeatability
         if repeatability is not None and tool is not None:
@@ -435,21 +429,18 @@ class _Cell(NamedTuple):
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         # what the joints of the model bear, as `Arm.at` takes it
-        borne = [np.empty((N, 0))]
-        if torque is not None:
-            borne.append(torque @ np.linalg.inv(self.robot.joint_map))
-        if payload is not None:
-            borne.append(payload[:, None])
-        load = np.hstack(borne)
-        if poses is not None:
-            commands, target = self._commands(poses, q, load), poses
-            missed = self.nominal.at(commands, load, poses)[1]
-            beside = np.full(N, np.nan) if q is None else self._norms(self.nominal.at(q, load, poses)[1])[0]
-        else:
+        borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
+        load = np.hstack([np.empty((N, 0)), *borne, *([] if payload is None else [payload[:, None]])])
+        beside = np.full(N, np.nan)
+        if poses is None:
             commands = np.asarray(q)
             target, error, _ = self.nominal.at(commands, load, np.zeros((N, len(self.kind.columns))))
             missed = np.zeros_like(error)
-            beside = np.full(N, np.nan)
+        else:
+            commands, target = self._commands(poses, q, load), poses
+            missed = self.nominal.at(commands, load, poses)[1]
+            if q is not None:
+                beside = self._norms(self.nominal.at(q, load, poses)[1])[0]
         _, before, J = self.identified.at(commands, load, target)
         W = attainable(J)
         unit = joint_units(self.robot, J.shape[1])
