@@ -170,6 +170,11 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)
         refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))
+    excluded = [rows for rows in (result.excluded, refitted.excluded) if rows is not None]
+    if excluded:
+        refitted = replace(
+            refitted, excluded=Dataset.together(excluded, ["identification", "all rows"][: len(excluded)])
+        )
     return replace(refitted, record=record)
 
 

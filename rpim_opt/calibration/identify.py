@@ -27,6 +27,7 @@ from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.select import weight_of
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import require_affordable
+from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import relocated
 from rpim_opt.problem.registration.global_start import JointMapping, find_mapping
 
@@ -174,8 +175,12 @@ def calibrate(
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
     learned = None
+    excluded = None
     if weight is None:
         found = estimate(problem, estimator, model, start)
+        if found.learned.left_out and isinstance(problem, CalibrationProblem):
+            labels = [row.label for row in found.learned.left_out]
+            excluded = problem.data.take(np.flatnonzero(np.isin(problem.labels, labels)))
         problem, weight, start, learned = found.problem, 1.0, found.x, found.learned
         formulation = found.stated.penalized(formulation)
     else:
@@ -202,6 +207,7 @@ def calibrate(
         asked=mapped_as(mapping, again, notes),
         learned=learned,
         mapping=mapping,
+        excluded=excluded,
     )
 
 

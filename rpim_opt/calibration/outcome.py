@@ -116,6 +116,7 @@ class Outcome:
     learned: Learned | None = None
     mapping: JointMapping | None = None
     known_causes: tuple[str, ...] | None = None
+    excluded: Dataset | None = None
 
     @property
     def z(self) -> Array:

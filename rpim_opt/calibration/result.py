@@ -54,6 +54,8 @@ class Calibration(Outcome):
         Values of a script's functions, of a result that was read from a file; None otherwise.
     known_causes
         Likely causes of a bad fit that were computed before; None where `causes` computes them.
+    excluded
+        The rows that were excluded as outliers; None without any, of data in blocks and of a result that was read.
 
     Examples
     --------

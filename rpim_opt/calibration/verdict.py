@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NotDelivered
-from rpim_opt.basics.text import three_digits
+from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
@@ -51,6 +51,10 @@ WORSE = 3.0
 """Standard errors by which squared errors on held-out rows are above those of the nominal robot."""
 ROWS = 3
 """Held-out rows below which errors have no standard error, and only those twice the nominal ones count."""
+NOTICED = 2**0.5
+"""The same from which on an effect may explain half of the squares, and leave no less than the noise."""
+UPWARD = 5.0
+"""Standard deviations by which a compliance is below zero, which gravity cannot cause."""
 HOPELESS = 20.0
 """Residuals over the stated noise from which something is said even if nothing explains them."""
 SCALES = 10.0
@@ -59,6 +63,8 @@ LARGEST_CURVE = 0.01
 """Standard deviation of transmission errors [rad] that no gear exceeds: real ones are below a milliradian."""
 LARGEST = {"length": 0.02, "angle": 0.05}
 """A machined and assembled robot deviates by less than this [m, rad]."""
+BENDS = ("compliance", "bend")
+"""Beginnings of the names of parameters with which gravity bends an arm."""
 NOTHING = (
     "None of the tested input mistakes explains it. Check the nominal parameters; the arm may be compliant,"
     " or less repeatable than stated. See rpim-opt inspect."
@@ -374,15 +380,19 @@ def likely_causes(result: Outcome) -> list[str]:
         unit = "mm" if free.dimensions[worst] == "length" else "mrad"
         signs.append(f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}")
     head: list[str] = []
-    causes: list[str] = []
+    ordered = _in_table_order(result, problem)
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
-        causes = [*_explanations(result, problem), *diagnosis.computed_columns(problem)]
+        causes = [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
     elif _of_another_robot(result) and len(problem.arms) == 1 and (other := sibling(problem)) is not None:
         causes = [other.sentence]
-    elif not kept.all():
-        causes = [*diagnosis.rows_without_values(problem), *diagnosis.exchanged_rows(problem)]
+    else:
+        causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
+        if not causes and max(ratio for _, ratio in residuals.values()) > NOTICED and len(problem.arms) == 1:
+            causes = first(diagnosis.shown_by_residuals(_without_outliers(ordered, problem, result.x), result.x))
+    if max(ratio for _, ratio in residuals.values()) > NOTICED:
+        causes += _upward(result)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     if max(ratio for _, ratio in residuals.values()) > HOPELESS:
@@ -397,27 +407,55 @@ def _of_another_robot(result: Outcome) -> bool:
     return bool((np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any())
 
 
-def _explanations(result: Outcome, problem: CalibrationProblem) -> list[str]:
-    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
+def _upward(result: Outcome) -> list[str]:
+    """Say which joints turn against gravity for sure: the mounting is another one, or a force is not gravity's."""
+    names = result.problem.parameters.free.names
+    bent = [i for i, name in enumerate(names) if name.startswith("compliance")]
+    measured = any(block.torque is not None for part in result.problem.rows() for block in part.data.blocks)
+    if not bent or measured or not result.linear_penalty:
+        return []
+    spread = np.sqrt(np.diag(result.covariance))
+    joints = [names[i].removeprefix("compliance") for i in bent if result.x[i] < -UPWARD * spread[i]]
+    if not joints:
+        return []
+    return [
+        f"joint{'s' * (len(joints) > 1)} {joined(joints)} bend against gravity: check `mounting` and the payload, and "
+        "whether something else pulls the arm (a hose, a spring, a counterweight)."
+    ]
+
+
+def _single_rows(result: Outcome, ordered: CalibrationProblem) -> list[str]:
+    """Return what is wrong with single rows, by themselves or by the calibrated robot."""
+    causes = [*diagnosis.rows_without_values(ordered), *diagnosis.filled_rows(ordered.data)]
+    causes += diagnosis.exchanged_rows(ordered)
+    if not causes and result.excluded is not None and len(ordered.arms) == 1:
+        causes += diagnosis.turned_joint(replace(ordered, robots=result.robot))
+    return causes
+
+
+def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
+    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some.
+
+    ``ordered`` has the rows of the problem and those that are held out or excluded, as in the table.
+    """
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(diagnosis.rows_without_values(problem))
-    ordered = _in_table_order(result, problem)
     better = better_reading(ordered)
     read = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
-    rows = [*diagnosis.rows_without_values(problem), *diagnosis.filled_rows(ordered.data)]
-    if read:
-        return [*rows, *read]
-    causes = [*rows, *diagnosis.exchanged_rows(problem)]
-    causes += first(diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem))
+    causes = [*_single_rows(result, ordered), *read]
+    if causes:
+        return causes
+    causes = first(diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem))
     if not causes:
-        errors, own = ordered.errors(result.x), np.isin(ordered.labels, problem.labels)
-        likely = own | (errors <= np.nanmax(errors[own]))  # held-out rows that are gross errors were not looked for
-        alone, x = ordered.on(ordered.data.take(np.flatnonzero(likely))), result.x
-        if result.learned is not None and result.learned.added:  # curves take up ratios and scales of all kinds
+        alone, x = _without_outliers(ordered, problem, result.x), result.x
+        added = () if result.learned is None else result.learned.added
+        curves = [name for name in added if not name.startswith(BENDS)]
+        if curves:  # they take up ratios and scales of all kinds
             p = problem.parameters
-            alone = alone.identifying(p.identified & ~np.isin(p.names, result.learned.added))
+            alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
             x = settled(alone)
-        causes = first(diagnosis.shown_by_residuals(alone, x), diagnosis.scattering_joint(alone, x))
+        single = diagnosis.scattering_joint(alone, x), diagnosis.two_positions(alone, x)
+        causes = first(diagnosis.shown_by_residuals(alone, x), *single)
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))
     if causes or error < LARGEST["length"]:  # which a robot's own effects may be
@@ -427,16 +465,21 @@ def _explanations(result: Outcome, problem: CalibrationProblem) -> list[str]:
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:
-    """Return the problem with held-out rows at their places in the table, where labels have numbers."""
-    apart = result.record.validation
-    if apart is None:
-        return problem
-    numbers = [re.search(r"\d+$", label) for label in (*problem.data.label, *apart.label)]
+    """Return the problem with held-out and excluded rows, all at their places in the table by the labels' numbers."""
+    parts = {"identification": problem.data, "excluded": result.excluded, "validation": result.record.validation}
+    there = {name: data for name, data in parts.items() if data is not None}
+    numbers = [re.search(r"\d+$", label) for data in there.values() for label in data.label]
     rows = [int(match[0]) for match in numbers if match]
-    if len(set(rows)) < len(numbers):  # labels without numbers, or a table of its own
+    if len(set(rows)) < len(numbers):  # labels without numbers, or a validation table of its own
         return problem
     order = np.argsort(rows, kind="stable")
-    return problem.on(Dataset.together([problem.data, apart], ["identification", "validation"]).take(order))
+    return problem.on(Dataset.together(list(there.values()), list(there)).take(order))
+
+
+def _without_outliers(ordered: CalibrationProblem, problem: CalibrationProblem, x: Array) -> CalibrationProblem:
+    """Return the rows that are those of the problem, or no larger errors: of held-out ones gross errors are unknown."""
+    errors, own = ordered.errors(x), np.isin(ordered.labels, problem.labels)
+    return ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= np.nanmax(errors[own])))))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

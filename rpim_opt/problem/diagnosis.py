@@ -25,7 +25,7 @@ from rpim_opt.problem.noise import UNITS, Equations
 from rpim_opt.problem.problem import CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
-from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, misfit, points_of
+from rpim_opt.problem.registration.points import Fit, Points, fit_points, lengths_of, misfit, points_of
 from rpim_opt.problem.row_functions import about_means, repeated
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
@@ -47,6 +47,8 @@ RARE = 1e-6
 """Probability with which chance may explain what is reported."""
 FLAT = 1e-3
 """A coordinate that spreads less than this part of another one is hardly measured."""
+FEW = 3
+"""Outliers from which on they may have one cause."""
 FEWEST = 6
 """Rows on either side of a change, or of which copies are told."""
 LINEAR, EXACT = 13, 1e-5
@@ -391,11 +393,14 @@ def filled_rows(data: Dataset) -> Iterator[str]:
 
     The data are in the order of the table.
     """
-    for block in data.blocks:
-        q, y = block.q[:, 0], block.y[:, :3]
-        if y.shape[1] < 3 or len(y) < 3:
-            continue
-        labels = np.array(data.label)[block.row]
+    of_points = [block for block in data.blocks if block.y.shape[1] >= 3]
+    for kind in dict.fromkeys((block.robot, block.markers) for block in of_points):
+        blocks = [block for block in of_points if (block.robot, block.markers) == kind]
+        row, q, y = (
+            np.concatenate(each) for each in zip(*((b.row, b.q[:, 0], b.y[:, :3]) for b in blocks), strict=True)
+        )
+        order = np.argsort(row, kind="stable")
+        q, y, labels = q[order], y[order], np.array(data.label)[row[order]]
         moves = np.linalg.norm(np.diff(y, axis=0), axis=1)
         middle = np.linalg.norm(y[1:-1] - (y[:-2] + y[2:]) / 2, axis=1) < EXACT
         between = labels[1:-1][middle & (np.minimum(moves[:-1], moves[1:]) > FILLED)].tolist()
@@ -546,13 +551,24 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     fit = fit_points(points)
     label = [problem.data.label[i] for i in points.row]
     far = np.flatnonzero(fit.error > FAR * np.median(fit.error))
-    pairs = []
-    for i, j in combinations(far, 2):
-        crossed = np.linalg.norm([points.y[i] - fit.modelled[j], points.y[j] - fit.modelled[i]], axis=1)
-        if points.marker[i] == points.marker[j] and (crossed < BETTER * fit.error[[i, j]]).all():
-            pairs.append(f"{label[i]} and {label[j]}")
+    away = np.linalg.norm(points.y[far, None] - fit.modelled, axis=2)
+    away[points.marker[far, None] != points.marker] = np.inf
+    other = {
+        int(i): int(j)
+        for i, j, fits in zip(far, away.argmin(axis=1), away.min(axis=1), strict=True)
+        if fits < BETTER * fit.error[i]
+    }
+    pairs = [f"{label[i]} and {label[j]}" for i, j in other.items() if i < j and other.get(j) == i]
     if pairs:
         yield f"the measured values of rows {listed(pairs)} fit each other's joint values: exchange them."
+    for by in (1, -1):
+        shifted = [label[i] for i, j in other.items() if j - i == by]
+        if len(shifted) >= FEWEST and len(shifted) > len(far) / 2:
+            which = "next" if by > 0 else "previous"
+            yield (
+                f"the measured values of rows {listed(shifted)} fit the joint values of the {which} row: was a reading "
+                "missed, or taken twice?"
+            )
     if len(points.tools) < 2 or not len(far):
         return
     model = transformed((fit.base @ forward_kinematics(points.robot, points.q[far]))[:, None], fit.tools)
@@ -604,12 +620,36 @@ def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
     )
 
 
-def _values_that_fit(points: Points, joint: int) -> Array:
-    """Return joint values (N, dof) in which one joint's are those that fit best."""
+def turned_joint(problem: CalibrationProblem) -> Iterator[str]:
+    """Report outliers of a calibrated robot that another value of one joint explains, the same joint in all of them."""
+    points = points_of(problem)
+    if points is None or points.turns is not None:
+        return
+    fit = fit_points(points)
+    limit = FAR * np.median(fit.error)
+    out = points.take(np.flatnonzero(fit.error > limit))
+    best = max(FEW, len(out.row) / 2) - 1
+    said = ""
+    for i in np.flatnonzero(np.array(points.robot.joint_types) == "revolute"):
+        q = _values_that_fit(out, int(i), fit)
+        modelled = transformed(fit.base @ forward_kinematics(points.robot, q), fit.tools[out.marker])
+        explained = np.linalg.norm(out.y - modelled, axis=1) < limit
+        if explained.sum() > best:
+            best = explained.sum()
+            named = _rows([problem.data.label[row] for row in out.row[explained]], "has", "have")
+            off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))
+            by = f"{off.min():.1f} to {off.max():.1f} deg"
+            said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct column q{i + 1}"
+    if said:
+        yield f"{said}, or leave them out ([exclude])."
+
+
+def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Array:
+    """Return joint values (N, dof) in which one joint's are those that fit best, with base and reflectors if known."""
     q, width = points.q, np.pi
     around: Any = 0.0
     for _ in range(MOST_ROUNDS):
-        fit = fit_points(replace(points, q=q))
+        fit = known or fit_points(replace(points, q=q))
         tries = np.repeat(q[:, None], GRID, axis=1)
         tries[..., joint] = around + width * np.linspace(-1, 1, GRID)
         frames = fit.base @ forward_kinematics(points.robot, tries.reshape(-1, q.shape[1]))
@@ -798,7 +838,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
         enough = MOVED if kinds.consecutive else kinds.left / MOVED
         kinds = None if best.left <= enough else kinds
     if kinds is not None:
-        yield _said_of_kinds(problem, kinds)
+        single = scattering_joint(problem, x), two_positions(problem, x)
+        yield from first(*single, [_said_of_kinds(problem, kinds)])
     elif best is not None and abs(best.coefficients[0]) <= best.addition.largest:
         what, remedy = best.addition.said(best.coefficients)
         yield f"{what} (that leaves {100 * best.left:.0f} % of the residuals): {remedy}."
@@ -828,6 +869,13 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     A = whole.linearize(there).A
     for what, (names, cause) in parts.items():
         yield from _changes(whole, there, A, names, what, cause, steadily=what in placed)
+    free = whole.parameters.free
+    nominal = whole.parameters.nominal[whole.parameters.identified]
+    of_arm = (np.array(free.dimensions) == "length") & ~free.of_frames
+    grown = A @ np.where(of_arm, nominal / free.scale, 0.0) * problem.owners / max(len(problem.data) - 1, 1)
+    remedy = "did it warm up? Measure it warm, or in random order, or state temperature_C of every row (expansion)"
+    what = "the arm grows from row to row, by {} from the first to the last"
+    yield Addition(grown[:, None], lambda c: (what.format(f"{100 * c[0]:.2g} %"), remedy), SMALL)
 
 
 def _changes(
@@ -962,6 +1010,38 @@ def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     if _by_chance(gain, whole, N, spare) < RARE:
         left = f"that leaves {100 * np.sqrt(1 - gain / whole):.0f} % of the residuals"
         yield f"{what} ({left}): backlash, a loose encoder, or values read while it moved; check it."
+
+
+def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
+
+    Random errors would leave 60 % of the residuals: half of their sign is not known.
+    """
+    alone = problem.with_repeatability(None)
+    model, free, rows = alone.linearize(x), problem.parameters.free, alone.owners
+    r = model.b - model.A @ (x / free.scale)
+    joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
+    joints = [(i, k) for i, k in joints if model.A[:, k].any()]
+    for some in [*combinations(joints, 1), *combinations(joints, 2)]:
+        A = model.A[:, [k for _, k in some]]
+        sides = np.array(list(product((-1.0, 1.0), repeat=len(some))))
+        step, moved = np.linalg.norm(r) / np.linalg.norm(A, axis=0), np.zeros_like(r)
+        for _ in range(MOST_ROUNDS):
+            errors = [np.bincount(rows, (r - A @ (side * step)) ** 2) for side in sides]
+            columns = A * sides[np.argmin(errors, axis=0)][rows]
+            step = np.linalg.lstsq(columns, r, rcond=None)[0]
+            moved = columns @ step
+        left = float(np.linalg.norm(r - moved) / np.linalg.norm(r))
+        apart = 2 * np.abs(step) * free.scale[[k for _, k in some]]
+        if left < TWO_KINDS and apart.min() >= LOOSE:
+            units = ["mrad" if free.dimensions[k] == "angle" else "mm" for _, k in some]
+            named = zip(some, apart, units, strict=True)
+            sizes = joined([f"joint {i} by {1e3 * each:.2g} {unit}" for (i, _), each, unit in named])
+            yield (
+                f"either of two positions in every row, {sizes} apart, explains the residuals (that leaves "
+                f"{100 * left:.0f} %): backlash; approach all rows from one side, or state the sides (approach1, ...)."
+            )
+            return
 
 
 def _zeros(robot: Robot) -> list[str]:

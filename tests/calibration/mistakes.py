@@ -330,6 +330,20 @@ def to_zenith(y: np.ndarray) -> np.ndarray:
     return np.column_stack([azimuth / np.pi * 0.2, np.arccos(y[:, 2] / radius) / np.pi * 0.2, radius])
 
 
+def grown(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Measure an arm whose lengths grow by 0.1 % from the first row to the last."""
+    free = problem.parameters.free
+    of_arm = (np.array(free.dimensions) == "length") & ~free.of_frames
+    nominal = problem.parameters.nominal[problem.parameters.identified]
+    growth = (problem.jacobian(np.zeros(len(free))) @ np.where(of_arm, nominal, 0.0)).reshape(COUNT, 3)
+    return values(lambda y: y + 1e-3 * np.linspace(0, 1, COUNT)[:, None] * growth)(problem)
+
+
+def of_two_sides(q: np.ndarray) -> np.ndarray:
+    """Return joint values of which the first two are on either side of their play of 2 mrad."""
+    return q + 1e-3 * np.random.default_rng(4).choice([-1, 1], q.shape) * (np.arange(q.shape[1]) < 2)
+
+
 def tenths(q: np.ndarray) -> np.ndarray:
     return np.radians(np.degrees(q).round(1))
 
@@ -345,6 +359,12 @@ IN_TABLES |= {
     "joints 1 to 3 rounded": (
         of_joint_rows(lambda q: np.where(np.arange(q.shape[1]) < 3, tenths(q), q)),
         "(q1, q2, q3)",
+    ),
+    "an arm that warms up": (grown, "the arm grows from row to row, by 0.1 %"),
+    "play in two joints": (of_joint_rows(of_two_sides), "either of two positions in every row, joint 1 by 2 mrad"),
+    "a reading missed, a later one taken twice": (
+        values(lambda y: np.concatenate([y[:12], y[13:24], y[23:]])),
+        "fit the joint values of the next row",
     ),
     "commanded degrees": (commanded, "they are the commanded values"),
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),

@@ -109,6 +109,14 @@ def test_wrong_mounting_bends_upwards():
     assert not lack_of_fit(learned(4, compliance=BENT)).upward
 
 
+@pytest.mark.parametrize(("mounting", "delivered"), [(-1.0, True), (1.0, False)])
+def test_an_arm_that_bends_against_gravity_is_not_delivered_where_residuals_are_beyond_the_noise(mounting, delivered):
+    noisy = arm(4, n=40, compliance=5 * BENT, repeatability=5 * NOISE, mounting=mounting)
+    result = ro.calibrate(noisy, model="auto")
+    assert result.verdict.delivered == delivered
+    assert any("bend against gravity: check `mounting`" in text for text in result.causes) != delivered
+
+
 def test_repeatability_is_no_lack_and_is_told_by_its_size():
     found = lack_of_fit(learned(5, n=60, repeatability=2e-4))
     assert not found.alarming
