@@ -295,6 +295,7 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
         if not any(map(str.isalpha, "".join(row))):
             continue  # a line of dashes
         wide = len(filled) >= width / 2 or (filled[-1] > width / 2 and filled[-1] > 1)
+        wide = wide or (len(filled) > 1 and any(split(cell)[1] for cell in row))  # merged: Pose, Joint values [deg]
         if not wide or len(row) > width + 1:
             break
         headers.insert(0, i)
@@ -474,9 +475,11 @@ def _one_row_each(table: RawTable) -> RawTable:
         found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     (value,) = measured
+    units = {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
+    unit = split(value)[1] or (units.pop() if len(units) == 1 else "")
     for letter in "xyz":
         cells = [texts[value][rows[letter]] if letter in rows else "" for rows in points]
-        columns[_with_unit(letter, split(value)[1])] = cells
+        columns[_with_unit(letter, unit)] = cells
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
 

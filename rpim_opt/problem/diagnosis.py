@@ -784,12 +784,7 @@ def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> E
     """
     r = model.b - model.A @ (x / model.parameters.scale)
     whole = float(r @ r)
-    own = np.linalg.qr(np.vstack([model.A, np.eye(len(x))]))[0]
-
-    def without(columns: Array) -> Array:
-        G = np.vstack([columns, np.zeros((len(x), columns.shape[1]))])
-        return np.asarray(G - own @ (own.T @ G), dtype=float)
-
+    without = _without_parameters(model)
     rest = without(r[:, None])[:, 0]
     tried: list[tuple[float, float, Explained]] = []  # by the variance that is left: of many columns against few
     for addition in additions:
@@ -806,6 +801,18 @@ def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> E
     if gain <= (1 - MOVED) * whole or _by_chance(gain, whole, len(best.coefficients), spare) * len(tried) >= RARE:
         return None
     return best
+
+
+def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
+    """Return a function of columns (m, c) that returns what parameters with their prior leave of them (m + n, c)."""
+    n = model.A.shape[1]
+    own = np.linalg.qr(np.vstack([model.A, np.eye(n)]))[0]
+
+    def without(columns: Array) -> Array:
+        G = np.vstack([columns, np.zeros((n, columns.shape[1]))])
+        return np.asarray(G - own @ (own.T @ G), dtype=float)
+
+    return without
 
 
 def _by_chance(gain: float, whole: float, columns: int, spare: int) -> float:
@@ -1015,33 +1022,38 @@ def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
 def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
 
-    Random errors would leave 60 % of the residuals: half of their sign is not known.
+    The parameters are fitted beside, with their prior. Random errors would leave 60 % of the residuals: their signs are
+    known then, and not their sizes.
     """
     alone = problem.with_repeatability(None)
     model, free, rows = alone.linearize(x), problem.parameters.free, alone.owners
     r = model.b - model.A @ (x / free.scale)
+    without = _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
     joints = [(i, k) for i, k in joints if model.A[:, k].any()]
+    best, said = TWO_KINDS, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
-        A = model.A[:, [k for _, k in some]]
+        numbers = [k for _, k in some]
+        A = columns = model.A[:, numbers]
         sides = np.array(list(product((-1.0, 1.0), repeat=len(some))))
-        step, moved = np.linalg.norm(r) / np.linalg.norm(A, axis=0), np.zeros_like(r)
+        step, target = np.linalg.norm(r) / np.linalg.norm(A, axis=0), r
         for _ in range(MOST_ROUNDS):
-            errors = [np.bincount(rows, (r - A @ (side * step)) ** 2) for side in sides]
+            errors = [np.bincount(rows, (target - A @ (side * step)) ** 2) for side in sides]
             columns = A * sides[np.argmin(errors, axis=0)][rows]
-            step = np.linalg.lstsq(columns, r, rcond=None)[0]
-            moved = columns @ step
-        left = float(np.linalg.norm(r - moved) / np.linalg.norm(r))
-        apart = 2 * np.abs(step) * free.scale[[k for _, k in some]]
-        if left < TWO_KINDS and apart.min() >= LOOSE:
-            units = ["mrad" if free.dimensions[k] == "angle" else "mm" for _, k in some]
-            named = zip(some, apart, units, strict=True)
-            sizes = joined([f"joint {i} by {1e3 * each:.2g} {unit}" for (i, _), each, unit in named])
-            yield (
-                f"either of two positions in every row, {sizes} apart, explains the residuals (that leaves "
-                f"{100 * left:.0f} %): backlash; approach all rows from one side, or state the sides (approach1, ...)."
-            )
-            return
+            step = np.linalg.lstsq(without(columns), without(r[:, None])[:, 0], rcond=None)[0]
+            target = without((r - columns @ step)[:, None])[: len(r), 0] + columns @ step
+        left = float(np.linalg.norm(target - columns @ step) / np.linalg.norm(r))
+        apart = 2e3 * np.abs(step) * free.scale[numbers]
+        if left < best and apart.min() >= 1e3 * LOOSE:
+            best = left
+            units = ["mrad" if free.dimensions[k] == "angle" else "mm" for k in numbers]
+            sizes = [f"joint {some[k][0]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]
+            said = f"either of two positions in every row, {joined(sizes)} apart"
+    if said:
+        yield (
+            f"{said}, explains the residuals (that leaves {100 * best:.0f} %): backlash; approach all rows from one "
+            "side, or state the sides (approach1, ...)."
+        )
 
 
 def _zeros(robot: Robot) -> list[str]:

@@ -298,3 +298,37 @@ def test_a_german_controllers_and_a_trackers_export_need_no_renaming(tmp_path: P
     found = understand_of(arm, [tmp_path / "raw.csv"], options=ro.data.TableOptions(units="deg,mm"))
     assert found.kind is position
     assert set(found.columns) == {"label", *(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", "u95_mm"}
+
+
+def test_the_label_is_the_column_that_tells_rows_apart(tmp_path: Path) -> None:
+    """Not the one collection that all points are of, nor what kind of feature they are; else --key says which."""
+    rows = "A,Main,P1,1,2,401,5,6\nA,Main,P2,3,4,402,6,7\n"
+    found = read(write(tmp_path, HEAD.replace("Point,", "Collection,Group,Point,") + rows))
+    assert found.columns["label"] == ["P1", "P2"]
+    rows = "a,P1,1,2,401,5,6\nb,P2,3,4,402,6,7\n"
+    with pytest.raises(ro.InputError, match="such as --key 'Point'"):
+        read(write(tmp_path, HEAD.replace("Point,", "Name,Point,") + rows))
+
+
+def test_a_unit_in_a_column_is_that_of_a_table_with_a_row_a_coordinate(tmp_path: Path) -> None:
+    rows = [f"P{i},Point,{axis},{i},{i}.5,0.5,mm" for i in (1, 2) for axis in "XYZ"]
+    found = read(write(tmp_path, "Name,Feature,Axis,Nominal,Measured,Deviation,Unit\n" + "\n".join(rows)))
+    assert found.columns["y_mm"] == ["1.5", "2.5"]
+    assert found.columns["label"] == ["P1", "P2"]
+
+
+def test_a_merged_cell_with_the_unit_of_all_joints_stands_above_them(tmp_path: Path) -> None:
+    book = openpyxl.Workbook()
+    for row in (["Cell 4"], [], ["Pose", "Joint values [deg]"], ["", "A1", "A2"], [1, 10.5, 20.5], [2, 11.5, 21.5]):
+        book.active.append(row)
+    book.active.merge_cells("B3:C3")
+    book.save(tmp_path / "joints.xlsx")
+    assert read(tmp_path / "joints.xlsx").columns["q2_deg"] == ["20.5", "21.5"]
+
+
+def test_messages_that_ros_prints_into_a_text_are_read_and_xml_is_named(tmp_path: Path) -> None:
+    message = "header:\n  seq: {0}\nname: [two, one]\nposition: [{0}.5, 0.25]\nvelocity: []\neffort: []\n---\n"
+    found = read(write(tmp_path, message.format(0) + message.format(1), "states.txt"), joints=("one", "two"))
+    assert found.columns["q2_rad"] == ["0.5", "1.5"]
+    with pytest.raises(ro.InputError, match=r"the file's name: found 'm.xml'"):
+        read(write(tmp_path, "<?xml version='1.0'?><a/>", "m.xml"))

@@ -206,12 +206,15 @@ def counts_rows(keys: Sequence[str]) -> bool:
 
 
 def _choose_label(read: Readings, table: Columns, key: str) -> None:
-    """Of several labels keep the stated key, or the one that does more than count the rows."""
-    labels = [name for name, each in read.items() if each.stem == "label"]
-    keys = [name for name in labels if name.lower() == key.lower()]
-    chosen = keys or [name for name in labels if not counts_rows([str(cell).strip() for cell in table[name]])]
-    if len(labels) > 1 and len(chosen) == 1:
-        read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in labels if name != chosen[0]})
+    """Of several labels keep the stated key, or the one that tells rows apart and does more than count them."""
+    cells = {name: [str(cell).strip() for cell in table[name]] for name, each in read.items() if each.stem == "label"}
+    chosen = [name for name in cells if name.lower() == key.lower()]
+    if not chosen:
+        counting = [name for name in cells if not counts_rows(cells[name])]
+        groups = [name for name in counting if len(set(cells[name])) > 1]
+        chosen = [name for name in groups if _unique(cells[name])] or groups or counting
+    if len(cells) > 1 and len(chosen) == 1:
+        read.update({name: Reading("", "", f"'{chosen[0]}' is the label") for name in cells if name != chosen[0]})
 
 
 def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joints: Sequence[str]) -> Reading:
@@ -411,7 +414,8 @@ def _under_our_names(
         new = f"{reading.stem}_{unit}" if unit else reading.stem
         if new in columns:
             other = next(each.column for each in meant if each.name == new)
-            raise InputError("the header", f"columns '{other}' and '{name}' for {new}", "one of them")
+            accepted = f"one of them, such as --key '{name}'" if new == "label" else "one of them"
+            raise InputError("the header", f"columns '{other}' and '{name}' for {new}", accepted)
         columns[new] = cells
         words_of_column = kind.words.columns.get(reading.stem) or meaning(reading.stem)
         meant.append(Meant(name, words_of_column, new, unit, f"{reading.why}; unit {why}" if why else reading.why))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -10,6 +11,9 @@ from rpim_opt.basics.files import parse_json
 from rpim_opt.basics.tables import library
 from rpim_opt.basics.units import split
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
+
+MESSAGE = re.compile(r"^name: *\[[^\]]*\]\nposition: *\[", re.MULTILINE)
+"""What `rostopic echo` and `ros2 topic echo --flow-style` print of joint states."""
 
 
 def read(text: str) -> Rows:
@@ -75,4 +79,5 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
 FORMATS = (
     TableFormat("JSON", (".json", ".jsonl", ".ndjson"), lambda text: text.lstrip()[:1] in "[{", read),
     TableFormat("YAML", (".yaml", ".yml"), lambda text: ":" in text, read_yaml),
+    TableFormat("ROS messages", (".txt", ".log"), MESSAGE.search, read_yaml),
 )

@@ -18,8 +18,10 @@ Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
 
-BINARY = frozenset({".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl"})
-"""Endings of files that are no text; any other unknown ending may be one of an instrument's table."""
+BINARY = frozenset(
+    {".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl"}
+)
+"""Endings of files that are no tables as text; any other unknown ending may be one of an instrument's table."""
 
 
 class TableFormat(NamedTuple):
