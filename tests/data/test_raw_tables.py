@@ -311,9 +311,9 @@ def test_the_label_is_the_column_that_tells_rows_apart(tmp_path: Path) -> None:
 
 
 def test_a_unit_in_a_column_is_that_of_a_table_with_a_row_a_coordinate(tmp_path: Path) -> None:
-    rows = [f"P{i},Point,{axis},{i},{i}.5,0.5,mm" for i in (1, 2) for axis in "XYZ"]
+    rows = [f"P{i},Point,{axis},{i},{i}.{k},0.{k},mm" for i in (1, 2) for k, axis in enumerate("XYZ", 1)]
     found = read(write(tmp_path, "Name,Feature,Axis,Nominal,Measured,Deviation,Unit\n" + "\n".join(rows)))
-    assert found.columns["y_mm"] == ["1.5", "2.5"]
+    assert found.columns["y_mm"] == ["1.2", "2.2"]
     assert found.columns["label"] == ["P1", "P2"]
 
 
