@@ -8,7 +8,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.program import Estimate, Program
-from rpim_opt.convex.rules.selection import Selection, choice, least_between, on_squares, skipped, solved, weight_grid
+from rpim_opt.convex.rules.selection import Selection, choice, least_between, on_inliers, skipped, solved, weight_grid
 
 SLOWEST = 1e-200
 """Squared speed below which a curve stands still."""
@@ -21,7 +21,7 @@ GRID = 60
 GOLDEN = (1 + 5**0.5) / 2
 
 
-@on_squares
+@on_inliers
 def l_curve(program: Program) -> Selection:
     """Choose the corner of the L-curve: the largest curvature of (ln |A z - b|, ln |z|).
 
@@ -112,7 +112,7 @@ def menger(points: Array) -> Array:
     return np.concatenate([[0.0], inner, [0.0]])
 
 
-@on_squares
+@on_inliers
 def corner(program: Program, tolerance: float = 0.01) -> Selection:
     """Search the corner of the L-curve without a grid: golden sections by Menger curvature, any formulation.
 

@@ -15,7 +15,7 @@ from rpim_opt.convex.rules.selection import (
     Score,
     Selection,
     choice,
-    on_squares,
+    on_inliers,
     searched,
     solved,
     weight_grid,
@@ -30,7 +30,7 @@ DROPPED = 1e-13
 """Added to what a configuration leaves to itself: below, nothing else decides it."""
 
 
-@on_squares
+@on_inliers
 def leave_one_out(program: Program) -> Selection:
     """Choose by leave-one-out cross-validation of whole configurations.
 
@@ -52,7 +52,7 @@ def leave_one_out(program: Program) -> Selection:
     return _least(program, "leave_one_out", "smallest leave-one-out error", held_out_error(program), begin)
 
 
-@on_squares
+@on_inliers
 def k_fold(program: Program, folds: int = FOLDS, seed: int = 0, parts: Sequence[np.ndarray] | None = None) -> Selection:
     """Choose by cross-validation in folds that keep configurations whole (Stone 1974); any formulation.
 
@@ -79,7 +79,7 @@ def k_fold(program: Program, folds: int = FOLDS, seed: int = 0, parts: Sequence[
     return _least(program, "k_fold", note, held_out_error(program, _drawn(program, folds, seed)))
 
 
-@on_squares
+@on_inliers
 def two_step(program: Program) -> Selection:
     """Choose by the paper's two steps: a coarse L-curve, then held-out error (section III B and Figs. 7 to 10).
 

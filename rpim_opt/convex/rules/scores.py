@@ -10,15 +10,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import identity, ridge, robot_alone
-from rpim_opt.convex.rules.selection import (
-    Score,
-    Selection,
-    choice,
-    grid_of,
-    least_between,
-    on_squares,
-    weight_grid,
-)
+from rpim_opt.convex.rules.selection import Score, Selection, choice, grid_of, least_between, on_inliers, weight_grid
 
 
 def require_linear(program: Program, name: str) -> None:
@@ -47,7 +39,7 @@ def linear_rule(program: Program, name: str, score: Score, note: str, local: boo
     return replace(chosen, weight=least_between(score, weights, best)[0]) if chosen.interior else chosen
 
 
-@on_squares
+@on_inliers
 def reml(program: Program) -> Selection:
     """Choose by restricted maximum likelihood (REML), with the noise level profiled out.
 
@@ -95,7 +87,7 @@ def reml(program: Program) -> Selection:
     return replace(chosen, weight=1.0, note=note)
 
 
-@on_squares
+@on_inliers
 def gcv(program: Program) -> Selection:
     """Choose by generalized cross-validation: minimize rho(w) / (m - dof(w))^2 (Golub, Heath and Wahba 1979).
 
@@ -119,7 +111,7 @@ ROOM = 1.1
 """Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
 
 
-@on_squares
+@on_inliers
 def discrepancy(program: Program) -> Selection:
     """Choose the largest weight whose misfit agrees with the declared noise (Morozov 1966).
 
@@ -157,7 +149,7 @@ def discrepancy(program: Program) -> Selection:
     return replace(chosen, weight=weight, interior=True, note=note)
 
 
-@on_squares
+@on_inliers
 def quasi_optimality(program: Program) -> Selection:
     """Choose where the solution changes least with the weight: minimize |w dz/dw| (Tikhonov and Glasko 1965).
 

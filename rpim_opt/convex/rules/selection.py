@@ -72,7 +72,7 @@ class Selection(Tabled):
 Selector = Callable[[Program], Selection | float]
 
 
-def on_squares(rule: Callable[..., Selection]) -> Callable[..., Selection]:
+def on_inliers(rule: Callable[..., Selection]) -> Callable[..., Selection]:
     """Apply a rule to the equivalent linear estimator of a robust fit, repeated until its choice stays."""
 
     @wraps(rule)

@@ -322,7 +322,7 @@ class ReducedSquares:
 
 @dataclass(frozen=True, eq=False)
 class Point:
-    """A minimum x (N,) of the penalty's form, multipliers of its rows (m,), and the unknowns of the exact loss."""
+    """A minimum x (N,) of the canonical form, multipliers of its rows (m,), and the unknowns of the exact loss."""
 
     x: Array
     dual: Array
@@ -337,14 +337,14 @@ class ReducedProgram:
     of norms that it gets.
     """
 
-    def __init__(self, penalty: Canonical, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None):
-        self.penalty, self.rows, self.loss, self.sizes = penalty, rows, loss, sizes
+    def __init__(self, canonical: Canonical, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None):
+        self.canonical, self.rows, self.loss, self.sizes = canonical, rows, loss, sizes
         self.face = np.zeros(0, dtype=int)
-        self.near = np.zeros(penalty.size)
+        self.near = np.zeros(canonical.size)
 
     def solve(self, squares: ReducedSquares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
-        p = self.penalty
+        p = self.canonical
         if self.loss is not None or not p.polyhedral:
             return self._by_cones(squares, weight, A, b)[0]
         exact = self._by_active_set(squares, weight, self.face, self.near)
@@ -360,7 +360,7 @@ class ReducedProgram:
 
     def _by_active_set(self, squares: ReducedSquares, weight: float, face: np.ndarray, near: Array) -> Point | None:
         """Return the minimum by a primal-dual active set; None where the sets of active rows cycle."""
-        p = self.penalty
+        p = self.canonical
         A = p.dense[0]
         inequalities = np.arange(p.zero, p.linear)
         seen: set[bytes] = set()
@@ -395,13 +395,13 @@ class ReducedProgram:
     @cached_property
     def data(self) -> _ConicData:
         """Clarabel's data and solver."""
-        return _ConicData(self.penalty, self.rows, self.loss, self.sizes)
+        return _ConicData(self.canonical, self.rows, self.loss, self.sizes)
 
     def _by_cones(
         self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
     ) -> tuple[Point, Array]:
         """Return Clarabel's minimum, and the slacks of the penalty's rows."""
-        data, p, k, n = self.data, self.penalty, self.rows, len(self.penalty.at)
+        data, p, k, n = self.data, self.canonical, self.rows, len(self.canonical.at)
         # tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
         # of the squares with some weight on |z|^2
         z0 = self.near[p.at]

@@ -99,14 +99,14 @@ class Rows:
         return r if self.sizes is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
     def alone(
-        self, loss: Loss, which: np.ndarray, penalty: Canonical, squares: int
+        self, loss: Loss, which: np.ndarray, canonical: Canonical, squares: int
     ) -> tuple[ReducedProgram, Array, Array]:
         """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
         sizes, places = None, which
         if self.sizes is not None:
             sizes = self.sizes[which]
             places = np.concatenate([np.arange(int(self.sizes[i])) + self.starts[i] for i in which])
-        return ReducedProgram(penalty, squares, loss.some(which), sizes), self.A[places], self.b[places]
+        return ReducedProgram(canonical, squares, loss.some(which), sizes), self.A[places], self.b[places]
 
 
 @dataclass(eq=False)
@@ -119,7 +119,7 @@ class Newton:
 
     loss: Loss
     rows: Rows
-    penalty: Canonical
+    canonical: Canonical
     small: ReducedProgram
     weight: float
     damping: Damping | None
@@ -173,7 +173,7 @@ class Newton:
         return float(self.loss.values(self.rows.entries(r)).sum())
 
     def _others(self, z: Array, x: Array) -> float:
-        return self.weight * self.penalty.value(x) + (0.0 if self.damping is None else self.damping.value(z))
+        return self.weight * self.canonical.value(x) + (0.0 if self.damping is None else self.damping.value(z))
 
     def _value(self, z: Array, x: Array) -> float:
         return self._total(self._residual(z)) + self._others(z, x)
@@ -192,8 +192,8 @@ class Newton:
     # --- smooth losses -----------------------------------------------------------------------------------------------
 
     def smooth(self, z: Array, x: Array, h: float = 0.0, tolerance: float = DECREASE, most: int = STEPS) -> Array:
-        """Return the minimum (n,) of the loss smoothed with width h, from z with x of the penalty's form."""
-        at, T, weight = self.penalty.at, self.rows.whitened[1], self.weight
+        """Return the minimum (n,) of the loss smoothed with width h, from z with x of the canonical form."""
+        at, T, weight = self.canonical.at, self.rows.whitened[1], self.weight
         self.x = x
         r = self._residual(z)
         size = max(min(abs(self._total(r)), float(len(r))), TINY)  # outliers do not loosen it
@@ -211,7 +211,7 @@ class Newton:
             self.point = self._solved(z, gradient, H)
             ahead = self.point.x
             d = ahead[at] - z
-            chord = weight * (self.penalty.value(ahead) - self.penalty.value(self.x))
+            chord = weight * (self.canonical.value(ahead) - self.canonical.value(self.x))
             u = T @ d
             pull, bend = (0.0, 0.0) if self.damping is None else self.damping.along(z, d)
             promised = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
@@ -295,7 +295,7 @@ class Newton:
 
     def _exact(self, z: Array, near: np.ndarray, h: float) -> Array | None:
         """Return the minimum with rows near a kink as they are, the others by their model, until no other row bends."""
-        at, T = self.penalty.at, self.rows.whitened[1]
+        at, T = self.canonical.at, self.rows.whitened[1]
         x, best = self.x, self.point
         value = self._value(z, x)
         for _ in range(8):
@@ -306,7 +306,7 @@ class Newton:
             small = self.small
             exact: list[Array] = []
             if len(near):
-                small, *exact = self.rows.alone(self.loss, near, self.penalty, small.rows)
+                small, *exact = self.rows.alone(self.loss, near, self.canonical, small.rows)
             try:
                 point = self._solved(z, gradient, H, small, *exact)
             except (Unsolved, np.linalg.LinAlgError):

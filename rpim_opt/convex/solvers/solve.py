@@ -48,7 +48,7 @@ class WarmStart:
     lock: Any = field(default_factory=threading.RLock)
 
     @property
-    def penalty(self) -> Canonical:
+    def canonical(self) -> Canonical:
         """Penalty and constraints in canonical form."""
         return self.structure.canonical
 
@@ -56,13 +56,13 @@ class WarmStart:
         """Return the small program with so many rows of squares, and with all rows of a loss."""
         key = rows, loss is None
         if key not in self.small:
-            self.small[key] = ReducedProgram(self.penalty, rows, loss, sizes)
+            self.small[key] = ReducedProgram(self.canonical, rows, loss, sizes)
         return self.small[key]
 
     def begin(self, z: Array) -> WarmStart:
         """Look for the next minimum from z (n,) on, with solvers set up anew."""
         with self.lock:
-            self.z = self.x = z if len(self.penalty.at) == self.penalty.size else None
+            self.z = self.x = z if len(self.canonical.at) == self.canonical.size else None
             self.width, self.count, self.small = 0.0, 0, {}
         return self
 
@@ -93,7 +93,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
                 point = _by_newton(loss, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError):
                 point = _all_rows(loss, rows, warm, weight, damping)
-        warm.z, warm.x = point.x[warm.penalty.at], point.x
+        warm.z, warm.x = point.x[warm.canonical.at], point.x
         return point
 
 
@@ -103,7 +103,7 @@ def _by_newton(
     few = loss.variable.size <= FEW_ENTRIES
     # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too, or
     # begin with an unknown active set
-    quick = warm.penalty.polyhedral and (warm.z is not None or warm.penalty.size == len(warm.penalty.at))
+    quick = warm.canonical.polyhedral and (warm.z is not None or warm.canonical.size == len(warm.canonical.at))
     if few and (loss.expression.is_pwl() or (loss.quadratic and not quick)):
         return _all_rows(loss, rows, warm, weight, damping)
     if warm.kink < 0:
@@ -115,15 +115,15 @@ def _by_newton(
     known = z is not None
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
-        z = x[warm.penalty.at]
-    search = Newton(loss, rows, warm.penalty, small, weight, damping, warm.kink, accuracy)
+        z = x[warm.canonical.at]
+    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
         z = search.smooth(z, x)
     if not np.isfinite(z).all():
         raise OutsideDomain
-    dual = np.zeros(len(warm.penalty.b)) if search.point is None else search.point.dual
+    dual = np.zeros(len(warm.canonical.b)) if search.point is None else search.point.dual
     return Point(search.x, dual, search.steps)
 
 
@@ -148,7 +148,7 @@ def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Da
     Those near a kink are taken as they are and all others by their tangents, which bounds the loss from below; those
     that then have other slopes are added, until the bound is reached. Of any other loss all rows are taken.
     """
-    n, at = rows.A.shape[1], warm.penalty.at
+    n, at = rows.A.shape[1], warm.canonical.at
     if loss.variable.size <= FEW_ENTRIES or loss.threshold is None:
         return _all_rows(loss, rows, warm, weight, damping)
     terms = _alone(n, damping)
@@ -163,7 +163,7 @@ def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Da
         outside = np.ones(loss.variable.size, dtype=bool)
         outside[working] = False
         slope = np.where(rows.spread(outside), tangent.slope, 0.0)
-        small, *equations = rows.alone(loss, working, warm.penalty, len(terms.y))
+        small, *equations = rows.alone(loss, working, warm.canonical, len(terms.y))
         small.data.clarabel.attempts = (EQUILIBRATED,)
         part: Any = small.loss
         part.price(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
