@@ -175,7 +175,7 @@ def read_measurements(
     data = rows_of(understanding, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
-    left_out = tuple(column for column in understanding.left_out if column != name)
+    left_out = tuple(column for column in understanding.left_out if column.lower() != name)
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
     return Measured(data, left_out, (*notes, *understanding.notes), clock)

@@ -17,7 +17,6 @@ import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.tables import Columns
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import numeral, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
@@ -114,14 +113,9 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
             files = [str(i) for i in range(1, len(files) + 1)]
         whole["label"] = [f"{file}:{label}" for file, each in zip(files, tables, strict=True) for label in each.labels]
         notes.append("labels occur in several files: they are prefixed with the name of the file.")
-    lower = [_lower(table) for table in tables]
-    common = [name for name in lower[0] if all(name in own for own in lower)]
-    raw = {name: [cell for own in lower for cell in own[name]] for name in common}
+    common = [name for name in first.raw if all(name in table.raw for table in tables)]
+    raw = {name: [cell for table in tables for cell in table.raw[name]] for name in common}
     return replace(first, columns=whole, raw=raw, notes=tuple(notes))
-
-
-def _lower(table: Understood) -> Columns:
-    return {name.lower(): cells for name, cells in table.raw.items()}
 
 
 # --- by a key ------------------------------------------------------------------------------------------------------
@@ -169,11 +163,10 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
             others = _normal(values.columns.get(column, ()))
             if set(labels) & set(others) and not (telling and counts_rows(labels)):
                 return Key("label", (), labels, others)
-    left, right = _lower(joints), _lower(values)
-    common = [name for name in left if name in right]
+    common = [name for name in joints.raw if name in values.raw]
     name = common[0] if not key and len(common) == 1 and not (telling and pair) else key.lower()
     if name in common:
-        return Key(f"column '{name}'", (name,), _normal(left[name]), _normal(right[name]))
+        return Key(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
     if pair:
         return pair
     found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
@@ -182,9 +175,8 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
 
 def _naming(table: Understood) -> dict[str, list[str]]:
     """Return the keys of columns, labels or left out, that name every row differently."""
-    raw = _lower(table)
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
-    cells = {name: _normal(raw[name.lower()]) for name in free if name.lower() in raw}
+    cells = {name: _normal(table.raw[name.lower()]) for name in free if name.lower() in table.raw}
     return {name: keys for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)}
 
 
@@ -267,14 +259,13 @@ def _clock_tolerance(joints: Understood, values: Understood) -> float:
 
 
 def _times(table: Understood, key: str) -> tuple[str, Array]:
-    """Return the column of a table's times, in lower case, and the times [s] of its rows."""
-    columns = _lower(table)
-    name = time_column(columns) if key.lower() in ("", "time") else key.lower()
-    if name is None or name not in columns:
+    """Return the column of a table's times, and the times [s] of its rows."""
+    name = time_column(table.raw) if key.lower() in ("", "time") else key.lower()
+    if name is None or name not in table.raw:
         lacks = f"no column '{key}'" if key else "no column of times"
         where = f"--time-tolerance, {table.file}"
         raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
-    return name, seconds(name, columns[name])
+    return name, seconds(name, table.raw[name])
 
 
 def time_column(names: Iterable[str]) -> str | None:

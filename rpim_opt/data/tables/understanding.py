@@ -56,9 +56,10 @@ class Meant(NamedTuple):
 class Understood:
     """A raw table with canonical names.
 
-    ``columns`` are cells by our names, ``raw`` those that the file has, of the same rows. ``doubt`` is the option that
-    says how orientations are to be read where only a check against the robot shows it: ``quaternion``, ``rotation``.
-    Of several files as one, ``file`` is the first, and ``keys`` are the columns that joined them, in lower case.
+    ``columns`` are cells by our names, ``raw`` those of the file by its names in lower case, of the same rows. What
+    ``doubt`` is names the option that says how orientations are to be read where only a check against the robot shows
+    it: ``quaternion``, ``rotation``. Of several files as one, ``file`` is the first, and ``keys`` are the columns that
+    joined them, in lower case.
     """
 
     columns: Columns
@@ -107,23 +108,24 @@ def understand(
     """
     options = options or TableOptions()
     units = options.units
-    options = replace(options, units={**raw.units, **units})
+    options = replace(options, units={**raw.units, **units}, joints=tuple(joints))
     if options.rotation not in ("", "vector") and not known_names.EULER.fullmatch(options.rotation):
         accepted = "vector, or extrinsic or intrinsic with the order of the turns: 'extrinsic xyz', 'intrinsic zyx'"
         raise InputError("--rotation", f"'{options.rotation}'", accepted)
     known = number_columns(robot, kind)
     more = raw.with_constants(options.constants)
-    read, rotation = _readings(more, robot, kind, options, joints, targets)
+    read, rotation = _readings(more, robot, kind, options, targets)
     if any(re.fullmatch(r"q\d+", read[name].stem) for name in raw.columns):  # the file with the joints
         raw = more
     elif options.constants:
-        read, rotation = _readings(raw, robot, kind, options, joints, targets)
+        read, rotation = _readings(raw, robot, kind, options, targets)
     rotation = options.rotation or rotation
     stated = {key: (unit, "--units" if key in units else "above the header") for key, unit in options.units.items()}
     columns, meant = _under_our_names(raw.columns, read, kind, known, stated)
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         columns, meant = _as_quaternions(columns, meant, rotation)
-    table = Understood(columns, raw.columns, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
+    of_file = {name.lower(): cells for name, cells in raw.columns.items()}
+    table = Understood(columns, of_file, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
     if not targets:
         table = _rows_with_values(table, robot, kind)
     notes = list(table.notes)
@@ -161,10 +163,10 @@ def _doubt(read: Readings, robot: Robot, options: TableOptions, rotation: str) -
 
 
 def _readings(
-    raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions, joints: Sequence[str], targets: bool
+    raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions, targets: bool
 ) -> tuple[Readings, str]:
     """Return the meaning of every column, None for ignored ones, and the rotation convention in the names."""
-    table, dof = raw.columns, robot.dof
+    table, dof, joints = raw.columns, robot.dof, options.joints
     names = [*number_columns(robot, kind), *text_columns(kind)]
     read = {name: _read(name, raw.groups.get(name, ""), names, kind.names, joints) for name in table}
     rotation = ""
@@ -187,10 +189,8 @@ def _readings(
         if ANOTHER_POINT.fullmatch(each.stem):
             raise InputError("the header", f"column '{name}', another point", "one row per point, with a column marker")
         if name.lower() in TURNED and each.stem in names and not (options.rotation or options.units.get("rx")):
-            accepted = (
-                "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "
-                "'intrinsic xyz'; or --measurement position"
-            )
+            accepted = "roll, pitch, yaw; rx_deg, ry_deg, rz_deg; a quaternion; --rotation vector; --rotation "
+            accepted += "'intrinsic xyz'; or --measurement position"
             raise InputError("the header", f"column '{name}', either angles or a rotation vector", accepted)
         wanted = {*options.units, *robot.model.columns}
         if each.stem == "temperature" and not each.unit and "temperature" not in wanted:
@@ -365,9 +365,8 @@ def _leave_out(read: Readings, targets: bool) -> None:
                 why = "not a target of the robot"
         elif each.kind == "wanted" and (each.stem != "label" or "label" in measured):
             if each.stem not in measured and re.fullmatch(r"(?:to_)?q\d+", each.stem):
-                read[name] = each._replace(
-                    why=f"{each.why}; commanded values are used, since there are no measured ones"
-                )
+                note = "commanded values are used, since there are no measured ones"
+                read[name] = each._replace(why=f"{each.why}; {note}")
             else:
                 why = "commanded, not measured"
         if why:
