@@ -28,9 +28,6 @@ _HALF_PAIR = re.compile(r"\\u[dD][89a-fA-F]")
 ENDING = ".part"  # of folders in which files are written
 
 
-# Reading
-
-
 def require_file(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = ()) -> None:
     """Refuse anything but a regular file of at most ``largest`` bytes; a pipe or device may never end."""
     try:
@@ -138,9 +135,6 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 of a file's bytes, in hexadecimal digits."""
     return sha256(read_bytes(path, LARGEST_DATA)).hexdigest()
-
-
-# Writing
 
 
 @contextmanager

@@ -16,7 +16,6 @@ import re
 from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from importlib import import_module
-from itertools import islice
 from pathlib import Path
 from string import ascii_letters
 from typing import Any, NamedTuple
@@ -38,8 +37,7 @@ LARGEST_WORKBOOK = 2**27  # bytes that a workbook may unpack to: some three hund
 EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
-SAMPLE_LINES = 200
-SAMPLE_CHARACTERS = 2**16  # of the lines from which the separator is found
+SAMPLE = 2**15  # characters from which the separator is found
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
@@ -276,9 +274,7 @@ def is_numeral(cell: str) -> bool:
 
 def _separator(text: str) -> str:
     """Return the separator between most numbers of the numeric rows; a comma if there is none."""
-    lines = (line for line in io.StringIO(text[: SAMPLE_LINES * SAMPLE_CHARACTERS]) if line.strip())
-    sample = "".join(islice(lines, SAMPLE_LINES))[:SAMPLE_CHARACTERS]
-    rows = {mark: _split(sample, mark, strict=False)[0] for mark in SEPARATORS.values()}
+    rows = {mark: _split(text.lstrip()[:SAMPLE], mark, strict=False)[0] for mark in SEPARATORS.values()}
     parted = {mark: sum(map(_parted, split)) for mark, split in rows.items()}
     blanks = parted.pop(" ")
     best = max(parted, key=parted.__getitem__)

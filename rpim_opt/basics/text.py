@@ -102,9 +102,6 @@ def version_of(package: str) -> str:
     return str(sys.modules["rpim_opt"].__version__) if package == "rpim-opt" else metadata.version(package)
 
 
-# Objects
-
-
 class Brief:
     """Base class with a one-line representation; `_short` returns that line without the class name."""
 

@@ -48,8 +48,7 @@ class Requirement:
         if not 0.5 <= self.confidence < 1:
             raise InputError("confidence", f"{self.confidence:g}", "a probability from 0.5 to below 1")
         named = [(f"joint {joint}", side) for joint, side in self.joints]
-        if self.box is not None:
-            named += list(zip("xyz", self.box, strict=True))
+        named += zip("xyz", self.box, strict=True) if self.box is not None else ()
         for name, (low, high) in named:
             if not low < high:
                 raise InputError(name, f"from {low:g} to {high:g}", "two numbers, the smaller one first")

@@ -37,9 +37,6 @@ MOST = 300
 """Points along either side of a pattern: beyond the larger number none has them, and they are listed one by one."""
 
 
-# --- what a camera sees --------------------------------------------------------------------------------------------
-
-
 def pixels(
     X: Any, Y: Any, Z: Any,
     fx: Any, fy: Any, cx: Any, cy: Any,
@@ -121,9 +118,6 @@ camera's frame, which is the instrument's."""
 
 TYPES = (eye_in_hand, eye_to_hand)
 CAMERAS = {m.name: m for m in TYPES}
-
-
-# --- boards --------------------------------------------------------------------------------------------------------
 
 
 def grid_board(columns: int, rows: int, spacing: float) -> dict[str, Array]:

@@ -118,9 +118,6 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
     return replace(first, columns=whole, raw=raw, notes=tuple(notes))
 
 
-# --- by a key ------------------------------------------------------------------------------------------------------
-
-
 def _by_key(joints: Understood, values: Understood, key: str) -> Match:
     """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
@@ -204,9 +201,6 @@ def _normal(cells: Sequence[Any]) -> list[str]:
     if len(set(last)) == len(set(keys)):
         keys = last
     return [str(int(key.partition(".")[0])) if re.fullmatch(r"\d+(?:\.0*)?", key) else key for key in keys]
-
-
-# --- by the nearest time -------------------------------------------------------------------------------------------
 
 
 def partners(left: Array, right: Array, within: float) -> tuple[np.ndarray, np.ndarray, Array]:

@@ -48,23 +48,22 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     ending = path.suffix.lower()
     every = formats()
     fitting = [each for each in every if ending in each.endings]
-    plain = {*TEXTS, *EXCEL, ".parquet", ".mat", ".npz"}
     if not fitting and ending in BINARY:
+        plain = {*TEXTS, *EXCEL, ".parquet", ".mat", ".npz"}
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
-    format = None
-    rows: Rows = ()
-    if fitting:
-        with in_file(path):
-            require_file(path, LARGEST_DATA)
-            text, _ = decoded(path, options.encoding if options else "")
-            format = next((each for each in fitting if each.shown_by(text)), None)
-            rows = format.read(text) if format else ()
-        if not rows and (format or ending not in TEXTS):
-            names = " or ".join(each.name for each in fitting)
-            raise InputError("the file", "neither targets nor rows", f"{names} with at least one", path)
-    if format is None:
+    if not fitting:
         return read_table(path, options)
+    with in_file(path):
+        require_file(path, LARGEST_DATA)
+        text, _ = decoded(path, options.encoding if options else "")
+        format = next((each for each in fitting if each.shown_by(text)), None)
+        if format is None and ending in TEXTS:
+            return read_table(path, options)
+        rows = format.read(text) if format else ()
+        if format is None or not rows:
+            accepted = f"{' or '.join(each.name for each in fitting)} with at least one"
+            raise InputError("the file", "neither targets nor rows", accepted)
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
     raw = read_table(path, options, columns)
