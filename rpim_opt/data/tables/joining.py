@@ -258,7 +258,8 @@ def _times(table: Understood, key: str) -> tuple[str, Array]:
     if name is None or name not in table.raw:
         lacks = f"no column '{key}'" if key else "no column of times"
         where = f"--time-tolerance, {table.file}"
-        raise InputError(where, f"{lacks} among {', '.join(table.raw)}", "one called time, or --key with it")
+        columns = ", ".join(each.column for each in table.meant)
+        raise InputError(where, f"{lacks} among {columns}", "one called time, or --key with it")
     return name, seconds(name, table.raw[name])
 
 
