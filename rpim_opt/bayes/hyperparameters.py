@@ -200,7 +200,7 @@ class Estimator:
         if not (np.isfinite(J).all() and np.isfinite(y).all()):
             raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
         unit = free.scale * stated.scale
-        stacks = problem.stacks(joints="joint" in self.noise, at=parameter_values(problem, x))
+        stacks = problem.stacks(joints="joint" in self.noise, at=problem.parameters.values_at(x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
         hierarchy = Hierarchy(
             group=stated.group,
@@ -249,7 +249,7 @@ class Estimator:
         point, *others = evidence.optima(starts)
         scale = p.scale.copy()
         scale[p.identified] *= prior.scale * np.sqrt(point.v)
-        repeatability = replace(evidence.repeatability(point.logs), at=parameter_values(problem, x))
+        repeatability = replace(evidence.repeatability(point.logs), at=p.values_at(x))
         laid = replace(problem, parameters=replace(p, scale=scale), repeatability=repeatability)
         mean = p.free.scale * (prior.centre + prior.scale * point.z)
         fit = Fit(problem, prior, evidence, point, others, laid, mean)
@@ -294,14 +294,6 @@ def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
 def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:
     """Return the RMS change of deviations (n,) in units of their scales."""
     return float(np.sqrt(np.mean(((x - before) / laid.parameters.free.scale) ** 2)))
-
-
-def parameter_values(problem: Source, x: Array) -> Array:
-    """Return the values (P,) of all parameters at deviations x (n,)."""
-    p = problem.parameters
-    values = p.nominal.copy()
-    values[p.identified] = p.free.values(x)
-    return values
 
 
 # --- how well they are known ------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
-from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, parameter_values, spectrum_of
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
 from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, extended, named, questions
 from rpim_opt.bayes.prior_terms import FIXED
@@ -129,7 +129,7 @@ def _most_likely(
     """Return the optimum of curves and noise, the curves and columns (m, c); None where they gain too little."""
     problem = models.whole
     slopes = np.zeros((len(models.columns.data.y), len(problem.robot.joint_types)))
-    for stack in problem.stacks(at=parameter_values(problem, models.x)):
+    for stack in problem.stacks(at=problem.parameters.values_at(models.x)):
         slopes[stack.index] = stack.joint
     q = problem.joint_values[problem.owners]
     centre, travel = (q.min(axis=0) + q.max(axis=0)) / 2, np.ptp(q, axis=0)

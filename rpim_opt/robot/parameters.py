@@ -285,6 +285,12 @@ class Parameters(Tabled):
                 result[triple] = roll_pitch_yaw(moved[:3, :3])
         return result
 
+    def values_at(self, x: Array) -> Array:
+        """Return the values (P,) [SI] of all parameters at deviations x (n,) [SI] of the identified ones."""
+        result = self.nominal.copy()
+        result[self.identified] = self.free.values(x)
+        return result
+
     def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:
         """Return the same table with other scales, given as in a problem file's ``[scale]``.
 

@@ -20,7 +20,6 @@ from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, w
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
-from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
@@ -70,7 +69,7 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     (array([ 1.8 , -0.7 ,  0.35,  0.02, -0.04,  1.9 ]), array([18.8, -3.7, 61. ]))
     """
     p = result.problem.parameters
-    of = dict(zip(p.names, parameter_values(result.problem, result.x), strict=True))
+    of = dict(zip(p.names, p.values_at(result.x), strict=True))
     joint_map = result.robot.joint_map.copy()
     for i in set(range(len(joint_map))) - set(result.robot.leading):  # of joints that follow others the multipliers
         joint_map[i] *= 1 + of.pop(f"ratio{i + 1}")
@@ -416,7 +415,7 @@ def export_camera(result: Calibration, source: str | Path, target: str | Path) -
     cameras = {name.rpartition("_")[0] for name in p.names if own_name(name).startswith("camera_")}
     if len(cameras) != 1:
         raise InputError("the calibration", counted(len(cameras), "camera"), "one camera")
-    values = dict(zip(p.names, parameter_values(result.problem, result.x).tolist(), strict=True))
+    values = dict(zip(p.names, p.values_at(result.x).tolist(), strict=True))
     fx, fy, cx, cy, *distortion = (values[f"{min(cameras)}_{name}"] for name in INTRINSICS)
     text = read_bytes(path).decode()
     before = _yaml_list(text, "camera_matrix", (3, 3), path)[0]

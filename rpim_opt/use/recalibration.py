@@ -14,7 +14,6 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, table
 from rpim_opt.basics.units import display
-from rpim_opt.bayes.hyperparameters import parameter_values
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.identify import calibrate
@@ -245,7 +244,7 @@ def update(
             found = f"readings {1e3 * missed:.3g} mm off, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     was, now = (  # values: of a frame that was registered again, deviations refer to another orientation
-        dict(zip(each.problem.parameters.names, parameter_values(each.problem, each.x), strict=True))
+        dict(zip(each.problem.parameters.names, each.problem.parameters.values_at(each.x), strict=True))
         for each in (result, updated)
     )
     moved = []
