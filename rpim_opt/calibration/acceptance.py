@@ -20,6 +20,7 @@ from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, he
 from rpim_opt.calibration.lack_of_fit import judged as judged_fit
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.verdict import Verdict as Delivery
 from rpim_opt.calibration.verdict import refuse_misread, rms
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
@@ -236,6 +237,15 @@ class Acceptance:
     def bound(self) -> float | None:
         """Maximum expanded uncertainty [m]."""
         return None if self.workspace is None else self.workspace.largest
+
+    @property
+    def summary(self) -> str:
+        """Verdict and reasons as one text."""
+        return " ".join(["Acceptance of the calibration, whole model:", self.sentences()[0], *self.reasons])
+
+    def on(self, calibration: Delivery) -> Delivery:
+        """Return the verdict on a calibration, not delivered where the test rejects its robot."""
+        return Delivery(calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
 
     def sentences(self) -> list[str]:
         """Return the verdict and its grounds, sentence by sentence."""

@@ -454,8 +454,7 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
             p = problem.parameters
             alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
             x = settled(alone)
-        single = diagnosis.scattering_joint(alone, x), diagnosis.two_positions(alone, x)
-        causes = first(diagnosis.shown_by_residuals(alone, x), *single)
+        causes = list(diagnosis.shown_by_residuals(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))
     if causes or error < LARGEST["length"]:  # which a robot's own effects may be

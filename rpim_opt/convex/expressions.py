@@ -92,6 +92,8 @@ def scalar(value: Any, where: str) -> Any:
 def listed(value: Any, where: str) -> list[Any]:
     """Check the return value of a constraint function, and return it as a list of CVXPY constraints."""
     made = list(value) if isinstance(value, list | tuple) else [value]
+    if not made:
+        raise InputError(where, "no constraint", "a CVXPY constraint, or several in a list")
     for constraint in made:
         if isinstance(constraint, bool | np.bool_):
             raise InputError(where, f"{constraint}", "a CVXPY constraint: something that depends on z")

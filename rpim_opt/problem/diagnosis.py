@@ -64,7 +64,7 @@ NARROWER, GRID = 0.25, 61
 SEVERAL = 0.85
 """Several joint zeros moved, if that leaves less than this part of what one move leaves."""
 LOOSE = 1e-3
-"""A joint's random error [rad, m] that no gear in order has: a tenth of that is usual."""
+"""Backlash of a joint [rad, m] that no gear in order has: a tenth of that is usual."""
 FLAT_TURN = 0.05
 """Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
 FILLED = 1e-3
@@ -798,7 +798,8 @@ def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> E
         return None
     _, gain, best = min(tried, key=lambda each: each[0])
     spare = max(len(model.A) - len(x) - len(best.coefficients), 1)
-    if gain <= (1 - MOVED) * whole or _by_chance(gain, whole, len(best.coefficients), spare) * len(tried) >= RARE:
+    chance = fdtrc(len(best.coefficients), spare, gain / len(best.coefficients) / (max(whole - gain, 1e-300) / spare))
+    if gain <= (1 - MOVED) * whole or chance * len(tried) >= RARE:
         return None
     return best
 
@@ -815,17 +816,13 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
     return without
 
 
-def _by_chance(gain: float, whole: float, columns: int, spare: int) -> float:
-    """Return the probability that columns explain so much of a sum of squares by chance (F test)."""
-    return float(fdtrc(columns, spare, gain / columns / (max(whole - gain, 1e-300) / spare)))
-
-
 def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: bool = True) -> Iterator[str]:
     """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
     Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few;
     if ``transmission``, the slope of a joint's zero times the value of a joint, all of these times the way from the row
     before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
+    Else backlash and rows of two kinds are looked for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -844,12 +841,11 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if kinds is not None and best is not None:  # what changed at a row is named by itself where that is enough
         enough = MOVED if kinds.consecutive else kinds.left / MOVED
         kinds = None if best.left <= enough else kinds
-    if kinds is not None:
-        single = scattering_joint(problem, x), two_positions(problem, x)
-        yield from first(*single, [_said_of_kinds(problem, kinds)])
-    elif best is not None and abs(best.coefficients[0]) <= best.addition.largest:
+    if kinds is None and best is not None and abs(best.coefficients[0]) <= best.addition.largest:
         what, remedy = best.addition.said(best.coefficients)
         yield f"{what} (that leaves {100 * best.left:.0f} % of the residuals): {remedy}."
+    elif kinds is not None or transmission:
+        yield from first(two_positions(problem, x), [] if kinds is None else [_said_of_kinds(problem, kinds)])
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
@@ -992,31 +988,6 @@ def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
         f"{what}: are they of another arm, tool or load, or were their joint values computed for another configuration "
         "of wrist or elbow? Calibrate the two groups separately, or leave one out ([exclude])."
     )
-
-
-def scattering_joint(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report a joint that explains residuals at x (n,) if it is elsewhere in every row, by more than a gear lets it."""
-    alone = problem.with_repeatability(None)
-    model, free, rows = alone.linearize(x), problem.parameters.free, alone.owners
-    r = model.b - model.A @ (x / free.scale)
-    N, whole = len(problem.data), float(r @ r)
-    best = (0.0, 0.0, "")
-    for i, name in enumerate(_zeros(problem.robot), start=1):
-        if name in free.names:
-            k = free.names.index(name)
-            along, size = (np.bincount(rows, model.A[:, k] * each, N) for each in (r, model.A[:, k]))
-            step = along / np.maximum(size, 1e-12)
-            off = float(np.sqrt(np.mean(step**2)) * free.scale[k])
-            unit = "mrad" if free.dimensions[k] == "angle" else "mm"
-            what = f"joint {i} is {three_digits(1e3 * off)} {unit} (RMS) from its reading, differently in every row"
-            best = max(best, (float(step @ along), off, what))
-    gain, off, what = best
-    spare = len(r) - N
-    if off < LOOSE or whole - gain >= BETTER * whole or spare < N:
-        return
-    if _by_chance(gain, whole, N, spare) < RARE:
-        left = f"that leaves {100 * np.sqrt(1 - gain / whole):.0f} % of the residuals"
-        yield f"{what} ({left}): backlash, a loose encoder, or values read while it moved; check it."
 
 
 def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:

@@ -161,10 +161,11 @@ def new_problem(
 
 def _remarks(arm: Described, source: Path, understanding: Understanding) -> Iterator[str]:
     """Yield where the flange frame of a converted DH table is, and which joint values are of no joint."""
-    if source.suffix.lower() == ".csv" and arm.tool.any():  # a DH table in another convention than the modified one
+    if arm.tool.any():  # of a URDF, or of a DH table in another convention than the modified one
+        frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         yield (
-            "[tool] and --tool refer to the flange frame after the last joint. In it the last frame of the DH table is "
-            f"at {placed(arm.tool)}: transform points of the table's frame by it."
+            f"[tool], `known` and --tool refer to the flange frame after the last joint. In it {frame} is at "
+            f"{placed(arm.tool)}: transform points of {frame} by it."
         )
     dof = arm.robot.dof
     beyond = {f"q{i}" for i in range(dof + 1, dof + 9)}

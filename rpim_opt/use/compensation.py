@@ -17,6 +17,7 @@ from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import joint_columns
+from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.covariance import noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
@@ -224,7 +225,8 @@ def compensate(
 
     ``largest`` is the largest correction of a joint [rad or m], ``limit`` [m] what the position error left by the model
     and its expanded uncertainty (k = 2) may be together; a command above it counts as one that misses its target. A
-    calibration that is not delivered raises NotDelivered unless ``despite_verdict``; InputError for shapes that do not
+    calibration that is not delivered, or that its acceptance test rejects, raises NotDelivered unless
+    ``despite_verdict``; InputError for shapes that do not
     fit, numbers that are not finite, a reflector that is not known.
 
     >>> import rpim_opt as ro
@@ -236,7 +238,8 @@ def compensate(
     >>> print(found.csv().splitlines()[0])
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status
     """
-    note = result.verdict.require(despite_verdict)
+    verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
+    note = verdict.require(despite_verdict)
     mapping = result.mapping
     if mapping is not None:
         note = (

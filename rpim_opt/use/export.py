@@ -168,12 +168,10 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
     verdict, doubt = alone.verdict, inconclusive(whole, found)
     remarks, undecided = [], False
     if accepted:
-        tested = " ".join(["Acceptance of the calibration, whole model:", accepted.sentences()[0], *accepted.reasons])
-        doubt = tested if accepted.verdict == "inconclusive" else ""
+        verdict = accepted.on(verdict)
+        doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
         undecided = bool(doubt) and verdict.delivered
-        remarks = [tested] if accepted.verdict == "accepted" else []
-        if accepted.verdict == "rejected" and verdict.delivered:
-            verdict = replace(verdict, reasons=(tested,))
+        remarks = [accepted.summary] if accepted.verdict == "accepted" else []
     note = verdict.require(despite_verdict) or doubt
     if whole.learned is None or alone is whole or found is None:
         return note, remarks, undecided

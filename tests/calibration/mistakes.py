@@ -289,7 +289,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     ),
     "joint 3 with backlash": (
         of_joint(2, lambda q: q + 3.5e-3 * np.random.default_rng(4).choice([-1, 1], COUNT)),
-        "from its reading, differently in every row",
+        "either of two positions in every row, joint 3 by 7 mrad",
     ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),

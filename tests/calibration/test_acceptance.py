@@ -220,6 +220,12 @@ def test_rows_that_miss_reject_only_when_chance_does_not_make_so_many(result) ->
     found = accept(some, Requirement(1e-3))
     assert found.verdict == "rejected"
     assert "12 of" in found.reasons[0]
+    assert not found.on(some.verdict).delivered
+    stated = replace(some, record=replace(some.record, requirement=Requirement(1e-3)))
+    q = some.problem.data.q[:2]
+    with pytest.raises(ro.basics.NotDelivered, match="Rejected: limit 1 mm"):
+        ro.use.compensate(stated, q)
+    assert "Rejected: limit 1 mm" in ro.use.compensate(stated, q, despite_verdict=True).note
     one = replace(result, record=replace(result.record, validation=moved(apart, [0], 5e-3)))
     assert accept(one, Requirement(1e-3)).verdict == "inconclusive"
 

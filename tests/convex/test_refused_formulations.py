@@ -55,6 +55,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a constraint of two concave sides": (
         lambda: posed(constraints=lambda z, p: cp.sqrt(cp.norm(z)) <= 1).solve(1.0), "a program that is not convex"
     ),
+    "a constraint function that returns none": (lambda: posed(constraints=lambda z, p: []), "found no constraint"),
     "a constraint with the sides exchanged": (
         lambda: posed(constraints=lambda z, p: cp.sum_squares(z) >= 1).solve(1.0), "whose sides are"
     ),
