@@ -332,8 +332,9 @@ def likely_causes(result: Outcome) -> list[str]:
 
     A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
     does not downweight, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
-    without value, exchanged rows, rounded joints and a base that moved are looked for. A calibration of data in blocks
-    says nothing.
+    without value, exchanged rows, rounded joints and a base that moved are looked for. Where residuals are beyond the
+    noise at all, something systematic is looked for in them, and in excluded rows what they have in common. A
+    calibration of data in blocks says nothing.
 
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
@@ -381,6 +382,7 @@ def likely_causes(result: Outcome) -> list[str]:
         signs.append(f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}")
     head: list[str] = []
     ordered = _in_table_order(result, problem)
+    noticed = max(ratio for _, ratio in residuals.values())
     if signs:
         head = [f"{BAD}: {'; '.join(signs)}."]
     if signs or not result.converged:
@@ -389,15 +391,13 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = [other.sentence]
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
-        if not causes and max(ratio for _, ratio in residuals.values()) > NOTICED and len(problem.arms) == 1:
-            causes = first(diagnosis.shown_by_residuals(_without_outliers(ordered, problem, result.x), result.x))
-    if max(ratio for _, ratio in residuals.values()) > NOTICED:
+        if not causes and noticed > NOTICED and len(problem.arms) == 1:
+            causes = list(diagnosis.shown_by_residuals(_without_outliers(ordered, problem, result.x), result.x))
+    if noticed > NOTICED:
         causes += _upward(result)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
-    if max(ratio for _, ratio in residuals.values()) > HOPELESS:
-        return [*head, NOTHING]
-    return []
+    return [*head, NOTHING] if noticed > HOPELESS else []
 
 
 def _of_another_robot(result: Outcome) -> bool:
@@ -478,7 +478,8 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
 def _without_outliers(ordered: CalibrationProblem, problem: CalibrationProblem, x: Array) -> CalibrationProblem:
     """Return the rows that are those of the problem, or no larger errors: of held-out ones gross errors are unknown."""
     errors, own = ordered.errors(x), np.isin(ordered.labels, problem.labels)
-    return ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= np.nanmax(errors[own])))))
+    largest = np.nan_to_num(errors[own]).max()
+    return ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

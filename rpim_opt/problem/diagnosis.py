@@ -1001,7 +1001,7 @@ def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     r = model.b - model.A @ (x / free.scale)
     without = _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
-    joints = [(i, k) for i, k in joints if model.A[:, k].any()]
+    joints = [(i, k) for i, k in joints if model.A[:, k].any() and r.any()]
     best, said = TWO_KINDS, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
