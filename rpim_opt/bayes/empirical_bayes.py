@@ -20,8 +20,8 @@ from rpim_opt.problem.registration.frames import settled
 
 ROUNDS = 6  # linearizations at which hyperparameters are estimated
 ASKED = 6.0
-"""By how much -2 ln L must fall for a optional prior: a likelihood ratio of twenty, which by Markov's inequality an arm
-of another kind shows once in twenty times at most."""
+"""By how much -2 ln L must fall for an optional prior: a likelihood ratio of twenty, which by Markov's inequality one
+arm of another kind in twenty shows at most."""
 LOOKS = 4  # how often outliers are looked for again without those that were found: they mask each other
 
 

@@ -22,8 +22,7 @@ CURVES = {"transmission size": (1e-4, 2.0), "transmission length": (0.2, 1.5)}
 WAVES, WAVES_LENGTH = 1.5e-4, 1.0
 """Standard deviation and length scale [rad] of the waves beside them, which are not estimated: part of a joint's range
 hardly distinguishes them from its offset and eccentricity."""
-NOISE_SD, GEOMETRY_SD, EXTENSION_SD = 2.0, 3.0, 2.0
-"""Prior standard deviations of the natural logarithms of the hyperparameters."""
+NOISE_SD, GEOMETRY_SD, EXTENSION_SD = 2.0, 3.0, 2.0  # prior standard deviations of hyperparameters' logarithms
 BASE_SD = 1.0  # that of the base: wider, eight configurations take it for nearer than it is
 RATIO_SD = 1.0
 """That of the ratio of two scales of the geometry: lengths, angles and joint offsets are made by different means, but
@@ -31,8 +30,7 @@ few data do not identify each scale alone."""
 FARTHEST = 7.0  # logarithms of hyperparameters farther from their prior medians are implausible
 SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
 """Largest change of logarithms of local variances at their fixed point, and on the way to an optimum; iterations."""
-STEEPEST = 0.8
-"""Bound on the slope of the fixed-point map of one local variance: its steps are at most five times the map's."""
+STEEPEST = 0.8  # bound on the slope of a local variance's map: its steps are at most five times the map's
 COUPLED, LONGEST_COUPLED = 0.3, 1.0
 """Changes of logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
 BASIN = 0.3  # logarithms of hyperparameters within which of a known optimum no other is looked for
@@ -44,11 +42,8 @@ are rounding."""
 RIDGE = 1e-13  # added to the scaled information matrix against rounding in unobservable directions
 PRECISIONS = np.linspace(-14.0, 8.0, 200)
 """Logarithms of the precisions, times a squared scale, of the normals that nearly all of a t_3 is a mixture of."""
-MOST_WIDENED = 100.0
-"""Upper bound on the factor of tails on a local variance: where data contradict them, nothing else bounds it."""
-
-FACTORS = np.geomspace(1.0, 30.0, 100)
-"""Factors on the covariance of deviations that are compared for what the model lacks."""
+MOST_WIDENED = 100.0  # bound on the factor of tails on a local variance, where data contradict them
+FACTORS = np.geomspace(1.0, 30.0, 100)  # on the covariance of deviations, compared for what the model lacks
 
 
 class Spectrum(NamedTuple):

@@ -31,13 +31,11 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
 MOST = 1000  # configurations that hyperparameters are estimated from, drawn at random where there are more
-FEW = 60
-"""Configurations up to which the marginal likelihood may have several optima, and is climbed from several sides."""
+FEW = 60  # configurations up to which several optima of the marginal likelihood are looked for
 SAME_SIZE, SAME_PLACE = 0.02, 0.01
 """Largest change of the logarithms of hyperparameters, and of deviations over their scales (RMS), at the end."""
 CLOSE = 0.1  # scales (RMS) up to which the posterior mean at one linearization stands for a fit
-ITERATIONS = 6
-"""Of the first fit between two estimates, twice as many in every later one: the first estimates change soon."""
+ITERATIONS = 6  # of the first fit between two estimates, twice as many in every later one: the first change soon
 VAGUE = 1.0  # standard deviation of a logarithm from which on a scale of the geometry is hardly identified
 FLATTEST = 0.05  # lower bound on the second derivatives of -2 ln L
 Refit = Callable[[Source, Formulation, Array, int], Array]

@@ -22,12 +22,10 @@ from rpim_opt.robot.extensions import extension_scales, model_extensions
 from rpim_opt.robot.parameters import EXPANSION, frame_of, of_session, own_name, session_prefix
 
 FIRST, SECOND, MOMENTS = "first harmonic", "second harmonic", "moments"
-TURNED = {FIRST: 2.0, SECOND: 4.0}
-"""Travel of a joint [rad] from which its harmonics are looked for: what less tells of them fails elsewhere."""
+TURNED = {FIRST: 2.0, SECOND: 4.0}  # travel [rad] from which a joint's harmonics are looked for: less fails elsewhere
 MANY = 40  # configurations from which on first moments and second harmonics are compared
 CANDIDATES = ((), ("gravity",), (FIRST,), ("gravity", FIRST))  # the models of the arm that are compared first
-FURTHER = {MOMENTS: "gravity", SECOND: FIRST}
-"""Extensions that are asked for one by one beside the best of those, and what each stands beside."""
+FURTHER = {MOMENTS: "gravity", SECOND: FIRST}  # asked for one by one, and what each stands beside
 ARM = ("gravity", FIRST, SECOND, MOMENTS)  # all extensions of the arm, in the order in which they are said
 SESSIONS = "sessions"  # the extension by what the readings of a session have in common, which is none of the arm
 WARMTH = "temperature"  # the extension by what grows with temperature
@@ -39,8 +37,7 @@ For sessions and for temperature once more each: they are other questions."""
 LARGE = 3.0  # by how much larger, in its logarithm, the scale of an extension is in another start
 COMPARED = 1e-2  # slopes of -2 ln L by the logarithms of hyperparameters at which models are compared
 ROUNDS = 3  # linearizations at which the hyperparameters of the selected model are estimated
-SPEAK = 10.0
-"""By how much -2 ln L must fall for an extension to be spoken of: 4 is what a false pick gains, 10 none in many."""
+SPEAK = 10.0  # fall of -2 ln L for an extension to be spoken of: false picks gain 4, none of many gained 10
 OWNED = {
     "gravity": ("compliance", "bend"),
     "first harmonic": ("ecc",),

@@ -19,8 +19,7 @@ from rpim_opt.problem.problem import CalibrationProblem, error_dimensions
 
 BEYOND, LOOK = 6.0, 3.0
 """Medians of the errors beyond which a position is an outlier; and from which on any is looked for."""
-FALSE_RATE = float(chdtrc(3, BEYOND**2 * chdtri(3, 0.5)))
-"""How rarely the error of a good position, of three components, is beyond."""
+FALSE_RATE = float(chdtrc(3, BEYOND**2 * chdtri(3, 0.5)))  # of a good position, of three components
 SPARE = 0.4  # part of the equations that must be left over: errors that the fit has swallowed tell nothing
 WELL_DETERMINED = 10.0  # equations a parameter from which on no single row can pull the fit to itself
 FULL_WEIGHT, STEPS = 1.5, 50

@@ -23,8 +23,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
 TRANSMISSION = "transmission error"  # the extension by curves of the joints' transmission error
-GAIN = 12.0
-"""By how much -2 ln L must fall for curves: real arms without them gain up to 10, of 162 simulated ones none 12."""
+GAIN = 12.0  # fall of -2 ln L for curves: real arms without them gain up to 10, of 162 simulated ones none 12
 MOMENTS_GAIN = 20.0
 """By how much it must fall for first moments of links beside curves: admitted at a gain of 15 they made errors outside
 the measured range 1.44 times as large; with all data of that arm they gain 70, and are needed."""
