@@ -55,12 +55,10 @@ def comparison_figure(ratios: Mapping[str, Array], means: Mapping[str, Sequence[
     for y, (method, values) in enumerate(ratios.items()):
         alpha = min(0.5, 3 / max(len(values), 1) ** 0.5)
         ax.plot(_inside(values), np.full(len(values), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
-        for beyond, edge, arrow in (
-            (values > LARGEST_RATIO, LARGEST_RATIO, ">"),
-            (values < 1 / LARGEST_RATIO, 1 / LARGEST_RATIO, "<"),
-        ):
-            if beyond.any():
-                ax.plot([edge], [y], arrow, ms=6, color="C0", zorder=2)
+        if (values > LARGEST_RATIO).any():
+            ax.plot([LARGEST_RATIO], [y], ">", ms=6, color="C0", zorder=2)
+        if (values < 1 / LARGEST_RATIO).any():
+            ax.plot([1 / LARGEST_RATIO], [y], "<", ms=6, color="C0", zorder=2)
         mean, low, high = means[method]
         colour = "0.3"
         if low is not None and high is not None:

@@ -27,6 +27,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance, load
 from rpim_opt.store.problem_file import find_problem
+from rpim_opt.study.studies import Row
 from rpim_opt.use.validation import validate
 
 ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed that returns one"
@@ -45,7 +46,6 @@ UNCONVERGED = "not converged"
 IMPOSSIBLE = "impossible"
 FAILED = "failed"
 WITH_FIGURES = (OK, UNCONVERGED)  # statuses of replicates that have figures
-Row = dict[str, Any]  # a replicate: its case, status and figures
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]
 """A problem, or a function of a seed with another problem for every seed."""
