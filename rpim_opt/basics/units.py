@@ -114,12 +114,9 @@ def numeral(text: str) -> float:
 
 
 def quantities(
-    table: Mapping[str, Any],
-    dimensions: Mapping[str, tuple[str, ...]],
-    where: str = "",
-    lists: bool = False,
-    also: Iterable[str] = (),
-) -> dict[tuple[str, str], Any]:
+    table: Mapping[str, Any], dimensions: Mapping[str, tuple[str, ...]], where: str = "",
+    lists: bool = False, also: Iterable[str] = (),
+) -> dict[tuple[str, str], Any]:  # fmt: skip
     """Return the values [SI] of a table of quantities, ``{"x_mm": 1.0, "rx_deg": 90}``, by (stem, dimension).
 
     ``dimensions`` are those that stems may have, ``{"x": ("length",), "rx": ("angle",)}``; ``where`` is what errors

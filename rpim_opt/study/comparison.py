@@ -48,22 +48,12 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def compare(
-    problems: Any,
-    formulations: Any = "tikhonov",
-    selectors: Any = "learned",
-    *,
-    methods: Any = (),
-    splits: Any = FOLDER,
-    counts: Any = None,
-    noise: Any = 1.0,
-    seeds: int | Iterable[int] = 1,
-    metrics: Any = USUAL,
-    options: Mapping[str, Any] | None = None,
-    workers: int = 1,
-    journal: str | Path | None = None,
-    resume: bool | None = True,
+    problems: Any, formulations: Any = "tikhonov", selectors: Any = "learned", *,
+    methods: Any = (), splits: Any = FOLDER, counts: Any = None, noise: Any = 1.0, seeds: int | Iterable[int] = 1,
+    metrics: Any = USUAL, options: Mapping[str, Any] | None = None, workers: int = 1,
+    journal: str | Path | None = None, resume: bool | None = True,
     progress: bool | Callable[[int, int], None] = True,
-) -> Comparison:
+) -> Comparison:  # fmt: skip
     """Compare formulations, selectors and user-defined methods on problems, by errors on held-out data.
 
     Every problem with every formulation and every selector, every split and every seed: one replicate each. What cannot
@@ -149,15 +139,11 @@ def compare(
     with progress_bar("comparing", progress) as say:
         rows = studies.run_cases(cases, work, workers, say, path, code, resume)
     axes = {
-        "Problems": asked,
-        "Methods": compared,
-        "Held out": ways,
+        "Problems": asked, "Methods": compared, "Held out": ways,
         "Configurations": ["all" if count is None else str(count) for count in sizes],
-        "Noise factors": [f"{factor:g}" for factor in factors],
-        "Seeds": map(str, numbered),
-        "Metrics": figured,
-        "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
-    }
+        "Noise factors": [f"{factor:g}" for factor in factors], "Seeds": map(str, numbered),
+        "Metrics": figured, "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
+    }  # fmt: skip
     settings = {name: ", ".join(values) for name, values in axes.items() if values}
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
 

@@ -94,6 +94,7 @@ JOINTS = (
 )
 """Joints from the base, where all of them are there."""
 UR_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+UR_NUMBERS = {f"{name}{end}": i for i, name in enumerate(UR_JOINTS, start=1) for end in ("", "_joint")}
 """Universal Robots' joints, from the base; ROS lists them in the alphabet's order."""
 MOST_PREFIXES = 6  # words before a name that is known
 VALUE = frozenset({"position", "pos", "angle", "value"})
@@ -115,7 +116,7 @@ def recognize(stem: str, joints: Sequence[str] = ()) -> Reading:
     rest = "_".join([word for word in words if not any(word in signs for signs in KINDS.values())] or words)
     named = path[: max(len(path) - 1, 1)] if len(path) < 2 or path[-1] in VALUE | {"effort"} else []
     for part in named:
-        number, why = ur_joint(part), "a joint of Universal Robots"
+        number, why = UR_NUMBERS.get(part, 0), "a joint of Universal Robots"
         if part in joints:
             number, why = joints.index(part) + 1, "a joint of the robot's file"
         if number:
@@ -136,12 +137,6 @@ def endings(stem: str) -> Iterator[tuple[str, str]]:
     """Yield the possible prefixes of a name, and the rest: ``robot1_joint_2`` is ``joint_2`` of ``robot1``."""
     for match in islice(re.finditer(r"[\s._/:\-]+", stem), MOST_PREFIXES):
         yield stem[: match.end()], stem[match.end() :]
-
-
-def ur_joint(name: str) -> int:
-    """Return the number of a joint of Universal Robots, 0 for another name."""
-    name = name.removesuffix("_joint")
-    return UR_JOINTS.index(name) + 1 if name in UR_JOINTS else 0
 
 
 # --- quaternions and matrices whose columns are numbered, turns ---------------------------------------------------

@@ -16,7 +16,7 @@ from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import DISPLAY, FOREIGN, UNITS, dimension_of, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
-from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize, ur_joint
+from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize
 from rpim_opt.data.tables.reading import number_columns, text_columns
 from rpim_opt.robot.mdh import Robot
 
@@ -93,13 +93,9 @@ class Understood:
 
 
 def understand(
-    raw: RawTable,
-    robot: Robot,
-    kind: Measurement,
-    options: TableOptions | None = None,
-    joints: Sequence[str] = (),
-    targets: bool = False,
-) -> Understood:
+    raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions | None = None,
+    joints: Sequence[str] = (), targets: bool = False,
+) -> Understood:  # fmt: skip
     """Interpret a raw table for a robot and a measurement type, with the names that `read_data` takes.
 
     Names that it takes already stay; others are recognized where they can mean one thing only (`names`). What is not
@@ -253,7 +249,7 @@ def _put_in_robots_order(read: Readings, table: Columns, dof: int, joints: Seque
             raise InputError("the header", f"column '{column}' with {len(others) + 1} names", "one joint per column")
         place = joints.index(joint) + 1 if joint in joints else 0
         if not joints and dof == len(known_names.UR_JOINTS):
-            place = ur_joint(joint)
+            place = known_names.UR_NUMBERS.get(joint, 0)
         if not joints and not place:
             accepted = "a robot from a URDF, which names its joints"
             raise InputError("the header", f"joint '{joint}' in column '{column}'", accepted)
@@ -377,12 +373,9 @@ def _leave_out(read: Readings, targets: bool) -> None:
 
 
 def _under_our_names(
-    table: Columns,
-    read: Readings,
-    kind: Measurement,
-    known: Mapping[str, Sequence[str]],
-    units: Mapping[str, tuple[str, str]],
-) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
+    table: Columns, read: Readings, kind: Measurement,
+    known: Mapping[str, Sequence[str]], units: Mapping[str, tuple[str, str]],
+) -> tuple[dict[str, Sequence[Any]], list[Meant]]:  # fmt: skip
     """Return the columns with canonical names and units, and the meaning of every column.
 
     ``units`` are those of columns whose name has none, by stem or dimension, and where they are stated.
