@@ -143,9 +143,8 @@ class NoSolutionFound(RpimError):
         self.advice = advice
         contradiction = str(conflict) if conflict else ""
         why = contradiction or advice or "use another weight, or add constraints that bound the solution"
-        super().__init__(
-            f"Formulation '{formulation}' at weight {weight:.3g}: the solver ended with '{status}'; {why}."
-        )
+        program = f"Formulation '{formulation}' at weight {weight:.3g}"
+        super().__init__(f"{program}: the solver ended with '{status}'; {why}.")
 
 
 def choices(found: str, known: Iterable[str]) -> str:

@@ -233,9 +233,8 @@ def _without_numbered_header(full: list[int], rows: Sequence[Sequence[str]]) -> 
     while len(full) > 1:
         first, second = rows[full[0]], rows[full[1]]
         names_between = any(not _count(row) for row in rows[full[0] + 1 : full[1]])
-        above_numbers = sum(
-            cell[:1].isalpha() and is_numeral(below) for cell, below in zip(first, second, strict=False)
-        )
+        pairs = zip(first, second, strict=False)
+        above_numbers = sum(cell[:1].isalpha() and is_numeral(below) for cell, below in pairs)
         # LabVIEW: counts and steps of the channels, above the names of columns that begin with a number
         lines = not is_numeral(first[0]) and is_numeral(rows[full[-1]][0])
         lines = lines and any(not _count(row) and len(row) > 1 for row in rows[full[0] + 1 : full[-1]])

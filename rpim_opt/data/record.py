@@ -93,11 +93,8 @@ class HeldOut:
 
     def sentence(self, rows: int) -> str:
         """Return a sentence on the validation, and the rows that the parameters are identified from."""
-        missed = f"{1e3 * np.nanmean(self.error):.4f} mm"
-        return (
-            f"Validated on {len(self.label)} held-out rows: with parameters from the {self.used} others their "
-            f"mean error is {missed}. The delivered parameters are from all {rows}."
-        )
+        mean = f"with parameters from the {self.used} others their mean error is {1e3 * np.nanmean(self.error):.4f} mm"
+        return f"Validated on {len(self.label)} held-out rows: {mean}. The delivered parameters are from all {rows}."
 
 
 class Earlier(NamedTuple):

@@ -401,9 +401,8 @@ def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[s
     try:
         yield from finished
     except BrokenExecutor as error:
-        raise RpimError(
-            f"A process ended before its replicate was finished: {error} Finished replicates are kept."
-        ) from None
+        ended = f"A process ended before its replicate was finished: {error}"
+        raise RpimError(f"{ended} Finished replicates are kept.") from None
 
 
 def _computed(key: str, work: Work) -> tuple[str, Row]:
@@ -455,9 +454,8 @@ def commit(folder: Path, *paths: Path) -> str:
 
     try:
         described = f"commit {git('describe', '--always').strip()}"
-        changes = git(
-            "status", "--porcelain", "--untracked-files=all", "--", *map(str, paths), ":(exclude,glob)**/results/**"
-        )
+        named = (*map(str, paths), ":(exclude,glob)**/results/**")
+        changes = git("status", "--porcelain", "--untracked-files=all", "--", *named)
     except (OSError, subprocess.CalledProcessError):
         return "in no repository"
     if "??" in {line[:2] for line in changes.splitlines()}:

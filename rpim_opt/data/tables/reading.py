@@ -112,9 +112,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         for i, key in enumerate(zip(*markers, _names(table, ["fixture"], N), strict=True)):
             groups.setdefault(key, []).append(i)
         parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
-        blocks = tuple(
-            replace(blocks[0].take(index, index), markers=tuple(names), fixture=place) for names, place, index in parts
-        )
+        blocks = tuple(replace(blocks[0].take(i, i), markers=tuple(names), fixture=place) for names, place, i in parts)
     data = Dataset(blocks, label, configuration)
     return data.grouped_by_points() if kind.touching else data
 
@@ -308,9 +306,7 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
         if not isinstance(tracker, Mapping) or not {"x", "y", "z"} <= set(kind.columns):
             raise InputError("table noise, key tracker", repr(tracker)[:60], "a table, for positions and poses")
         of_tracker = quantities(tracker, TRACKER, "table noise.tracker")
-        terms = {
-            "range_ppm" if dimension == "ratio" else stem: value for (stem, dimension), value in of_tracker.items()
-        }
+        terms = {"range_ppm" if of == "ratio" else stem: value for (stem, of), value in of_tracker.items()}
         if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
             raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
         declared["tracker"] = LaserTracker(**terms)
