@@ -175,7 +175,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
             if place.is_dir():
                 raise IsADirectoryError(21, "it is a folder", str(place))
             make_folder(place.parent, folders)
-            made[place] = stack.enter_context(scratch_folder(place)) / "file"
+            made[place] = Path(stack.enter_context(scratch_folder(place)), "file")
             with made[place].open("xb") as stream:
                 _keep_mode(stream.fileno(), place)
                 stream.write(contents[path])
@@ -232,11 +232,9 @@ def _keep_mode(handle: int, place: Path) -> None:
         os.fchmod(handle, stat.S_IMODE(known.st_mode))
 
 
-@contextmanager
-def scratch_folder(place: Path) -> Iterator[Path]:
-    """Make a temporary folder beside ``place`` for files that will be moved there, and remove it at the end."""
-    with tempfile.TemporaryDirectory(ENDING, f".{place.name}.", place.parent, ignore_cleanup_errors=True) as folder:
-        yield Path(folder)
+def scratch_folder(place: Path) -> tempfile.TemporaryDirectory[str]:
+    """Return a temporary folder beside ``place`` for files that will be moved there."""
+    return tempfile.TemporaryDirectory(ENDING, f".{place.name}.", place.parent, ignore_cleanup_errors=True)
 
 
 def write_json(path: Path, content: Any) -> None:

@@ -202,7 +202,7 @@ def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: Described, so
     """Write a new folder with its robot beside its place, and move it there when it is whole."""
     with ExitStack() as stack:
         files.make_folder(folder.parent, stack.enter_context(files.undoing()))
-        made = stack.enter_context(files.scratch_folder(folder)) / folder.name
+        made = Path(stack.enter_context(files.scratch_folder(folder)), folder.name)
         files.write_files({made / name: content for name, content in contents.items()})
         if chains:
             files.write_bytes(made / ROBOT_OF_CHAINS, files.read_bytes(source))
