@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import asdict, dataclass, field
 from functools import partial
@@ -413,7 +413,7 @@ def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[s
         )  # fmt: skip
         known.append(standing)
     known.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
-    return Summary(metric, reference, tuple(known), _notes(rows, known, drawn, reference))
+    return Summary(metric, reference, tuple(known), tuple(_notes(rows, known, drawn, reference)))
 
 
 def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
@@ -467,9 +467,9 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     return middle, float(np.exp(low)), float(np.exp(high))
 
 
-def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> tuple[str, ...]:
-    """Return the notes below the table: of what the ratios and intervals speak, and what has no results."""
-    notes = [f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."]
+def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> Iterator[str]:
+    """Yield the notes below the table: of what the ratios and intervals speak, and what has no results."""
+    yield f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."
     compared = sum(each.low is not None and each.method != reference for each in standings)
     problems = {row["problem"] for row in rows}
     if len(problems) >= ENOUGH:
@@ -483,13 +483,12 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         if compared > 1:
             text += " No correction for multiple comparisons: without any difference, "
             text += f"{(1 - CONFIDENCE) * compared:.2g} of {compared} would be marked by chance."
-        notes.append(text)
+        yield text
     elif len(standings) > 1:
-        few = f"fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one"
-        notes.append(f"There are no intervals: {few}.")
+        yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
     late = sum(each.unconverged for each in standings)
     if late:
-        notes.append(f"{late} replicates did not converge; their results are included (column status).")
+        yield f"{late} replicates did not converge; their results are included (column status)."
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
@@ -498,5 +497,4 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     for (method, status, reason), missing in without.items():
         where = f" ({listed(list(dict.fromkeys(missing)), 4)})" if len(missing) < every[method] else ""
         count = f"{len(missing)} of {every[method]} replicates{where}"
-        notes.append(f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}")
-    return tuple(notes)
+        yield f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}"
