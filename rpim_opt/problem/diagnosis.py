@@ -993,15 +993,17 @@ def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
 def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
 
-    The parameters are fitted beside, with their prior. Random errors would leave 60 % of the residuals: their signs are
-    known then, and not their sizes.
+    The parameters are fitted beside, with their prior. Random errors leave 60 % of the residuals, as their signs are
+    fitted then and not their sizes, and much less where there are fewer than three equations a parameter.
     """
     alone = problem.with_repeatability(None)
     model, free, rows = alone.linearize(x), problem.parameters.free, alone.owners
     r = model.b - model.A @ (x / free.scale)
+    if len(r) < 3 * len(x) or not r.any():
+        return
     without = _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
-    joints = [(i, k) for i, k in joints if model.A[:, k].any() and r.any()]
+    joints = [(i, k) for i, k in joints if model.A[:, k].any()]
     best, said = TWO_KINDS, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
@@ -1010,7 +1012,9 @@ def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         step, target = np.linalg.norm(r) / np.linalg.norm(A, axis=0), r
         for _ in range(MOST_ROUNDS):
             errors = [np.bincount(rows, (target - A @ (side * step)) ** 2) for side in sides]
-            columns = A * sides[np.argmin(errors, axis=0)][rows]
+            before, columns = columns, A * sides[np.argmin(errors, axis=0)][rows]
+            if np.array_equal(columns, before):
+                break
             step = np.linalg.lstsq(without(columns), without(r[:, None])[:, 0], rcond=None)[0]
             target = without((r - columns @ step)[:, None])[: len(r), 0] + columns @ step
         left = float(np.linalg.norm(target - columns @ step) / np.linalg.norm(r))
