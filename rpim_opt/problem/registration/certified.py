@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from typing import NamedTuple
@@ -27,7 +27,7 @@ RIDGE = 1e-6
 LOSSES = ("squares", "truncated")
 QUANTILE = 0.99
 """Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
-FEWEST = 3  # measurements that have to have a weight
+FEWEST, MOST_ROUNDS = 3, 100  # measurements that have to agree, and how often these are chosen anew
 MOST_PAIRED = 2000  # measurements up to which all pairs are compared
 TRIED, FEW = 40, 10  # measurements, evenly spread, whose compatible sets are tried, and the most sets that are
 SURPRISE = 1e-4  # probability that a good measurement is off by more than counts as good
@@ -115,14 +115,13 @@ def certified_hand_eye(
     loops = _Loops(*_equations(flange, measured, turned, deviations, expected, spread), beyond)
     several = False  # whether other measurements than those of full weight may be as many that agree
     if loss == "squares":
-        solved = loops.weighted(np.ones(N))
+        solved = loops.repeated(np.ones(N, dtype=bool))
     else:
         pairs = _compatible(flange, measured, turned, deviations[:, 1], beyond)
         solved = _truncated(loops, pairs)
-        agreeing = solved.weights > 0
-        count = int(np.sum(agreeing))
+        count = int(np.sum(solved.agreeing))
         if count < N // 2 + 2:  # no majority: none of the others is in a core of that size but what a good one may be
-            strange = ~agreeing & (solved.squares > chdtri(equations, SURPRISE))
+            strange = ~solved.agreeing & (solved.squares > chdtri(equations, SURPRISE))
             several = count < 2 or bool((_core(pairs, count) & strange).any())
     best = solved.smallest
     first, *last = best.rotations
@@ -132,21 +131,21 @@ def certified_hand_eye(
     weakest = float(np.linalg.eigvalsh(best.information)[0])
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
     radius = best.radius(float(chdtri(LINEAR + 3 * len(best.rotations), AS_WELL)))
-    full = int(np.sum(solved.weights))
+    full = int(np.sum(solved.agreeing))
     causes = {
         f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): rotations about two axes "
         "would": (uncertainty > UNKNOWN),
         f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
         f"another start, up to {radius:.2g} rad away, may fit as well: measure more or other poses to decide": radius
         > FAR,
-        "the weights of the loss did not converge": not np.array_equal(solved.squares <= beyond, solved.weights),
+        "the weights of the loss did not converge": not solved.settled,
         f"{full} of {N} measurements agree, and as many others may agree with another start": several,
     }
     cause = next((text for text, true in causes.items() if true), "")
     return CertifiedStart(
         base=rigid(first, first @ u), tool=rigid(last[0].T if last else np.eye(3), t), cost=solved.cost,
         bound=solved.cost - excess, gap=gap, rank_ratio=best.rank_ratio, uncertainty=uncertainty, radius=radius,
-        weights=solved.weights, certified=not cause,
+        weights=solved.agreeing.astype(float), certified=not cause,
         reason=cause or f"globally optimal (relative optimality gap at most {GAP:g})",
     )  # fmt: skip
 
@@ -221,9 +220,10 @@ class _Solved(NamedTuple):
     """Where a loss of closed loops is least."""
 
     v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
-    smallest: Smallest  # of the last weighted problem
-    weights: Array  # (N,) that the loss gives the measurements; one for a square
+    smallest: Smallest  # of the measurements that agree
     squares: Array  # (N,) squared residuals
+    agreeing: np.ndarray  # (N,) which of them count
+    settled: bool  # whether it is the solution of those
     cost: float  # the loss, summed, and what is expected of translations
 
 
@@ -234,51 +234,38 @@ class _Loops(NamedTuple):
     prior: Array  # (3, n) residuals of what is expected of t
     beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
 
-    def weighted(self, weights: Array, start: Array | None = None, bounded: bool = True) -> _Solved:
-        """Return the solution of a weighted sum of squares: by the relaxation, or by Newton's steps alone.
+    def of(self, some: np.ndarray) -> _Solved:
+        """Return the solution of the sum of squares of some measurements (N,).
 
-        With T (n, n), upper, |T v|^2 = sum_i weights_i |J_i v|^2 + |prior v|^2: its last rows are the least over
-        translations (a Schur complement), its first ones say which these are.
+        With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its last rows are the least over translations (a
+        Schur complement), its first ones say which these are.
         """
         n = self.rows.shape[2]
-        rows = (np.sqrt(weights)[:, None, None] * self.rows).reshape(-1, n)
-        T = np.asarray(np.linalg.qr(np.vstack([rows, self.prior, np.zeros((n, n))]), mode="r"))
-        L = T[LINEAR:, LINEAR:]
-        best = smallest(L, start, bounded)
+        T = np.asarray(np.linalg.qr(np.vstack([*self.rows[some], self.prior, np.zeros((n, n))]), mode="r"))
+        best = smallest(T[LINEAR:, LINEAR:])
         x = lifted(best.rotations)
         v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
         squares = np.sum((self.rows @ v) ** 2, axis=1)
         cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
-        return _Solved(v, best, weights, squares, cost)
+        agreeing = squares <= self.beyond
+        return _Solved(v, best, squares, agreeing, np.array_equal(agreeing, some), cost)
 
-    def repeated(self, solved: _Solved) -> _Solved:
-        """Return the fixed point of weights and solution, the last of which is the relaxation's."""
-        for _ in range(100):
-            weights = (solved.squares <= self.beyond).astype(float)
-            same = np.array_equal(weights, solved.weights)
-            if weights.sum() < FEWEST or (same and np.isfinite(solved.smallest.bound)):
-                break
-            solved = self.weighted(weights, solved.smallest.rotations, bounded=same)
-        if not np.isfinite(solved.smallest.bound):
-            solved = self.weighted(solved.weights, solved.smallest.rotations)
-        return solved
+    def repeated(self, some: np.ndarray) -> _Solved:
+        """Return the fixed point of solution and measurements that agree with it, beginning with some (N,).
 
-    def graduated(self, among: np.ndarray) -> _Solved:
-        """Return a least of the truncated loss by graduated non-convexity (Yang et al. 2020, IEEE RA-L 5:1127).
-
-        Losses of some measurements (N,) from squares to the truncated one, each from the last: that of parameter mu has
-        weights 1 below mu / (mu + 1) c^2, 0 above (mu + 1) / mu c^2, and between them sqrt(mu (mu + 1) c^2 / r^2) - mu.
+        Of those that do not agree at most the worst quarter is left out at once: the first solution may fit none.
         """
-        solved = self.weighted(among.astype(float))
-        mu = 1 / max(2 * float(np.max(among * solved.squares / self.beyond)) - 1, 1e-3)
-        for _ in range(100):
-            between = np.sqrt(mu * (mu + 1) * self.beyond / np.maximum(solved.squares, 1e-300)) - mu
-            weights = among * np.clip(between, 0.0, 1.0)
-            if np.all((weights == 0) | (weights == 1)) or np.sum(weights > 0) < FEWEST:
+        solved = self.of(some)
+        for _ in range(MOST_ROUNDS):
+            if solved.settled:
                 break
-            solved = self.weighted(weights, solved.smallest.rotations, bounded=False)
-            mu *= 1.6
-        return self.repeated(solved)
+            off = solved.squares / self.beyond
+            limit = np.sort(off[some])[max(FEWEST, 3 * some.sum() // 4) - 1]
+            before, some = some, solved.agreeing | (some & (off <= limit))
+            if np.array_equal(some, before):
+                break
+            solved = self.of(some)
+        return solved
 
 
 def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
@@ -288,10 +275,10 @@ def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
     of that agree, with all of them and with parts of it.
     """
     first = _likeliest(pairs)
-    solutions = [loops.graduated(first)]
-    if not np.array_equal(solutions[0].weights > 0, first):
-        solutions.append(loops.graduated(np.ones(len(pairs), dtype=bool)))
-    most = max(each.weights.sum() for each in solutions)
+    solutions = [loops.repeated(first)]
+    if not np.array_equal(solutions[0].agreeing, first):
+        solutions.append(loops.repeated(np.ones(len(pairs), dtype=bool)))
+    most = max(each.agreeing.sum() for each in solutions)
     if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
         members = np.flatnonzero(first)
         around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
@@ -299,7 +286,7 @@ def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
         if len(members) <= FEW:  # turning alike, one may be wrong all the same
             parts += list(first & ~np.eye(len(first), dtype=bool)[members])
         distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
-        solutions += [loops.graduated(part) for part in distinct if part.sum() >= FEWEST]
+        solutions += [loops.repeated(part) for part in distinct if part.sum() >= FEWEST]
     least = min(each.cost for each in solutions)
     return next(each for each in solutions if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
 
@@ -435,10 +422,10 @@ class Smallest:
 
     rotations: Array
     value: float
-    bound: float = -np.inf  # no rotations have less, up to rounding
-    rank_ratio: float = np.inf  # of the moment matrix
-    information: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (3k, 3k) half the Hessian by turns [1/rad^2]
-    steepness: float = 0.0  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
+    bound: float  # no rotations have less, up to rounding
+    rank_ratio: float  # of the moment matrix
+    information: Array  # (3k, 3k) half the Hessian by turns [1/rad^2]
+    steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
 
     def radius(self, excess: float) -> float:
         """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
@@ -458,10 +445,8 @@ class Smallest:
         return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
 
 
-def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smallest:
-    """Return the best of what the relaxation and a start (k, 3, 3) lead to, with the relaxation's bound.
-
-    If that is not wanted, the stationary rotations near the start, of which nothing is known.
+def smallest(L: Array) -> Smallest:
+    """Return the best rotations that the relaxation leads to, with its bound.
 
     ::
 
@@ -471,9 +456,6 @@ def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smal
     The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
-    near = [] if start is None else [_refined(L, start)]
-    if near and not bounded:
-        return Smallest(near[0], _value(L, near[0]))
     Q = L.T @ L
     moments = relax(Q)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
@@ -485,7 +467,7 @@ def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smal
         drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
         lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
     rounded = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
-    best = min([*rounded, *near], key=lambda R: _value(L, R))
+    best = min(rounded, key=lambda R: _value(L, R))
     value = _value(L, best)
     x = lifted(best)
     C = rotation_constraints(len(best))
@@ -495,7 +477,7 @@ def smallest(L: Array, start: Array | None = None, bounded: bool = True) -> Smal
     eigenvalues = np.linalg.eigvalsh(S - np.tensordot(moves, C, axes=1))
     bound = value + min(0.0, float(eigenvalues[0])) * float(x @ x)
     steepness = max(0.0, float(eigenvalues[1]))
-    return Smallest(best, value, bound, moments.rank_ratio, _derivatives(L, best)[1] / 2, steepness)
+    return Smallest(best, value, bound, moments.rank_ratio, _information(L, best), steepness)
 
 
 def lifted(rotations: Array) -> Array:
@@ -507,11 +489,10 @@ def _value(L: Array, rotations: Array) -> float:
     return float(np.sum((L @ lifted(rotations)) ** 2))
 
 
-def _derivatives(L: Array, rotations: Array) -> tuple[Array, Array]:
-    """Return first (3k,) and second derivatives (3k, 3k) of |L x|^2 by rotation vectors w, R_i exp([w_i] x)."""
+def _information(L: Array, rotations: Array) -> Array:
+    """Return half the second derivatives (3k, 3k) of |L x|^2 by rotation vectors w, R_i exp([w_i] x)."""
     k = len(rotations)
-    residual = L @ lifted(rotations)
-    G = (2 * L.T @ residual)[1:].reshape(k, 3, 3)
+    G = (L.T @ L @ lifted(rotations))[1:].reshape(k, 3, 3)
     D = np.zeros((L.shape[1], 3 * k))
     B = np.zeros((3 * k, 3 * k))
     for i, R in enumerate(rotations):
@@ -520,29 +501,17 @@ def _derivatives(L: Array, rotations: Array) -> tuple[Array, Array]:
         M = R.T @ G[i]
         # the second order of exp([w] x) is ([w] x)^2 / 2 = (w w' - |w|^2) / 2
         B[own, own] = (M + M.T) / 2 - np.trace(M) * np.eye(3)
-    J = L @ D
-    return 2 * J.T @ residual, 2 * J.T @ J + B
+    return D.T @ L.T @ L @ D + B
 
 
 def _refined(L: Array, rotations: Array) -> Array:
-    """Return the stationary rotations to which Newton's steps lead, uphill directions turned, long steps halved."""
-    value = _value(L, rotations)
-    for _ in range(50):
-        slope, curvature = _derivatives(L, rotations)
-        eigenvalues, V = np.linalg.eigh(curvature)
-        sizes = np.maximum(np.abs(eigenvalues), 1e-14 * np.abs(eigenvalues).max() + 1e-300)
-        step = -V @ ((V.T @ slope) / sizes)
-        step *= min(1.0, 1.0 / max(np.linalg.norm(step), 1e-300))
-        for halved in step / 2.0 ** np.arange(12)[:, None]:
-            turn = scipy.spatial.transform.Rotation.from_rotvec(halved.reshape(-1, 3)).as_matrix()
-            candidate = proper(rotations @ turn)
-            lower = _value(L, candidate)
-            if lower < value:
-                break
-        else:
-            return rotations
-        rotations = candidate
-        value = lower
-        if np.linalg.norm(step) < 1e-13:  # rad
-            break
-    return rotations
+    """Return the rotations of the least |L x|^2 near some."""
+
+    def turned(w: Array) -> Array:
+        return rotations @ scipy.spatial.transform.Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()
+
+    def residual(w: Array) -> Array:
+        return L @ lifted(turned(w))
+
+    start = np.zeros(3 * len(rotations))
+    return proper(turned(scipy.optimize.least_squares(residual, start, method="lm", xtol=1e-15, ftol=1e-15).x))

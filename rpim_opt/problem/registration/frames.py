@@ -11,6 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.optimize import least_squares
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -393,25 +394,20 @@ def settled(alone: Source, steps: int = 200) -> Array:
     """
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
-    z = np.zeros(len(scale))
-    model = source.linearize(scale * z)
-    least = float(np.sum(model.b**2))
-    damping = 0.0
-    for _ in range(steps):
-        R = model.triangle[:, :-1]
-        A = np.vstack([R, np.eye(len(z))])
-        size = np.sqrt(damping) * np.linalg.norm(A, axis=0)
-        right = np.concatenate([model.triangle[:, -1] - R @ z, -z, np.zeros(len(z))])
-        step = np.linalg.lstsq(np.vstack([A, np.diag(size)]), right, rcond=None)[0]
-        candidate = source.linearize(scale * (z + step))
-        objective = float(np.sum((candidate.A @ (z + step) - candidate.b) ** 2) + np.sum((z + step) ** 2))
-        if objective > least * (1 + 1e-12):
-            damping = max(4 * damping, 1e-3)
-            continue
-        z = z + step
-        model = candidate
-        least = objective
-        if damping == 0 and np.linalg.norm(step) <= 1e-11 * (1 + np.linalg.norm(z)):
-            break
-        damping = damping / 8 if damping > 1e-6 else 0.0
-    return scale * z
+    at: list[Array] = []  # where it was linearized last, and the factor: slopes are asked for where residuals were
+
+    def triangle(z: Array) -> Array:
+        if not at or not np.array_equal(at[0], z):
+            at[:] = z.copy(), source.linearize(scale * z).triangle
+        return at[1]
+
+    def residual(z: Array) -> Array:
+        return np.concatenate([triangle(z) @ [*z, -1.0], z])
+
+    def slopes(z: Array) -> Array:
+        return np.vstack([triangle(z)[:, :-1], np.eye(len(z))])
+
+    tight: Any = {"xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
+    z = least_squares(residual, np.zeros(len(scale)), slopes, method="lm", x_scale="jac", max_nfev=steps, **tight).x
+    z = z - np.linalg.lstsq(slopes(z), residual(z), rcond=None)[0]  # where a sum of squares no longer changes
+    return np.asarray(scale * z, dtype=float)
