@@ -21,8 +21,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 
 CRITERIA = ("D", "A", "V")
-ANYWHERE = 1.0
-"""Standard deviation of where a touched point is [m]."""
+ANYWHERE = 1.0  # standard deviation of where a touched point is [m]
 MOST_STEPS, MOST_PASSES = 4000, 20  # of the relaxation, and of exchanges over all chosen
 
 

@@ -31,48 +31,33 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
-LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}
-"""A joint that moves less [rad, m] is hardly seen."""
+LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}  # a joint that moves less [rad, m] is hardly seen
 FAR = 5.0
 """A row is in question from so many medians of the errors on, or robust standard deviations above their median."""
-ALIKE = (0.4, 2.5)
-"""Rounding explains errors that are between these multiples of what it makes."""
-MOVED = 0.5
-"""An instrument has moved if that leaves less than this part of the sum of squares."""
+ALIKE = (0.4, 2.5)  # rounding explains errors that are between these multiples of what it makes
+MOVED = 0.5  # an instrument has moved if that leaves less than this part of the sum of squares
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
-SMALL = 0.2
-"""Ratios and couplings [1, m] from which on a linearization says nothing of them."""
-RARE = 1e-6
-"""Probability with which chance may explain what is reported."""
-FLAT = 1e-3
-"""A coordinate that spreads less than this part of another one is hardly measured."""
-FEW = 3
-"""Outliers from which on they may have one cause."""
-FEWEST = 6
-"""Rows on either side of a change, or of which copies are told."""
+SMALL = 0.2  # ratios and couplings [1, m] from which on a linearization says nothing of them
+RARE = 1e-6  # probability with which chance may explain what is reported
+FLAT = 1e-3  # a coordinate that spreads less than this part of another one is hardly measured
+FEW = 3  # outliers from which on they may have one cause
+FEWEST = 6  # rows on either side of a change, or of which copies are told
 LINEAR, EXACT = 13, 1e-5
 """Coefficients of a coordinate by position and rotation of the flange, and what no measurement comes up to [m]."""
 BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
-UNRELATED = 0.5
-"""Part of the spread of positions that a fit leaves where joint values do not explain them."""
-ON_GRID = 2e-4
-"""Part of a step by which rounded values may miss it, for their last decimal."""
+UNRELATED = 0.5  # part of the spread of positions that a fit leaves where joint values do not explain them
+ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their last decimal
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
-SEVERAL = 0.85
-"""Several joint zeros moved, if that leaves less than this part of what one move leaves."""
-LOOSE = 1e-3
-"""Backlash of a joint [rad, m] that no gear in order has: a tenth of that is usual."""
+SEVERAL = 0.85  # several joint zeros moved, if that leaves less than this part of what one move leaves
+LOOSE = 1e-3  # backlash of a joint [rad, m] that no gear in order has: a tenth of that is usual
 FLAT_TURN = 0.05
 """Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
-FILLED = 1e-3
-"""A point that is at least so far from the one before [m] is another one."""
-COPIES = 0.2
-"""Part of the rows that may repeat others."""
-MOST_ROUNDS = 20
-"""Of telling rows of one reflector from those of another, and of fitting one joint's values."""
+FILLED = 1e-3  # a point that is at least so far from the one before [m] is another one
+COPIES = 0.2  # part of the rows that may repeat others
+MOST_ROUNDS = 20  # of telling rows of one reflector from those of another, and of fitting one joint's values
 TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
 OUTLYING, OUTLYING_ROUNDS = 10, 3
@@ -81,8 +66,7 @@ TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 PLACES, SPANS = 40, 12
 """Rows from which on something may have moved, and those between which it may have moved and moved back."""
-MOST_EQUATIONS = 3000
-"""Equations up to which a change is looked for."""
+MOST_EQUATIONS = 3000  # equations up to which a change is looked for
 
 
 @dataclass(frozen=True, eq=False, repr=False)

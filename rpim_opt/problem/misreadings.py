@@ -25,20 +25,14 @@ from rpim_opt.robot.kinematics import forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
 
-BETTER = 0.2
-"""Another reading of the data is reported when it leaves less than this part of the position error."""
+BETTER = 0.2  # another reading of the data is reported when it leaves less than this part of the position error
 SIBLING, SIBLING_BETTER = 0.1, 0.5
 """A ready robot whose nominal parameters differ by less [m, rad] is reported from this part of the error on."""
-FURTHER = 0.7
-"""A second mistake is looked for behind a reading that leaves less than this part."""
-WRONG = 0.02
-"""Points that are off by more than this part of their extent fit no nominal model of their robot."""
-LEFT = 0.05
-"""What leaves more than this part of the extent explains nothing, even if gross errors are behind it."""
-FEW = 30
-"""Rows of a first try; what comes near the best is tried on more."""
-SAME = 1.05
-"""Readings that leave within this factor the same cannot be told apart."""
+FURTHER = 0.7  # a second mistake is looked for behind a reading that leaves less than this part
+WRONG = 0.02  # points that are off by more than this part of their extent fit no nominal model of their robot
+LEFT = 0.05  # what leaves more than this part of the extent explains nothing, even if gross errors are behind it
+FEW = 30  # rows of a first try; what comes near the best is tried on more
+SAME = 1.05  # readings that leave within this factor the same cannot be told apart
 MISTAKES = {False: 3, True: 1}
 """Mistakes that are looked for at once; one alone of a camera's views, whose lens is not known yet and blurs others."""
 COUPLINGS = {True: (1.0, -1.0, 0.5, -0.5), False: (1.0, -1.0)}
@@ -66,8 +60,7 @@ MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
 """Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
 SLIPPED = ((1, "low", "up"), (-1, "high", "down"))
 """By how many rows a column may have slipped, where it is then, and which way back."""
-DEGREES_PER_MM = np.radians(1) / 1e-3
-"""Radians that a metre stands for where millimetres were degrees."""
+DEGREES_PER_MM = np.radians(1) / 1e-3  # radians that a metre stands for where millimetres were degrees
 
 
 class Misreading(NamedTuple):

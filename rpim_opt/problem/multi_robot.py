@@ -23,8 +23,7 @@ from rpim_opt.problem.registration.frames import met
 from rpim_opt.robot.parameters import Parameters, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
-MOST_PARAMETERS = 2000
-"""Parameters up to which sessions are identified."""
+MOST_PARAMETERS = 2000  # parameters up to which sessions are identified
 MINUTES = 0.26  # time of a default calibration of a thousand parameters; of 274 it takes 0.5 s, of 514 3 s
 FAR = 3.0
 """How many scales the nominal values of a shared parameter may differ by: as much as a frame's before it is moved."""

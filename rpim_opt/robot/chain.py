@@ -35,14 +35,11 @@ An error of an axis moves their common normal, and with it d and theta of both j
 beyond three times, prior scales would be wrong (with axes 10 degrees apart errors fell from 0.18 to 0.53 mm to 0.14 to
 0.20 mm on five simulated sets).
 """
-ANOTHER_ARM = 0.1
-"""A robot whose parameters deviate by more than this [m or rad] from a file's is not the file's."""
+ANOTHER_ARM = 0.1  # a robot whose parameters deviate by more than this [m or rad] from a file's is not the file's
 ORIGIN, MOUNT, MIMIC = OF_JOINTS = "origin_", "mount_", "mimic_"
 """Prefixes of the parameters of joints that move, of fixed joints at the ends of a chain, and of mimic joints."""
-ORIGIN_SCALES = {ORIGIN: 1.0, MOUNT: 10.0}
-"""Prior standard deviations of their deviations [mm and mrad]."""
-SAME_PLACE = (0.01, 0.1)
-"""Two frames nearer than this [m], [rad] are one and the same, known twice."""
+ORIGIN_SCALES = {ORIGIN: 1.0, MOUNT: 10.0}  # prior standard deviations of their deviations [mm and mrad]
+SAME_PLACE = (0.01, 0.1)  # two frames nearer than this [m], [rad] are one and the same, known twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -249,8 +246,7 @@ def _turned(angle: float, near: float) -> float:
 
 # Numbers in the files of robots
 
-ROUNDING = 1e-14
-"""Of numbers of an arm of a metre, and of an angle's cosine."""
+ROUNDING = 1e-14  # of numbers of an arm of a metre, and of an angle's cosine
 
 
 def spliced(data: bytes, edits: dict[tuple[int, int], str]) -> bytes:

@@ -19,8 +19,7 @@ from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Configuration, Symbol,
 GUESS = ((5.0, None), (10.0, 4))
 """Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
 AXES = "xyz"
-EXPECTED = 1e-4
-"""Expected size of an extension's deflection [rad] at the configuration where it is largest."""
+EXPECTED = 1e-4  # expected size of an extension's deflection [rad] at the configuration where it is largest
 DRAWS = 300
 SAME = 1e-2
 """Columns that differ by less, relatively, say the same: far from rounding, and from tilts of some milliradians."""

@@ -27,10 +27,8 @@ FRAME_DIMENSION = dict(zip(FRAME, ("length",) * 3 + ("angle",) * 3, strict=True)
 
 ZERO, ONE = ca.SX(0), ca.SX(1)
 """Made once: to make symbols of sixteen numbers takes longer than all the rest of a transform."""
-WIDTH = 256
-"""Rows of one call: in the virtual machine their numbers stay in the processor's second cache."""
-SHARE = 16 * WIDTH
-"""Rows that one thread evaluates before it takes more: enough to be worth handing over."""
+WIDTH = 256  # rows of one call: in the virtual machine their numbers stay in the processor's second cache
+SHARE = 16 * WIDTH  # rows that one thread evaluates before it takes more: enough to be worth handing over
 PAYS = 2_000
 """Rows, at once or in all, from which a vectorized function pays: to build it takes as long as to evaluate them."""
 

@@ -18,10 +18,8 @@ from rpim_opt.robot.terms import Model
 MDH = ("alpha", "a", "theta", "d", "beta")
 """Columns of the table, in this order: Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)."""
 MDH_DIMENSION = {"alpha": "angle", "a": "length", "theta": "angle", "d": "length", "beta": "angle"}
-FARTHEST = 1e15
-"""Size [m or rad] of a table's numbers: common normals of axes that are nearly parallel may be far away."""
-STANDARD = 9.80665
-"""Acceleration of free fall [m/s^2]."""
+FARTHEST = 1e15  # size [m or rad] of a table's numbers: common normals of axes that are nearly parallel may be far away
+STANDARD = 9.80665  # acceleration of free fall [m/s^2]
 Vector = tuple[float, float, float]
 MOUNTINGS: dict[str, Vector] = {"floor": (0.0, 0.0, -1.0), "ceiling": (0.0, 0.0, 1.0), "wall": (-1.0, 0.0, 0.0)}
 """Where gravity points in the robot's base; on a wall the base's x axis points up."""

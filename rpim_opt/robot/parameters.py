@@ -21,8 +21,7 @@ from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Entry, Model
 
 EXPANSION, REFERENCE = "expansion", "reference_temperature"
 """By how much all lengths of a robot grow with temperature, and the temperature at which they are nominal."""
-JOINT_OFFSET = "joint_offset"
-"""Stands in tables for every theta."""
+JOINT_OFFSET = "joint_offset"  # stands in tables for every theta
 DEFAULT_SCALE = {
     ("length", "length"): 1e-3, ("angle", "angle"): 1e-3,
     ("tool", "length"): 10e-3, ("tool", "angle"): 10e-3,
@@ -31,12 +30,9 @@ DEFAULT_SCALE = {
     ("camera", "pixel"): 10.0, ("camera", "ratio"): 1e-3, ("camera", ""): 0.05,
 }  # fmt: skip
 """Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
-STEEL = 12e-6
-"""By how much steel grows [1/K]; aluminium by 23e-6."""
-SHOWN = 4
-"""Names in one line."""
-KNOWN = 2**14
-"""Names whose meaning is cached: those of a hundred robots."""
+STEEL = 12e-6  # by how much steel grows [1/K]; aluminium by 23e-6
+SHOWN = 4  # names in one line
+KNOWN = 2**14  # names whose meaning is cached: those of a hundred robots
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
 _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|bend\d+_\d+[xyz]")
 

@@ -21,14 +21,10 @@ SYMBOLS = threading.RLock()
 Place = Literal["joint", "link", "base", "tool"]
 _STEM = re.compile(r"(?!base_|tool_)[A-Za-z](\w*[A-Za-z_])?(\{\}\w+)?")
 _FRAME = re.compile(r"\w*_r[xyz]")
-SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}
-"""How many numbers a term returns."""
-ENDS = ("base", "tool")
-"""Places that an arm has once: parameters there have no number."""
-EXPECTED_WAVE = 1e-5
-"""Scale of one harmonic of a transmission error before it is estimated [rad]."""
-BEND_SCALE = 1e-4
-"""Prior standard deviation of a joint's deflection by one component of one link's first moment [rad]."""
+SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}  # how many numbers a term returns
+ENDS = ("base", "tool")  # places that an arm has once: parameters there have no number
+EXPECTED_WAVE = 1e-5  # scale of one harmonic of a transmission error before it is estimated [rad]
+BEND_SCALE = 1e-4  # prior standard deviation of a joint's deflection by one component of one link's first moment [rad]
 
 
 # What a term sees

@@ -25,8 +25,7 @@ AS_WELL = 1e-4  # probability that the truth fits worse than what counts as fitt
 RIDGE = 1e-6
 """How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
 LOSSES = ("squares", "truncated")
-QUANTILE = 0.99
-"""Which part of good measurements the truncated loss leaves as they are: their squares are chi-squared."""
+QUANTILE = 0.99  # which part of good measurements the truncated loss leaves as they are: their squares are chi-squared
 FEWEST, MOST_ROUNDS = 3, 100  # measurements that have to agree, and how often these are chosen anew
 MOST_PAIRED = 2000  # measurements up to which all pairs are compared
 TRIED, FEW = 40, 10  # measurements, evenly spread, whose compatible sets are tried, and the most sets that are

@@ -37,35 +37,22 @@ from rpim_opt.robot.parameters import tool_prefix
 
 UNEXPLAINED = 0.01
 """Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
-ACCEPTED = 0.02
-"""A mapping may leave this part of the extent: an arm's geometric errors are not fitted with it."""
+ACCEPTED = 0.02  # a mapping may leave this part of the extent: an arm's geometric errors are not fitted with it
 EXPLAINED = 3.0
 """A mapping is taken if it leaves less than a third of what the nominal one leaves with zeros fitted near it."""
-NEAR_ZERO = 0.2
-"""Joint zeros up to this [rad] are left to the calibration, as deviations of theta."""
+NEAR_ZERO = 0.2  # joint zeros up to this [rad] are left to the calibration, as deviations of theta
 QUARTER = np.pi / 2
-SHORT, LONG = 14, 45
-"""Steps of all starts of a round, and of the best quarter."""
-ROUNDS, HITS = 4, 5
-"""Rounds at most, and starts that have to end in the best optimum."""
-FEW = 40
-"""Rows of a search; the best candidates are fitted to more."""
-LEAST_NOISE = 5e-5
-"""Floor of the error of a point [m]: what is nearer is rounding."""
-ODDS = 30.0
-"""Difference of chi-squared up to which data do not tell two mappings apart."""
-GROSS = 6.0
-"""Rows farther off than so many medians of the best fit's errors do not tell mappings apart."""
-FEWEST_FREE = 4
-"""Degrees of freedom below which any mapping would fit."""
-MOST_JOINTS = 8
-"""Joints beyond which signs are too many to be tried."""
-MIRRORED = 1.3
-"""A left-handed frame fits as well if it leaves up to so many times what a mapping leaves."""
-UNSEEN = 200
-"""Configurations at which mappings are compared."""
-RARE_BASIN = 0.005
-"""Probability of reaching a basin with one start whose probability of being missed is told."""
+SHORT, LONG = 14, 45  # steps of all starts of a round, and of the best quarter
+ROUNDS, HITS = 4, 5  # rounds at most, and starts that have to end in the best optimum
+FEW = 40  # rows of a search; the best candidates are fitted to more
+LEAST_NOISE = 5e-5  # floor of the error of a point [m]: what is nearer is rounding
+ODDS = 30.0  # difference of chi-squared up to which data do not tell two mappings apart
+GROSS = 6.0  # rows farther off than so many medians of the best fit's errors do not tell mappings apart
+FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
+MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
+MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
+UNSEEN = 200  # configurations at which mappings are compared
+RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
 
 
 @dataclass(frozen=True, eq=False)

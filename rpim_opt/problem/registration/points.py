@@ -25,8 +25,7 @@ MOST_ROWS = 300  # rows that are tried, evenly spread where there are more
 STEPS, FIRST_STEPS, MANY = 20, 8, 40
 """Steps of a fit of base and reflectors, joint zeros too if they are free; of many first ones choose a quarter."""
 FEWEST_ROWS = 6
-LONGEST = 3.0
-"""A reflector farther from the flange [m] is none."""
+LONGEST = 3.0  # a reflector farther from the flange [m] is none
 LEVER = 0.3  # length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions
 FULL_WEIGHT = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""

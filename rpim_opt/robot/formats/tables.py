@@ -26,8 +26,7 @@ from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 ENDINGS = (".toml", ".json", ".csv")
 LIMITS = ("lower", "upper")
 SI = {"angle": "rad", "length": "m"}
-FAR = 10.0
-"""A common normal that is further away [m] is that of nearly parallel axes."""
+FAR = 10.0  # a common normal that is further away [m] is that of nearly parallel axes
 CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modified", "mdh": "modified",
                "standard": "standard", "paul": "standard", "distal": "standard", "classic": "standard",
                "hayati": "standard"}  # fmt: skip
@@ -39,8 +38,7 @@ INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
 SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
          "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper"}  # fmt: skip
 """Other names of columns."""
-JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")
-"""Columns of the joints' own names."""
+JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
 WITHOUT_COLUMN = {

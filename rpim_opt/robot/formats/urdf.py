@@ -47,14 +47,11 @@ from rpim_opt.robot.mdh import Gravity, Robot, Vector
 from rpim_opt.robot.terms import Model, Term
 
 EXPANDED = "what ROS's command makes of it: xacro arm.urdf.xacro > arm.urdf"
-DEEPEST = 100
-"""How deep elements may be nested."""
-LARGEST_NUMBER = 1e6
-"""Size [m or rad] that no number of an origin or axis reaches."""
+DEEPEST = 100  # how deep elements may be nested
+LARGEST_NUMBER = 1e6  # size [m or rad] that no number of an origin or axis reaches
 KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": ""}
 ATTRIBUTE = re.compile(rb"([^\s=/<>\"']+)\s*=\s*(\"[^\"]*\"|'[^']*')")
-TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")
-"""A tag: quoted values may hold a '>'."""
+TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")  # a tag: quoted values may hold a '>'
 
 
 @of_file
