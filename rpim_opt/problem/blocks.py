@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from operator import methodcaller
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, ClassVar, NoReturn
 
 import numpy as np
 
@@ -70,6 +70,7 @@ class PartitionedProblem(RobotModel):
     (['1:c0', '2:c20'], '1.55')
     """
 
+    keeps_rows: ClassVar[bool] = False
     first: Dataset
     parts: Sequence[Part] = ()
     compute: Callable[..., Iterable[Any]] | None = None
@@ -90,11 +91,6 @@ class PartitionedProblem(RobotModel):
     def data(self) -> NoReturn:
         """Raises InputError: the measurements are never in memory together."""
         raise InputError("problem.data", "data in blocks", "problem.rows(), one problem per block")
-
-    @property
-    def keeps_rows(self) -> bool:
-        """False: linear models are QR factors."""
-        return False
 
     def sample(self) -> CalibrationProblem:
         """Return the first block, which suffices to locate frames."""

@@ -140,18 +140,14 @@ def choose(
         P = _rows(problem, candidates, whitened=False)
         C = np.zeros((n, n))
         C[: P.shape[2], : P.shape[2]] = np.einsum("kin,kim->nm", P, P) / len(P)
+    prior = np.eye(n)  # with what is measured already
     if measured is not None:
-        # in coordinates in which what is measured already, with the prior, is the identity: with
-        # L L' = 1 + sum of A_i' A_i over those rows, M = L (1 + sum B_i' B_i) L' for B = A L'^-1: ln det but for a
-        # constant, and tr M^-1 C = tr (1 + ...)^-1 (L^-1 C L'^-1)
         if measured.blocks[0].measurement.touching:
             raise InputError("measured", "touches of points", "a measurement type with independent rows")
         known = problem.on(measured).linearize(np.zeros(len(problem.parameters.free))).A
-        L = np.linalg.cholesky(np.eye(n) + known.T @ known)
-        A = np.asarray(np.linalg.solve(L, A.reshape(-1, n).T).T.reshape(A.shape), dtype=float)
-        C = np.asarray(np.linalg.solve(L, np.linalg.solve(L, C).T), dtype=float)
+        prior += known.T @ known
     progress(f"relaxing over {len(A)} candidates")
-    weights, bound = _relaxed(A, count, criterion, C, progress)
+    weights, bound = _relaxed(A, prior, count, criterion, C, progress)
     progress("rounding")
     rng, value, chosen = np.random.default_rng(0), -np.inf, np.empty(0, dtype=int)
     for trial in range(5):  # to the largest weights, then at random by them; the best set stays
@@ -159,8 +155,8 @@ def choose(
         if trial:
             share = np.maximum(weights, 1e-6)
             start = rng.choice(len(A), count, replace=False, p=share / share.sum())
-        picked = np.sort(_exchanged(A, start, criterion, C))
-        score, _ = _criterion(np.eye(n) + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
+        picked = np.sort(_exchanged(A, prior, start, criterion, C))
+        score, _ = _criterion(prior + np.einsum("kin,kim->nm", A[picked], A[picked]), criterion, C)
         if score > value:
             value, chosen = score, picked
     gap = np.exp((bound - value) / n) - 1 if criterion == "D" else max(bound / value, value / bound) - 1
@@ -194,7 +190,9 @@ def _criterion(M: Array, criterion: str, C: Array) -> tuple[float, Array]:
     return -float(np.sum(inverse * C.T)), inverse @ C @ inverse
 
 
-def _relaxed(A: Array, count: int, criterion: str, C: Array, progress: Callable[[str], None]) -> tuple[Array, float]:
+def _relaxed(
+    A: Array, prior: Array, count: int, criterion: str, C: Array, progress: Callable[[str], None]
+) -> tuple[Array, float]:
     """Maximize over {0 <= w <= 1, sum w = count} by multiplicative steps; weights and a bound on the optimum.
 
     The criteria are concave, so that the slope at any weights bounds them all.
@@ -205,7 +203,7 @@ def _relaxed(A: Array, count: int, criterion: str, C: Array, progress: Callable[
     flat = A.reshape(-1, n)
     power = 1.0 if criterion == "D" else 0.5
     for k in range(MOST_STEPS):
-        M = np.eye(n) + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
+        M = prior + (flat * np.repeat(w, A.shape[1])[:, None]).T @ flat
         value, Z = _criterion(M, criterion, C)
         gain = np.sum((flat @ Z) * flat, axis=1).reshape(len(A), -1).sum(axis=1)
         bound = min(bound, float(value + np.sort(gain)[-count:].sum() - gain @ w))
@@ -222,16 +220,15 @@ def _relaxed(A: Array, count: int, criterion: str, C: Array, progress: Callable[
     return w, bound
 
 
-def _exchanged(A: Array, chosen: np.ndarray, criterion: str, C: Array) -> np.ndarray:
+def _exchanged(A: Array, prior: Array, chosen: np.ndarray, criterion: str, C: Array) -> np.ndarray:
     """Exchange single configurations while that improves the criterion."""
     picked = [int(k) for k in chosen]
-    n = A.shape[2]
     eye = np.eye(A.shape[1])
     for _ in range(MOST_PASSES):
         changed = False
         for place in range(len(picked)):
             others = [c for c in picked if c != picked[place]]
-            inverse = np.linalg.inv(np.eye(n) + np.einsum("kin,kim->nm", A[others], A[others]))
+            inverse = np.linalg.inv(prior + np.einsum("kin,kim->nm", A[others], A[others]))
             small = np.einsum("kin,nm,kjm->kij", A, inverse, A, optimize=True) + eye
             if criterion == "D":
                 score = np.linalg.slogdet(small)[1]

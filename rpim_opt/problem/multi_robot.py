@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from string import ascii_uppercase
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import met
-from rpim_opt.robot.parameters import Parameters, frame_of, known_patterns, of_session, session_prefix
+from rpim_opt.robot.parameters import concatenated, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
 MOST_PARAMETERS = 2000  # parameters up to which sessions are identified
@@ -77,12 +76,11 @@ def together(
         p = part.parameters
         known = {own for table in tables for own in table.names}
         p = p.take(np.flatnonzero([own not in common[name] or own not in known for own in p.names]))
-        new = {own: own if own in common.get(name, ()) else f"{name}.{own}" for own in {*p.names, *p.terms}}
-        terms = tuple(new[own] for own in p.terms if own in p.names)
-        tables.append(replace(p, names=tuple(new[own] for own in p.names), terms=terms))
+        new = {own: own if own in common[name] else f"{name}.{own}" for own in p.names}
+        tables.append(replace(p, names=tuple(new.values()), terms=tuple(new[own] for own in p.terms)))
     robots = {name: part.robot for name, part in parts.items()}
     data = Dataset.of_robots({name: part.data for name, part in parts.items()}).grouped_by_points()
-    whole = CalibrationProblem(robots, _concatenated(tables), data)
+    whole = CalibrationProblem(robots, concatenated(tables), data)
     met(whole)  # what is touched by several robots is in one place
     return whole
 
@@ -126,18 +124,6 @@ def _common(
     return {key: {name for name, keys in having.items() if key in keys and len(keys) > 1} for key in parts}
 
 
-def _concatenated(tables: Sequence[Parameters]) -> Parameters:
-    """Return tables one after the other."""
-
-    def listed(what: str) -> list[Any]:
-        return list(chain.from_iterable(getattr(table, what) for table in tables))
-
-    fields: dict[str, Any] = {what: tuple(listed(what)) for what in ("names", "dimensions")}
-    fields |= {what: tuple(dict.fromkeys(listed(what))) for what in ("own_frames", "terms")}
-    fields |= {what: np.array(listed(what)) for what in ("nominal", "scale", "tolerance", "identified")}
-    return Parameters(**fields)
-
-
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     """Return the problem with the sessions of its data identified, in the same way as the present ones.
 
@@ -164,7 +150,7 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     repeatability = problem.repeatability
     if repeatability is not None and repeatability.at is not None:
         repeatability = replace(repeatability, at=np.append(repeatability.at[known_names], more.nominal))
-    return replace(problem, parameters=_concatenated([p.take(known_names), more]), repeatability=repeatability)
+    return replace(problem, parameters=concatenated([p.take(known_names), more]), repeatability=repeatability)
 
 
 def unknown_sessions(problem: CalibrationProblem) -> list[Array]:

@@ -7,7 +7,7 @@ from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import Any, Self
+from typing import Any, ClassVar, Self
 
 import numpy as np
 
@@ -58,6 +58,7 @@ SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move all of a robot 
 class RobotModel(Tabled):
     """The nominal robots, their parameters and repeatability, common to measurements in memory and in blocks."""
 
+    keeps_rows: ClassVar[bool] = True  # whether `linearize` returns the equations themselves, and not their QR factor
     robots: Robot | Mapping[str, Robot]
     parameters: Parameters
     asked: Kept | None = field(default=None, repr=False, kw_only=True)
@@ -139,8 +140,7 @@ class RobotModel(Tabled):
         """Return the same problem with transmission errors, one a joint or none, and no repeatability of before."""
         own = [term for term in self.robot.model.terms if not isinstance(term.made_of, Curve)]
         former = {name for curve in self.robot.model.curves for name in transmission(curve).names(curve.joint)}
-        p = self.parameters.take(np.array([i for i, name in enumerate(self.parameters.names) if name not in former]))
-        p = replace(p, terms=tuple(name for name in p.terms if name not in former))
+        p = self.parameters.take(np.flatnonzero([name not in former for name in self.parameters.names]))
         bare = replace(self, robots=replace(self.robot, model=Model(own)), parameters=p, repeatability=None)
         if not curves:
             return bare
@@ -218,11 +218,10 @@ class CalibrationProblem(RobotModel):
         p = self.parameters.of_robot(robot)
         others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared among other robots
         own = np.flatnonzero([name not in others for name in p.names])
-        p = replace(p.take(own), terms=tuple(name for name in p.terms if name not in others))
         repeatability = self.repeatability
         if repeatability is not None and repeatability.at is not None:
             repeatability = replace(repeatability, at=repeatability.at[self.parameters.places_of(robot)[own]])
-        return CalibrationProblem(arm, p, self.data.of_robot(robot), repeatability=repeatability)
+        return CalibrationProblem(arm, p.take(own), self.data.of_robot(robot), repeatability=repeatability)
 
     @property
     def joint_values(self) -> Array:
@@ -296,11 +295,6 @@ class CalibrationProblem(RobotModel):
     def rows(self) -> Iterator[CalibrationProblem]:
         """Yield problems that together have all the rows: here this one, of measurements in blocks one a block."""
         yield self
-
-    @property
-    def keeps_rows(self) -> bool:
-        """Whether `linearize` returns the equations themselves, and not their QR factor."""
-        return True
 
     @property
     def labels(self) -> tuple[str, ...]:

@@ -6,6 +6,7 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, lru_cache
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ DEFAULT_SCALE = {
 STEEL = 12e-6  # by how much steel grows [1/K]; aluminium by 23e-6
 SHOWN = 4  # names in one line
 KNOWN = 2**14  # names whose meaning is cached: those of a hundred robots
+NUMBERS = ("nominal", "scale", "tolerance", "identified")  # fields of `Parameters` that are arrays
 _TABLE = re.compile(rf"({'|'.join(MDH)})\d+")
 _TERM = re.compile(rf"({'|'.join(term.name for term in JOINT_TERMS)})\d+|bend\d+_\d+[xyz]")
 
@@ -151,7 +153,7 @@ class Parameters(Tabled):
 
     def __post_init__(self) -> None:
         """Refuse fields of different lengths."""
-        for key in ("dimensions", "nominal", "scale", "tolerance", "identified"):
+        for key in ("dimensions", *NUMBERS):
             count = len(getattr(self, key))
             if count != len(self):
                 raise InputError(key, f"{count} entries", f"{len(self)}, one for every name")
@@ -177,8 +179,8 @@ class Parameters(Tabled):
     def take(self, index: np.ndarray) -> Parameters:
         """Return the entries at ``index`` (K,), in that order."""
         texts: dict[str, Any] = {key: tuple(getattr(self, key)[i] for i in index) for key in ("names", "dimensions")}
-        numbers = {key: getattr(self, key)[index] for key in ("nominal", "scale", "tolerance", "identified")}
-        return replace(self, **texts, **numbers)
+        texts["terms"] = tuple(name for name in self.terms if name in texts["names"])
+        return replace(self, **texts, **{key: getattr(self, key)[index] for key in NUMBERS})
 
     @cached_property
     def free(self) -> Parameters:
@@ -190,8 +192,7 @@ class Parameters(Tabled):
         if not robot:
             return self
         part = self.take(self.places_of(robot))
-        terms = tuple(own_name(name) for name in self.terms if name in part.names)
-        return replace(part, names=tuple(map(own_name, part.names)), terms=terms)
+        return replace(part, names=tuple(map(own_name, part.names)), terms=tuple(map(own_name, part.terms)))
 
     def called(self, robot: str, own: str) -> str:
         """Return the table's name of a robot's parameter: ``left.a2``, or ``a2`` if shared."""
@@ -384,9 +385,7 @@ def model_parameters(
         entries.append(Entry(EXPANSION, "ratio per temperature", STEEL, 0.0))
         entries.append(Entry(REFERENCE, "temperature", 1.0, temperature))
     entries += [_usual(name, dimension, value) for name, (dimension, value) in (own or {}).items()]
-    none = np.empty(0)
-    empty = Parameters((), (), none, none, none, none.astype(bool), own_frames)
-    return with_terms(_extended(empty, entries), robot.model, robot.joint_types)
+    return with_terms(_table(entries, own_frames=own_frames), robot.model, robot.joint_types)
 
 
 def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str]) -> Parameters:
@@ -396,21 +395,26 @@ def with_terms(parameters: Parameters, model: Model, joint_types: Sequence[str])
     for name in own:
         if name in parameters.names:
             raise InputError("model, terms", f"parameter '{name}', which the model has", "a unique name")
-    return replace(_extended(parameters, entries), terms=(*parameters.terms, *own)) if own else parameters
+    return concatenated([parameters, _table(entries, terms=own)]) if own else parameters
 
 
-def _extended(parameters: Parameters, entries: Sequence[Entry]) -> Parameters:
-    """Return a table with further entries, none of them identified."""
+def _table(entries: Sequence[Entry], **kept: tuple[str, ...]) -> Parameters:
+    """Return a table of entries, none of them identified and without tolerances."""
     names, dimensions, scale, nominal = zip(*entries, strict=True)
-    return replace(
-        parameters,
-        names=(*parameters.names, *names),
-        dimensions=(*parameters.dimensions, *dimensions),
-        nominal=np.append(parameters.nominal, nominal),
-        scale=np.append(parameters.scale, scale),
-        tolerance=np.append(parameters.tolerance, np.full(len(names), np.inf)),
-        identified=np.append(parameters.identified, np.zeros(len(names), dtype=bool)),
-    )
+    none = np.zeros(len(names), dtype=bool)
+    return Parameters(names, dimensions, np.array(nominal), np.array(scale), np.full(len(names), np.inf), none, **kept)
+
+
+def concatenated(tables: Sequence[Parameters]) -> Parameters:
+    """Return tables one after the other."""
+
+    def joined(key: str) -> tuple[Any, ...]:
+        return tuple(chain.from_iterable(getattr(table, key) for table in tables))
+
+    fields: dict[str, Any] = {key: joined(key) for key in ("names", "dimensions")}
+    fields |= {key: tuple(dict.fromkeys(joined(key))) for key in ("own_frames", "terms")}
+    fields |= {key: np.array(joined(key)) for key in NUMBERS}
+    return Parameters(**fields)
 
 
 def _usual(name: str, dimension: str, nominal: float) -> Entry:
