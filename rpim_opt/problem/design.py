@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import scipy
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
@@ -342,16 +343,8 @@ def observe(problem: Source) -> Observability:
         U = reduced_rows(part.jacobian(x) * units, U)
     raw = np.linalg.svd(U, compute_uv=False)
     tiny = 1e-15 * raw[0]  # rounding, another on every processor
-    # Independent columns are each time the first that is about as long as any, less those before it: redundant columns
-    # are often parallel and of one length, and without a margin rounding would choose between them.
-    left = A.copy()
-    pivot: list[int] = []
-    for _ in range(rank):
-        size = np.linalg.norm(left, axis=0)
-        size[pivot] = 0.0
-        pivot.append(int(np.argmax(size >= (1 - TIE) * size.max())))
-        direction = left[:, pivot[-1]] / size[pivot[-1]]
-        left -= np.outer(direction, direction @ left)
+    # redundant columns are often parallel and of one length: the first counts as the longest, or rounding would choose
+    pivot = scipy.linalg.qr(A * (1 - TIE * np.arange(len(x))), mode="r", pivoting=True)[1][:rank]
     # column rest[j] = sum_i W_ij column pivot[i]
     rest = np.setdiff1d(np.arange(len(x)), pivot)
     Q, R = np.linalg.qr(A[:, pivot])

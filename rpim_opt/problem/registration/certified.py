@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import import_module
 from typing import NamedTuple
@@ -233,15 +233,15 @@ class _Loops(NamedTuple):
     prior: Array  # (3, n) residuals of what is expected of t
     beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
 
-    def of(self, some: np.ndarray) -> _Solved:
-        """Return the solution of the sum of squares of some measurements (N,).
+    def of(self, some: np.ndarray, start: Array | None = None) -> _Solved:
+        """Return the solution of the sum of squares of some measurements (N,), as `smallest` does.
 
         With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its last rows are the least over translations (a
         Schur complement), its first ones say which these are.
         """
         n = self.rows.shape[2]
         T = np.asarray(np.linalg.qr(np.vstack([*self.rows[some], self.prior, np.zeros((n, n))]), mode="r"))
-        best = smallest(T[LINEAR:, LINEAR:])
+        best = smallest(T[LINEAR:, LINEAR:], start)
         x = lifted(best.rotations)
         v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
         squares = np.sum((self.rows @ v) ** 2, axis=1)
@@ -256,15 +256,13 @@ class _Loops(NamedTuple):
         """
         solved = self.of(some)
         for _ in range(MOST_ROUNDS):
-            if solved.settled:
-                break
             off = solved.squares / self.beyond
-            limit = np.sort(off[some])[max(FEWEST, 3 * some.sum() // 4) - 1]
+            limit = np.sort(off[some])[: max(FEWEST, 3 * some.sum() // 4)][-1]
             before, some = some, solved.agreeing | (some & (off <= limit))
             if np.array_equal(some, before):
                 break
-            solved = self.of(some)
-        return solved
+            solved = self.of(some, solved.smallest.rotations)
+        return solved if np.isfinite(solved.smallest.bound) else self.of(some)
 
 
 def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
@@ -421,10 +419,10 @@ class Smallest:
 
     rotations: Array
     value: float
-    bound: float  # no rotations have less, up to rounding
-    rank_ratio: float  # of the moment matrix
-    information: Array  # (3k, 3k) half the Hessian by turns [1/rad^2]
-    steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
+    bound: float = -np.inf  # no rotations have less, up to rounding
+    rank_ratio: float = np.inf  # of the moment matrix
+    information: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (3k, 3k) half the Hessian by turns [1/rad^2]
+    steepness: float = 0.0  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
 
     def radius(self, excess: float) -> float:
         """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
@@ -444,8 +442,8 @@ class Smallest:
         return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
 
 
-def smallest(L: Array) -> Smallest:
-    """Return the best rotations that the relaxation leads to, with its bound.
+def smallest(L: Array, start: Array | None = None) -> Smallest:
+    """Return the best rotations that the relaxation leads to, with its bound; or those near a start, of no bound.
 
     ::
 
@@ -455,6 +453,9 @@ def smallest(L: Array) -> Smallest:
     The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
+    if start is not None:
+        near = _refined(L, start)
+        return Smallest(near, _value(L, near))
     Q = L.T @ L
     moments = relax(Q)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
@@ -476,7 +477,7 @@ def smallest(L: Array) -> Smallest:
     eigenvalues = np.linalg.eigvalsh(S - np.tensordot(moves, C, axes=1))
     bound = value + min(0.0, float(eigenvalues[0])) * float(x @ x)
     steepness = max(0.0, float(eigenvalues[1]))
-    return Smallest(best, value, bound, moments.rank_ratio, _information(L, best), steepness)
+    return Smallest(best, value, bound, moments.rank_ratio, _derivatives(L, best)[1] / 2, steepness)
 
 
 def lifted(rotations: Array) -> Array:
@@ -488,10 +489,11 @@ def _value(L: Array, rotations: Array) -> float:
     return float(np.sum((L @ lifted(rotations)) ** 2))
 
 
-def _information(L: Array, rotations: Array) -> Array:
-    """Return half the second derivatives (3k, 3k) of |L x|^2 by rotation vectors w, R_i exp([w_i] x)."""
+def _derivatives(L: Array, rotations: Array) -> tuple[Array, Array]:
+    """Return first (3k,) and second derivatives (3k, 3k) of |L x|^2 by rotation vectors w, R_i exp([w_i] x)."""
     k = len(rotations)
-    G = (L.T @ L @ lifted(rotations))[1:].reshape(k, 3, 3)
+    residual = L @ lifted(rotations)
+    G = (2 * L.T @ residual)[1:].reshape(k, 3, 3)
     D = np.zeros((L.shape[1], 3 * k))
     B = np.zeros((3 * k, 3 * k))
     for i, R in enumerate(rotations):
@@ -500,17 +502,29 @@ def _information(L: Array, rotations: Array) -> Array:
         M = R.T @ G[i]
         # the second order of exp([w] x) is ([w] x)^2 / 2 = (w w' - |w|^2) / 2
         B[own, own] = (M + M.T) / 2 - np.trace(M) * np.eye(3)
-    return D.T @ L.T @ L @ D + B
+    J = L @ D
+    return 2 * J.T @ residual, 2 * J.T @ J + B
 
 
 def _refined(L: Array, rotations: Array) -> Array:
-    """Return the rotations of the least |L x|^2 near some."""
-
-    def turned(w: Array) -> Array:
-        return rotations @ scipy.spatial.transform.Rotation.from_rotvec(w.reshape(-1, 3)).as_matrix()
-
-    def residual(w: Array) -> Array:
-        return L @ lifted(turned(w))
-
-    start = np.zeros(3 * len(rotations))
-    return proper(turned(scipy.optimize.least_squares(residual, start, method="lm", xtol=1e-15, ftol=1e-15).x))
+    """Return the stationary rotations to which Newton's steps lead, uphill directions turned, long steps halved."""
+    value = _value(L, rotations)
+    for _ in range(50):
+        slope, curvature = _derivatives(L, rotations)
+        eigenvalues, V = np.linalg.eigh(curvature)
+        sizes = np.maximum(np.abs(eigenvalues), 1e-14 * np.abs(eigenvalues).max() + 1e-300)
+        step = -V @ ((V.T @ slope) / sizes)
+        step *= min(1.0, 1.0 / max(np.linalg.norm(step), 1e-300))
+        for halved in step / 2.0 ** np.arange(12)[:, None]:
+            turn = scipy.spatial.transform.Rotation.from_rotvec(halved.reshape(-1, 3)).as_matrix()
+            candidate = proper(rotations @ turn)
+            lower = _value(L, candidate)
+            if lower < value:
+                break
+        else:
+            return rotations
+        rotations = candidate
+        value = lower
+        if np.linalg.norm(step) < 1e-13:  # rad
+            break
+    return rotations

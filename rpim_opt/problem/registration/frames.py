@@ -407,7 +407,7 @@ def settled(alone: Source, steps: int = 200) -> Array:
     def slopes(z: Array) -> Array:
         return np.vstack([triangle(z)[:, :-1], np.eye(len(z))])
 
-    tight: Any = {"xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
-    z = least_squares(residual, np.zeros(len(scale)), slopes, method="lm", x_scale="jac", max_nfev=steps, **tight).x
+    options: Any = {"jac": slopes, "x_scale": "jac", "xtol": 1e-11, "ftol": 1e-15, "gtol": 1e-15}
+    z = least_squares(residual, np.zeros(len(scale)), method="lm", max_nfev=steps, **options).x
     z = z - np.linalg.lstsq(slopes(z), residual(z), rcond=None)[0]  # where a sum of squares no longer changes
     return np.asarray(scale * z, dtype=float)

@@ -100,11 +100,7 @@ class _RobotTable(Table):
 
 
 def gravity_with(
-    gravity: Gravity,
-    mounting: Mounting | None,
-    payload: PayloadTable | None,
-    file: object,
-    base: Array | None = None,
+    gravity: Gravity, mounting: Mounting | None, payload: PayloadTable | None, file: object, base: Array | None = None
 ) -> Gravity:
     """Return gravity with the mounting and the payload that a file states; ``base`` is that of `Gravity.mounted`."""
     try:
