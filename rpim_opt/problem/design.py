@@ -93,13 +93,9 @@ def joint_cells(robot: Robot, q: Array, index: np.ndarray) -> dict[str, list[str
 
 
 def choose(
-    problem: CalibrationProblem,
-    candidates: Array,
-    count: int,
-    criterion: str = "V",
-    progress: Callable[[str], None] = lambda text: None,
-    measured: Dataset | None = None,
-) -> Design:
+    problem: CalibrationProblem, candidates: Array, count: int, criterion: str = "V",
+    progress: Callable[[str], None] = lambda text: None, measured: Dataset | None = None,
+) -> Design:  # fmt: skip
     """Choose the configurations that are most informative about the identified parameters.
 
     With rows A_i of the whitened, scaled Jacobian at nominal and the prior of the scales, the information of a set is
