@@ -16,8 +16,8 @@ from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
 from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
-from rpim_opt.calibration.held_out import FEWEST, displaced, excluded_by_fit, headline_errors, judged, of_positions
-from rpim_opt.calibration.lack_of_fit import judged as judged_fit
+from rpim_opt.calibration.held_out import FEWEST, compared, displaced, excluded_by_fit, headline_errors, of_positions
+from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import Verdict as Delivery
@@ -369,21 +369,18 @@ def _held_out(
     intervals out.
     """
     apart = result.record.validation if data is None else data
-    held = result.record.held_out
-    excluded: list[str] = []
-    moved = ""
+    held, excluded, moved = result.record.held_out, [], ""
     if apart is not None:
-        intervals = judged(result, apart)
-        error, (sigmas, allowed, coverage) = result.errors(apart), intervals
-        moved = displaced(result, apart, intervals)
+        held = compared(result, apart)
+        moved = displaced(result, apart, held)
     elif held is not None:
         excluded = excluded_by_fit(result)
-        kept = ~np.isin(held.label, excluded)
         known = {label: row for row, label in enumerate(result.problem.data.label)}
         apart = result.problem.data.take([known[label] for label in held.label if label in known])
-        error, sigmas, allowed, coverage = held.error[kept], held.sigmas[kept], held.allowed[kept], held.coverage
     else:
         return None, [], ["Missing: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
+    kept = ~np.isin(held.label, excluded)
+    error, sigmas, allowed = held.error[kept], held.sigmas[kept], held.allowed[kept]
     inside = np.isfinite(error) & region.rows(apart)
     instrument = np.zeros(len(apart))  # what it may add to an error, with the required confidence
     for block in apart.blocks:
@@ -392,8 +389,7 @@ def _held_out(
             covariance = block.covariance[:, lengths][:, :, lengths]
             instrument[block.row] = distance_quantile(covariance, STATED, requirement.confidence)
     missing = [apart.label[i] for i in np.flatnonzero(inside & (error > requirement.limit + instrument))]
-    unexplained = np.nan_to_num(sigmas) > np.nan_to_num(allowed, nan=np.inf)
-    beyond = [apart.label[i] for i in np.flatnonzero(unexplained)]
+    beyond = [apart.label[i] for i in np.flatnonzero(sigmas > allowed)]
     rows, count = len(apart), int(inside.sum())
     largest = 1e3 * float(error[inside].max(initial=0.0))
     missed: list[str] = []
@@ -416,19 +412,19 @@ def _held_out(
         )
     sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm, of "
     sentence += f"which the instrument may contribute {1e3 * instrument[inside].max(initial=0.0):.3f} mm"
-    if coverage is not None:
+    if held.coverage is not None:
         # coordinates of a row are not independent of each other: a row counts once
         least = float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
-        share = f"{100 * coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
+        share = f"{100 * held.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
         sentence += f"; {share} (at least {100 * least:.0f} % are required for this number of rows)"
-        if coverage < least:
+        if held.coverage < least:
             lacking.append(f"Missing: valid prediction intervals. Only {share}.")
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
     if excluded:
         sentence += f". Not counted: {listed(excluded, MOST)}, excluded from the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
-    document |= {"beyond": beyond, "excluded": excluded, "coverage95": coverage, "sentence": f"{sentence}."}
+    document |= {"beyond": beyond, "excluded": excluded, "coverage95": held.coverage, "sentence": f"{sentence}."}
     return document, missed, lacking
 
 
@@ -454,7 +450,7 @@ def repeatability_bounds(result: Calibration, region: Region, q: Array, confiden
 def _unmodelled(result: Calibration, region: Region) -> list[str]:
     """Say that the model does not fit, and that joints go in the region where nothing was measured."""
     lines: list[str] = []
-    fit = judged_fit(result)
+    fit = judged(result)
     if fit is not None and fit.alarming:
         lines.append(f"Missing: a model that fits. {fit}")
     corners = Dataset.of(region.limits.T.copy(), np.zeros((2, 3)), 1.0)

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 from scipy.special import chdtrc, stdtrit
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.quadratic import Ridge
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import LinearModel
@@ -140,12 +140,6 @@ def position_noise(source: Source) -> Array:
         if seen:
             return np.asarray(np.median(np.concatenate(seen), axis=0), dtype=float)
     return np.zeros((3, 3))
-
-
-def require_interval(of: str) -> None:
-    """Refuse anything but an `Interval`."""
-    if of not in get_args(Interval):
-        raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
 
 
 def coverage_factor(freedom: float | Array, confidence: float) -> Array:

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.convex.constraints import Parsed
-from rpim_opt.convex.program import Program
 from rpim_opt.convex.robust_loss import RARE, outlying
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.record import Earlier
 from rpim_opt.problem.blocks import Source
 
 SLACK = 0.1
 """Share of a measured joint range by which values may exceed it: its extremes are themselves drawn by chance."""
 SLACK_LEAST = np.radians(1.0)
 """What they may exceed it by in any case [rad; for prismatic joints 17 mm]."""
-ACTIVE = 1e-6
-"""Relative multiplier from which on, and distance up to which, a constraint is active."""
 
 
 class Flag(NamedTuple):
@@ -84,51 +82,6 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     return tuple(Flag(labels[i], float(norms[i] / noise[i]), float(error[i])) for i in worst)
 
 
-def active_bounds(program: Program, z: Array, weight: float) -> tuple[ActiveBound, ...]:
-    """Return the parameters with an active bound at z (n,), the largest multiplier first."""
-    box = program.box
-    if box is None or not program.formulation.constraints:
-        return ()
-    parameters = program.model.parameters
-    multiplier = np.sum(program.beginning(z).solve(weight).duals, axis=0)
-    loss = program.value(z)[0]
-    rows = program.model.equations
-    near = np.minimum(z - box[0], box[1] - z) < ACTIVE * (1 + np.abs(z))
-    bounds: list[ActiveBound] = []
-    for i in np.flatnonzero((multiplier > ACTIVE * loss / rows) & near & (box[0] < box[1])):
-        bound = float(min((box[0][i], box[1][i]), key=lambda side: abs(z[i] - side)))
-        less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
-        gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
-        bounds.append(ActiveBound(parameters.names[i], bound * float(parameters.scale[i]), float(multiplier[i]), gain))
-    return tuple(sorted(bounds, key=lambda h: -h.gain))
-
-
-def shadow_prices(program: Program, z: Array, weight: float) -> tuple[ShadowPrice, ...]:
-    """Return the shadow prices of a program's textual constraints at its solution z (n,)."""
-    constraints = program.formulation.constraints
-    if not any(isinstance(constraint, Parsed) for constraint in constraints):
-        return ()
-    parameters = program.model.parameters
-    duals = program.beginning(z).solve(weight).duals
-    misfit = program.objective(z, weight)
-    prices = []
-    for parsed, multipliers in zip(constraints, duals, strict=True):
-        if not isinstance(parsed, Parsed):
-            continue
-        unit, si = parsed.unit
-        slack = parsed.slack(z, parameters)
-        scale = parsed.scale(parameters)
-        multiplier = parsed.price(multipliers, parameters)
-        met = slack > ACTIVE * scale * (1 + float(np.max(np.abs(z))))
-        if met or multiplier * scale <= ACTIVE * max(misfit, ACTIVE):  # an interior point's multipliers are not zero
-            multiplier = 0.0
-        gain = min(multiplier * parsed.step, misfit)
-        prices.append(
-            ShadowPrice(parsed.text, unit, max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit)
-        )
-    return tuple(prices)
-
-
 # --- extrapolation ----------------------------------------------------------------------------------------------------
 
 
@@ -152,19 +105,18 @@ class Outside:
         ]
 
 
-def measured_ranges(problem: Source) -> dict[str, Array]:
-    """Return the minimum and maximum measured value of every joint (2, dof) [rad or m], by robot."""
-    blocks = (block for part in problem.rows() for block in part.data.blocks)
-    return widest((block.robot, np.stack([block.q.min(axis=(0, 1)), block.q.max(axis=(0, 1))])) for block in blocks)
+def measured_ranges(problem: Source, earlier: Sequence[Earlier] = ()) -> dict[str, Array]:
+    """Return the minimum and maximum measured value of every joint (2, dof) [rad or m], by robot.
 
-
-def widest(ranges: Iterable[tuple[str, Array]]) -> dict[str, Array]:
-    """Return the union of ranges (2, dof), by robot."""
-    corrections: dict[str, Array] = {}
-    for robot, (low, high) in ranges:
-        least, most = corrections.get(robot, (low, high))
-        corrections[robot] = np.stack([np.minimum(least, low), np.maximum(most, high)])
-    return corrections
+    With those of the ``earlier`` calibrations that serve as the prior.
+    """
+    here = ((b.robot, b.q.reshape(-1, b.q.shape[2])) for part in problem.rows() for b in part.data.blocks)
+    before = ((robot, np.array(ends)) for each in earlier for robot, ends in each.ranges.items())
+    ranges: dict[str, Array] = {}
+    for robot, q in chain(here, before):
+        seen = np.vstack([q, ranges.get(robot, q[:0])])
+        ranges[robot] = np.stack([seen.min(axis=0), seen.max(axis=0)])
+    return ranges
 
 
 def outside(ranges: Mapping[str, Array], data: Dataset) -> Outside:

@@ -15,7 +15,6 @@ from rpim_opt.bayes.hyperparameters import sessions_spread
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, row_freedom
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
@@ -46,7 +45,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     N = len(data)
     sigmas = np.full(N, np.nan)
     allowed = np.full(N, np.nan)
-    C = known_covariance(result)
+    C = result.known_covariance
     if C is None:
         return Judged(sigmas, allowed, None)
     inside: list[np.ndarray] = []
@@ -73,7 +72,13 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     return Judged(sigmas, allowed, float(covered.mean()) if len(covered) else None)
 
 
-def displaced(result: Calibration, data: Dataset, intervals: Judged) -> str:
+def compared(result: Calibration, data: Dataset) -> HeldOut:
+    """Return the errors of a calibration on measurements that it did not use."""
+    errors = result.nominal_errors(data), result.errors(data)
+    return HeldOut(data.label, len(result.problem.labels), *errors, *judged(result, data))
+
+
+def displaced(result: Calibration, data: Dataset, intervals: Judged | HeldOut) -> str:
     """Say that measurements are displaced together, by the motion that registers them; empty where they are not.
 
     It is said where rows are outside their prediction intervals and the motion takes more than half of the RMS error,
@@ -159,14 +164,12 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     original = result.stated
     if not original.keeps_rows:
         raise InputError("refit_all", "data in blocks", "measurements in memory")
-    used = len(original.data)
     whole = Dataset.together([original.data, apart], ["identification", "validation"])
     refitted = result.asked(original.on(whole))
-    labels = whole.label[used:]
+    labels = whole.label[len(original.data) :]
     kept = np.flatnonzero(np.isin(labels, refitted.problem.labels))
-    errors = result.nominal_errors(apart), result.errors(apart)
-    judgement = judged(result, apart)._replace(coverage=judged(result, apart.take(kept)).coverage)
-    record = replace(result.record, validation=None, held_out=HeldOut(labels, used, *errors, *judgement))
+    held = replace(compared(result, apart), label=labels, coverage=judged(result, apart.take(kept)).coverage)
+    record = replace(result.record, validation=None, held_out=held)
     if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)
         refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))

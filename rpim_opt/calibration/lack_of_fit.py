@@ -158,24 +158,20 @@ class LackOfFit:
                 f'falls by {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
             )
         if self.upward:
-            named = joined([str(joint) for joint in self.upward])
-            joints = f"Compliances of joints {named} are"
-            if len(self.upward) == 1:
-                joints = f"Compliance of joint {named} is"
+            joints = f"Compliance of joint {self.upward[0]} is"
+            if len(self.upward) > 1:
+                joints = f"Compliances of joints {joined([str(joint) for joint in self.upward])} are"
             lines.append(
                 f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the "
                 "controller compensates sag; do not use such a fit outside the measured joint ranges."
             )
-        lines += _limit(self)
+        lines += filter(None, [_limit(self)])
         if self.repeated is not None:
-            agree = f"Repeated readings of a configuration agree to {_size(self, self.repeated)} RMS"
+            beyond = ": residuals are no larger."
             if self.excess:
-                lines.append(
-                    f"{agree}; {_size(self, self.excess)} of the residuals is systematic (repeatable), unless the "
-                    "robot stood still between them."
-                )
-            else:
-                lines.append(f"{agree}: residuals are no larger.")
+                beyond = f"; {_size(self, self.excess)} of the residuals is systematic (repeatable), unless the "
+                beyond += "robot stood still between them."
+            lines.append(f"Repeated readings of a configuration agree to {_size(self, self.repeated)} RMS{beyond}")
         return lines
 
     def __str__(self) -> str:
@@ -185,24 +181,14 @@ class LackOfFit:
     def content(self) -> dict[str, Any]:
         """Return the same as a document [mm, mrad or px]."""
         unit, si = UNITS[self.dimension]
-        lengths = ("left", "instrument", "position", "joint", "repeatable", "excess")
-        return {
-            "configurations": self.configurations,
-            "equations": self.equations,
-            "spare": self.spare,
-            "dimension": self.dimension,
-            **{f"{key}_{unit}": getattr(self, key) / si for key in lengths},
-            f"repeated_{unit}": None if self.repeated is None else self.repeated / si,
-            "missing": list(self.missing),
-            "identify": list(self.parameters),
-            "gain": self.gain,
-            "share": self.share,
-            "present": dict(self.present),
-            "alike": None if self.alike is None else self.alike._asdict(),
-            "upward": list(self.upward),
-            "alarming": self.alarming,
-            "text": self.sentences(),
-        }
+        document = dict(vars(self))
+        for key in ("left", "instrument", "position", "joint", "repeatable", "repeated", "excess"):
+            size = document.pop(key)
+            document[f"{key}_{unit}"] = None if size is None else size / si
+        document["identify"] = list(document.pop("parameters"))
+        del document["overstated"]  # which a sentence says
+        alike = self.alike and self.alike._asdict()
+        return {**document, "alike": alike, "alarming": self.alarming, "text": self.sentences()}
 
 
 @one_blas_thread
@@ -232,12 +218,9 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     if best.extensions:
         share = max(total - sum(part**2 for part in after.values()), 0.0) / total
     group = [kind_of(name) for name in compared.own]
-    present = {}
-    for extension, terms in OWNED.items():
-        members = np.isin(group, terms)
-        gain = compared.rise_without(members) if members.any() else 0.0
-        if gain > SPEAK:
-            present[extension] = gain
+    members = {extension: np.isin(group, terms) for extension, terms in OWNED.items()}
+    gains = {extension: compared.rise_without(own) for extension, own in members.items() if own.any()}
+    present = {extension: gain for extension, gain in gains.items() if gain > SPEAK}
     again, freedom = _repeated(problem, result.x, dimension)
     excess = 0.0
     if again is not None:
@@ -329,9 +312,7 @@ def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ..
 
 def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:
     """Return the RMS [m or rad] of repeated readings about their mean, None for too few, and its freedom."""
-    squares = 0.0
-    rows = 0
-    freedom = 0
+    squares, rows, freedom = 0.0, 0, 0
     for block, residual in by_block(problem, problem.residual(x)):
         r = residual[:, [d == dimension for d in block.measurement.components.values()]]
         number = repeated(block)
@@ -405,28 +386,26 @@ def _size(found: LackOfFit, value: float) -> str:
     return f"{value / si:.3g} {unit}"
 
 
-def _limit(found: LackOfFit) -> list[str]:
+def _limit(found: LackOfFit) -> str:
     """Say what limits the result: an effect that the model lacks, the robot or the instrument."""
     if found.correlated and found.alike is not None:
         even = "Even then, residuals" if found.missing else "Residuals"
-        return [
+        return (
             f"{even} of neighbouring configurations are correlated ({found.alike.correlation:.2f}, z = "
             f"{found.alike.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
-        ]
+        )
     if found.robot > GROSS * found.instrument:
-        return ["No robot has such poor repeatability: check units, signs, frames and rows first (`inspect`)."]
+        return "No robot has such poor repeatability: check units, signs, frames and rows first (`inspect`)."
     if found.robot > ROUGH * found.instrument:
         limit = "The robot, not the instrument, limits the result"
-        if found.repeated is not None and found.excess:
-            return [f"{limit}."]
         if found.repeated is not None:
-            return [f"{limit}, by its repeatability, backlash or drift."]
-        return [
+            return f"{limit}." if found.excess else f"{limit}, by its repeatability, backlash or drift."
+        return (
             f"{limit}; the data do not separate repeatability from an effect that the model lacks. Repeat five "
             "configurations, approached from both sides, before a better instrument is bought."
-        ]
+        )
     if found.overstated:
-        return ["Repeat one reading ten times and state its standard deviation as the measurement noise."]
+        return "Repeat one reading ten times and state its standard deviation as the measurement noise."
     if found.robot < FINE * found.instrument:
-        return ["The instrument limits the result: only a more accurate one would show the robot's repeatability."]
-    return []
+        return "The instrument limits the result: only a more accurate one would show the robot's repeatability."
+    return ""

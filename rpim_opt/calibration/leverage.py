@@ -119,7 +119,8 @@ def influence(result: Outcome) -> Influence:
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
         accepted = "a loss that is a reweighted sum of squares: squares, Huber's"
         raise InputError("influence", f"formulation '{formulation.name}'", accepted)
-    T = _inverse_root(np.vstack([A, L]), moving)
+    T = np.zeros((len(free), len(A) + len(L)))  # H^-1 = T T'
+    T[moving] = np.linalg.pinv(np.vstack([A, L])[:, moving], rcond=RANK_TOLERANCE)
     residual = model.A @ result.z - model.b
     weight = np.divide(residual**2, squares, out=np.ones(len(squares)), where=squares > 0)
     leverage, change = _left_out(model.A @ T, residual, equations)
@@ -160,15 +161,6 @@ def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:
     for each in data:
         labels |= dict(zip(each.configuration[::-1], each.label[::-1], strict=True))
     return replace(models[0], A=A[order], b=b[order], group=group[order]), labels
-
-
-def _inverse_root(rows: Array, free: np.ndarray) -> Array:
-    """Return T (n, k) with H^-1 = T T' over the free parameters, of rows with H = rows' rows."""
-    _, s, Vt = np.linalg.svd(rows[:, free], full_matrices=False)
-    identifiable = s > RANK_TOLERANCE * np.max(s, initial=0.0)
-    T = np.zeros((len(free), np.count_nonzero(identifiable)))
-    T[free] = Vt[identifiable].T / s[identifiable]
-    return T
 
 
 def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, Array]:

@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from types import MappingProxyType
-from typing import NamedTuple, Self
+from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
 from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
@@ -26,7 +27,6 @@ from rpim_opt.calibration.covariance import (
     noise_covariances,
     noise_test,
     position_noise,
-    require_interval,
     row_freedom,
 )
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPrice
@@ -49,6 +49,8 @@ from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameters import own_name
 
+ACTIVE = 1e-6
+"""Relative multiplier from which on, and distance up to which, a constraint is active."""
 COVERAGE_FACTOR = 2.0
 """Of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution."""
 
@@ -204,7 +206,8 @@ class Outcome:
         >>> where.position.round(3), (1e3 * where.standard).round(3)  # [m], [mm]
         (array([[ 1.522, -0.347,  0.972]]), array([[0.013, 0.014, 0.012]]))
         """
-        require_interval(of)
+        if of not in get_args(Interval):
+            raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
         if not self.linear_penalty:
             accepted = "a squared penalty or none; `forward` gives the positions alone"
             raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
@@ -230,8 +233,7 @@ class Outcome:
     @cached_property
     def ranges(self) -> Mapping[str, Array]:
         """The measured range of every joint (2, dof) [rad or m], by robot, including earlier calibrations."""
-        earlier = [(robot, np.array(r)) for each in self.record.earlier for robot, r in each.ranges.items()]
-        return diagnosis.widest([*diagnosis.measured_ranges(self.problem).items(), *earlier])
+        return diagnosis.measured_ranges(self.problem, self.record.earlier)
 
     # --- errors ------------------------------------------------------------------------------------------------
 
@@ -311,6 +313,17 @@ class Outcome:
     def penalty_weight(self) -> float:
         """The weight, zero where there is no penalty."""
         return 0.0 if self.formulation.penalty is None else self.weight
+
+    @property
+    def selector(self) -> str:
+        """Name of the rule that chose the weight; ``given`` for a number, ``none`` without a penalty."""
+        if self.formulation.penalty is None:
+            return "none"
+        if self.record.earlier:
+            return "earlier result"
+        if self.learned is not None:
+            return "learned"
+        return "given" if self.selection is None else self.selection.name
 
     @property
     def squared_loss(self) -> bool:
@@ -407,6 +420,32 @@ class Outcome:
         """
         return self.spread.covariance
 
+    @property
+    def known_covariance(self) -> Array | None:
+        """The `covariance` (n, n) [SI]; None for a penalty or loss without one."""
+        try:
+            return self.covariance
+        except InputError:
+            return None
+
+    def parameter_rows(self) -> list[dict[str, Any]]:
+        """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
+
+        ``std`` is None where the formulation has no covariance, or an infinite one.
+        """
+        free = self.problem.parameters.free
+        values = free.values(self.x)
+        C = self.known_covariance
+        variance = np.full(len(self.x), np.inf) if C is None else np.diag(C)
+        rows: list[dict[str, Any]] = []
+        for i, name in enumerate(free.names):
+            unit, si = display(free.dimensions[i])
+            row: dict[str, Any] = {"name": name, "unit": unit, "nominal": float(free.nominal[i] / si)}
+            row |= {"identified": float(values[i] / si), "deviation": float(self.x[i] / si)}
+            row["std"] = float(np.sqrt(variance[i]) / si) if np.isfinite(variance[i]) else None
+            rows.append(row)
+        return rows
+
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:
         """Outliers, the worst first: rows above `robust_loss.outlying` for the noise that the other rows show.
@@ -478,14 +517,51 @@ class Outcome:
         """
         if self.kept is not None:
             return self.kept.active_bounds
-        return diagnosis.active_bounds(self.program, self.z, self.weight)
+        program, z = self.program, self.z
+        if program.box is None or not program.formulation.constraints:
+            return ()
+        low, high = program.box
+        parameters, rows = program.model.parameters, program.model.equations
+        multiplier = np.sum(self._multipliers, axis=0)
+        loss = program.value(z)[0]
+        near = np.minimum(z - low, high - z) < ACTIVE * (1 + np.abs(z))
+        bounds = []
+        for i in np.flatnonzero((multiplier > ACTIVE * loss / rows) & near & (low < high)):
+            bound = float(min(low[i], high[i], key=lambda side: abs(z[i] - side)))
+            less = max(loss - 0.1 * abs(bound) * multiplier[i], 0.0)
+            gain = float(np.sqrt(loss / rows) - np.sqrt(less / rows))
+            scale = float(parameters.scale[i])
+            bounds.append(ActiveBound(parameters.names[i], bound * scale, float(multiplier[i]), gain))
+        return tuple(sorted(bounds, key=lambda held: -held.gain))
 
     @cached_property
     def shadow_prices(self) -> tuple[ShadowPrice, ...]:
         """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none."""
         if self.kept is not None:
             return self.kept.shadow_prices
-        return diagnosis.shadow_prices(self.program, self.z, self.weight)
+        program, z = self.program, self.z
+        constraints, parameters = program.formulation.constraints, program.model.parameters
+        texts = [(i, parsed) for i, parsed in enumerate(constraints) if isinstance(parsed, Parsed)]
+        if not texts:
+            return ()
+        misfit = program.objective(z, self.weight)
+        prices = []
+        for i, parsed in texts:
+            unit, si = parsed.unit
+            slack, scale = parsed.slack(z, parameters), parsed.scale(parameters)
+            multiplier = parsed.price(self._multipliers[i], parameters)
+            met = slack > ACTIVE * scale * (1 + float(np.max(np.abs(z))))
+            if met or multiplier * scale <= ACTIVE * max(misfit, ACTIVE):  # an interior point's are not zero
+                multiplier = 0.0
+            gain = min(multiplier * parsed.step, misfit)
+            figures = max(slack, 0.0) / si, multiplier * si, parsed.step / si, gain, misfit
+            prices.append(ShadowPrice(parsed.text, unit, *figures))
+        return tuple(prices)
+
+    @cached_property
+    def _multipliers(self) -> Sequence[Array]:
+        """Multipliers of the formulation's constraints."""
+        return self.program.beginning(self.z).solve(self.weight).duals
 
     @cached_property
     def actively_constrained(self) -> tuple[str, ...]:

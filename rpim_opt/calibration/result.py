@@ -82,21 +82,9 @@ class Calibration(Outcome):
             return self.known_causes
         return tuple(likely_causes(self))
 
-    @property
-    def selector(self) -> str:
-        """Name of the rule that chose the weight; ``given`` for a number, ``none`` without a penalty."""
-        return words.selector(self)
-
     def weight_sentence(self) -> str:
         """Return a sentence on the weight and its origin."""
         return " ".join(words.weight_lines(self))
-
-    def parameter_rows(self) -> list[dict[str, Any]]:
-        """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
-
-        ``std`` is None where the formulation has no covariance, or an infinite one.
-        """
-        return words.parameter_rows(self)
 
     def to_frame(self, what: str = "parameters") -> Any:
         """Return one of the result's tables as a data frame (pandas, or polars if pandas is not installed).

@@ -99,14 +99,6 @@ class Uncertainty(Tabled):
         return lines
 
 
-def known_covariance(result: Outcome) -> Array | None:
-    """Return the covariance (n, n) [SI] of the deviations; None for a penalty or loss without one."""
-    try:
-        return result.covariance
-    except InputError:
-        return None
-
-
 def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dict[str, Array]:
     """Return the contributions to u^2 (N,) [m^2] of the positions reached at q (N, dof), summed over all axes."""
     spread = result.spread
@@ -153,7 +145,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
     free = result.problem.parameters.free
     if not free.of_curves.any():
         return []
-    C = known_covariance(result)
+    C = result.known_covariance
     part = next(iter(result.problem.rows()))
     J = part.jacobian(result.x)
     length = np.zeros(len(J), dtype=bool)

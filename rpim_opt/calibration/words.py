@@ -14,7 +14,7 @@ from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
+from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.calibration.verdict import Verdict, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.noise import UNITS
@@ -52,22 +52,6 @@ TWO_SIDED, ONE_SIDED = 1.96, 1.645
 """Standard normal quantiles of intervals and of bounds with 95 % confidence."""
 
 
-def parameter_rows(result: Outcome) -> list[dict[str, Any]]:
-    """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit."""
-    free = result.problem.parameters.free
-    values = free.values(result.x)
-    C = known_covariance(result)
-    rows: list[dict[str, Any]] = []
-    for i, name in enumerate(free.names):
-        unit, si = display(free.dimensions[i])
-        row: dict[str, Any] = {"name": name, "unit": unit, "nominal": float(free.nominal[i] / si)}
-        row |= {"identified": float(values[i] / si), "deviation": float(result.x[i] / si), "std": None}
-        if C is not None and np.isfinite(C[i, i]):
-            row["std"] = float(np.sqrt(C[i, i]) / si)
-        rows.append(row)
-    return rows
-
-
 def rotated(row: Mapping[str, Any]) -> bool:
     """Whether the deviation of a row of `parameter_rows` is a composed rotation, not a difference of the columns."""
     return abs(row["identified"] - row["nominal"] - row["deviation"]) > LAST_DIGIT
@@ -75,7 +59,7 @@ def rotated(row: Mapping[str, Any]) -> bool:
 
 def turned_frames(result: Outcome) -> list[str]:
     """Return a note on the parameters that tables mark with ``*``, since they are `rotated`."""
-    names = [row["name"] for row in parameter_rows(result) if rotated(row)]
+    names = [row["name"] for row in result.parameter_rows() if rotated(row)]
     if not names:
         return []
     turn = "roll, pitch and yaw of the rotation from the nominal to the identified frame, about the axes of its parent"
@@ -91,7 +75,7 @@ def parameter_table(result: Outcome) -> str:
 def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
     """Return head and cells of the table of identified parameters."""
     cells = []
-    for row, of_curve in zip(parameter_rows(result), result.problem.parameters.free.of_curves, strict=True):
+    for row, of_curve in zip(result.parameter_rows(), result.problem.parameters.free.of_curves, strict=True):
         if not of_curve:
             figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
             std = "-" if row["std"] is None else f"{row['std']:.4f}"
@@ -135,19 +119,6 @@ def noise_sentence(result: Outcome) -> list[str]:
         return []
 
 
-def selector(result: Outcome) -> str:
-    """Return the name of the rule: ``learned`` (prior scales), ``given`` for a number, ``none`` without a penalty."""
-    if result.formulation.penalty is None:
-        return "none"
-    if result.record.earlier:
-        return "earlier result"
-    if result.learned is not None:
-        return "learned"
-    if result.selection is None:
-        return "given"
-    return result.selection.name
-
-
 def weight_lines(result: Outcome) -> list[str]:
     """Return sentences on the weight and its origin, or on the hyperparameters."""
     name = result.formulation.name
@@ -166,9 +137,9 @@ def weight_lines(result: Outcome) -> list[str]:
     if result.formulation.penalty is None:
         return [f"Formulation '{name}' has no penalty and needs no weight."]
     if result.selection is None:
-        return [f"Weight {result.weight:.4g} ({selector(result)}), formulation '{name}'."]
+        return [f"Weight {result.weight:.4g} ({result.selector}), formulation '{name}'."]
     note = result.selection.note or ("" if result.selection.interior else "at an edge of the weights that it tried")
-    rule = ": ".join(filter(None, [selector(result), note]))
+    rule = ": ".join(filter(None, [result.selector, note]))
     return [f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."]
 
 
@@ -200,18 +171,11 @@ def remarks(result: Outcome) -> list[str]:
 
 
 def _outlying(result: Outcome) -> list[str]:
-    flagged = result.flagged
+    flagged, together = result.flagged, result.clustered
     if not flagged:
         return []
-    named = [
-        f"{flag.label} ({flag.sigmas:.0f} standard deviations, residual {flag.error_mm:.2f} mm)"
-        for flag in flagged[:MOST_ROWS]
-    ]
-    text = f"Outliers: {', '.join(named)}"
-    if len(flagged) > MOST_ROWS:
-        text += f" and {len(flagged) - MOST_ROWS} more"
-    lines = [f"{text}."]
-    together = result.clustered
+    named = [f"{f.label} ({f.sigmas:.0f} standard deviations, residual {f.error_mm:.2f} mm)" for f in flagged]
+    lines = [f"Outliers: {listed(named, MOST_ROWS)}."]
     if together:
         lines.append(
             f"Of them {listed(together)} have errors like their neighbours in joint space or time, so they are not"
@@ -325,7 +289,7 @@ def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
 
 
 FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
-    "parameters": lambda result: [{"parameter": row.pop("name"), **row} for row in parameter_rows(result)],
+    "parameters": lambda result: [{"parameter": row.pop("name"), **row} for row in result.parameter_rows()],
     "errors": lambda result: [
         {"label": label, "nominal_mm": float(before), "identified_mm": float(after)}
         for label, before, after in zip(

@@ -21,7 +21,6 @@ from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.covariance import noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose
@@ -349,7 +348,7 @@ def _tooled(
     every = np.zeros(len(whole))
     every[whole.identified] = result.x
     x = every[places]
-    C = known_covariance(result)
+    C = result.known_covariance
     if C is not None:
         own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
         C = C[np.ix_(own, own)]

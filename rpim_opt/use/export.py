@@ -24,7 +24,7 @@ from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import known_covariance, transmission_errors
+from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.data.measurements.pose import pose
@@ -350,7 +350,7 @@ def _orientation(result: Calibration, marker: str | None) -> list[str]:
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
     slopes = problem.measuring(q, pose, marker).jacobian(result.x).reshape(len(q), 6, -1)[:, 3:]
-    C = known_covariance(result)
+    C = result.known_covariance
     if C is None or (np.abs(slopes[:, :, np.isinf(np.diag(C))]) > 0).any():
         return ["URDF: the orientation of its tip link is undetermined: check it by other means."]
     C = np.where(np.isfinite(C), C, 0.0)

@@ -17,7 +17,6 @@ from rpim_opt.basics.text import listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.uncertainty import known_covariance
 from rpim_opt.calibration.verdict import misread
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
@@ -209,7 +208,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     leave open. Deviates are by Fisher's F, positive where a check misses more than usual. The filter learns nothing
     from a check that is less probable than ``level``.
     """
-    C = known_covariance(result)
+    C = result.known_covariance
     if C is None:
         accepted = "one with a squared penalty or none, whose predictions have intervals"
         raise InputError("monitor", f"formulation '{result.formulation.name}'", accepted)

@@ -14,7 +14,6 @@ from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, repeatability_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
-from rpim_opt.calibration.covariance import require_interval as interval
 from rpim_opt.calibration.lack_of_fit import Autocorrelation, LackOfFit, autocorrelation
 from rpim_opt.data.record import Requirement
 
@@ -216,5 +215,6 @@ def test_a_program_that_cannot_be_solved_again_certifies_nothing(monkeypatch: py
 
 
 def test_an_interval_is_one_of_those_that_are_known() -> None:
+    result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1.0)
     with pytest.raises(ro.InputError, match="of: found 'sigma', accepted: "):
-        interval("sigma")
+        result.predict(np.zeros((1, 6)), of="sigma")  # type: ignore[arg-type]

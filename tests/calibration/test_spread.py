@@ -155,4 +155,4 @@ def test_a_penalty_without_covariance_is_refused() -> None:
     for ask in (lambda: lasso.covariance, lambda: Uncertainty(lasso), lambda: lasso.predict(np.zeros((1, 6)))):
         with pytest.raises(ro.InputError, match="formulation 'lasso'"):
             ask()
-    assert ro.calibration.uncertainty.known_covariance(lasso) is None
+    assert lasso.known_covariance is None
