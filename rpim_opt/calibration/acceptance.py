@@ -29,18 +29,12 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 
 Verdict = Literal["accepted", "rejected", "inconclusive"]
-MOST = 3
-"""Joints or rows that a reason names."""
-STATED = 1e9
-"""Degrees of freedom of an uncertainty that is stated."""
-WORST, BESIDE = 16, 16
-"""The search for the largest bound goes on from so many, at so many beside each."""
-STEPS = (0.1, 0.05, 0.025, 0.0125)
-"""How far beside, in parts of the joint ranges."""
-LEAST = 1e-9
-"""Width of the range of a joint that never moved [rad or m]."""
-ANYWHERE = Requirement(limit=1.0)
-"""The region of a result without requirement: joints within the measured ranges."""
+MOST = 3  # joints or rows that a reason names
+STATED = 1e9  # degrees of freedom of an uncertainty that is stated
+WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
+STEPS = (0.1, 0.05, 0.025, 0.0125)  # how far beside, in parts of the joint ranges
+LEAST = 1e-9  # width of the range of a joint that never moved [rad or m]
+ANYWHERE = Requirement(limit=1.0)  # the region of a result without requirement: joints within the measured ranges
 
 
 # --- the region, and bounds in it -------------------------------------------------------------------------------------
@@ -218,12 +212,6 @@ class Acceptance:
     ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
     ``repeatability`` would be the largest of them if all parameters were known [m]. ``held_out`` are the errors on
     held-out rows and the coverage of their intervals, a document [mm] with its ``sentence``.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.load("position").calibrate()
-    >>> found = ro.calibration.accept(result, ro.data.Requirement(limit=1e-4))
-    >>> print(found.verdict, f"{1e3 * found.bound:.2f} mm")
-    accepted 0.08 mm
     """
 
     requirement: Requirement

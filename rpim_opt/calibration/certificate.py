@@ -17,16 +17,11 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program, feasibility_tolerance, pose
 from rpim_opt.problem.linear import LinearModel
 
-DECREASE = 1e-6
-"""What the convex program at a solution may still promise, relative to the objective: an interior point's accuracy."""
-DIRECTIONS = 2
-"""Random directions in which the model's derivative is compared."""
-APART = 1e-4
-"""Half the distance of a difference, in scales."""
-INEXACT = 1e-4
-"""Relative difference from which the model's derivative is not the residual's; rounding and curvature are less."""
-TINY = 1e-300
-"""Where numbers end that something may be divided by."""
+DECREASE = 1e-6  # what the program at a solution may still promise of the objective: an interior point's accuracy
+DIRECTIONS = 2  # random directions in which the model's derivative is compared
+APART = 1e-4  # half the distance of a difference, in scales
+INEXACT = 1e-4  # relative difference, beyond rounding, from which the model's derivative is not the residual's
+TINY = 1e-300  # where numbers end that something may be divided by
 
 
 class Certificate(NamedTuple):
@@ -70,10 +65,8 @@ def certified(
     """
     if residual is not None:
         model = _differentiated(model, residual, z)
-    if before is None:
-        program = pose(formulation, model).beginning(z)
-    else:
-        program = before.anew(formulation, model, z)  # where a minimum is looked for first proves nothing
+    # where a minimum is looked for first proves nothing
+    program = (before or pose(formulation, model)).anew(formulation, model, z)
     objective = program.objective(z, weight)
     violation = program.violation(z)
     try:

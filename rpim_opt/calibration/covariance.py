@@ -18,10 +18,8 @@ from rpim_opt.problem.multi_robot import unknown_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 
 Interval = Literal["mean", "reached", "reading"]
-UNDECIDED = 1e-9
-"""A position depends on an undecided direction where it moves by more than this share of what it moves by in all."""
-UNLIKELY = 0.01
-"""Probability below which the noise is said to be another than stated."""
+UNDECIDED = 1e-9  # a position depends on an undecided direction that makes more than this share of its movement
+UNLIKELY = 0.01  # probability below which the noise is said to be another than stated
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,9 +100,6 @@ class Spread:
         return covariance
 
 
-# --- noise of readings ------------------------------------------------------------------------------------------------
-
-
 class NoiseCovariances(NamedTuple):
     """Covariances added to that of the rows' model, block by block (N, k, k) [SI].
 
@@ -161,9 +156,6 @@ def row_freedom(freedom: float, spread: float, whole: Array, session: Array) -> 
     part = np.broadcast_to(np.einsum("nkk->n", session), V.shape)
     variance = 2 * (V - part) ** 2 / freedom + (2 * spread * part) ** 2
     return np.maximum(np.minimum(2 * V**2 / np.maximum(variance, 1e-300), freedom), 1.0)
-
-
-# --- the noise test ---------------------------------------------------------------------------------------------------
 
 
 class NoiseTest(NamedTuple):

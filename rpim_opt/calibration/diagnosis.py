@@ -16,10 +16,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.blocks import Source
 
-SLACK = 0.1
-"""Share of a measured joint range by which values may exceed it: its extremes are themselves drawn by chance."""
-SLACK_LEAST = np.radians(1.0)
-"""What they may exceed it by in any case [rad; for prismatic joints 17 mm]."""
+SLACK = 0.1  # share of a measured joint range by which values may exceed it: its extremes are drawn by chance
+SLACK_LEAST = np.radians(1.0)  # what they may exceed it by in any case [rad; for prismatic joints 17 mm]
 
 
 class Flag(NamedTuple):
@@ -80,9 +78,6 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     labels = problem.labels
     worst = [i for i in np.argsort(-norms) if norms[i] > limit[i]]
     return tuple(Flag(labels[i], float(norms[i] / noise[i]), float(error[i])) for i in worst)
-
-
-# --- extrapolation ----------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)

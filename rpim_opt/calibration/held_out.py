@@ -21,12 +21,9 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.problem.registration.closed_forms import register, transformed
 
-FEWEST = 5
-"""Held-out rows below which they say too little."""
-GROSS = 6.0
-"""Factor on the median distance from which on a row does not count for a registration."""
-RARE = 0.01
-"""Probability that data like those of the calibration have any row that is named."""
+FEWEST = 5  # held-out rows below which they say too little
+GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
+RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
 class Judged(NamedTuple):

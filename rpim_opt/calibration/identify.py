@@ -40,15 +40,11 @@ NOISE = {
 }
 """Parts of the noise that are estimated, by the option's name."""
 MODELS = ("geometry", "auto")
-LEVEL = 1e-9
-"""Relative fall of the objective over five iterations below which it hardly changes."""
-FAR = 1000.0
-"""Deviations in prior standard deviations beyond which a fit without a penalty is called divergent."""
+LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
+FAR = 1000.0  # deviations in prior standard deviations beyond which a fit without a penalty is called divergent
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
-CONTRADICTED = 3.0
-"""Standard deviations from a known value from which on the data contradict it."""
-ZERO = 0.1
-"""Standard deviation [rad] of a joint's zero that was found from the data."""
+CONTRADICTED = 3.0  # standard deviations from a known value from which on the data contradict it
+ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the data
 
 
 @one_blas_thread
@@ -137,17 +133,16 @@ def calibrate(
     formulation = formulation_of(formulation)
     weight = weight_of(weight)
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
-    if model not in MODELS:
-        raise InputError("model", f"'{model}'", choices(model, MODELS))
-    if noise not in NOISE:
-        raise InputError("noise", f"'{noise}'", choices(noise, NOISE))
+    for option, word, known in (("model", model, MODELS), ("noise", noise, NOISE)):
+        if word not in known:
+            raise InputError(option, f"'{word}'", choices(word, known))
     kinds = NOISE[noise]
     if model == "geometry":  # without the extensions joints would take gravity for noise
         kinds = tuple(kind for kind in kinds if kind != "joint")
     require_affordable(problem)
     require_finite(*(block.y for block in problem.sample().data.blocks))
-    elsewhere = None
     mapping: JointMapping | None = None
+    notes: list[str] = []
     if start is not None:
         start = require_start(start, len(problem.parameters.free))
     else:
@@ -160,17 +155,12 @@ def calibrate(
             zeros = [Statement((f"theta{i + 1}",), ("angle",), wide, (0.0,), whole=True) for i in own]
             prior = (prior or Prior()) & Prior(statements=tuple(zeros))
         elsewhere = relocated(problem)
-    notes = [] if elsewhere is None else _displaced_frames(problem, elsewhere)
-    problem = elsewhere or problem
+        if elsewhere is not None:
+            notes, problem = _displaced_frames(problem, elsewhere), elsewhere
     again: Callable[[Source], Calibration] = partial(
-        calibrate,
-        formulation=formulation,
-        weight=weight,
-        prior=prior,
-        model=model,
-        noise=noise,
+        calibrate, formulation=formulation, weight=weight, prior=prior, model=model, noise=noise,
         **(vars(options) | {"progress": None}),
-    )
+    )  # fmt: skip
     if weight is None and formulation.penalty is None:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
@@ -194,21 +184,11 @@ def calibrate(
     message = " ".join([ending(ended, max_iterations), *notes, *_contradicted(prior or Prior(), problem, ended.x)])
     LOGGER.info(message)
     return Calibration(
-        problem=problem,
-        formulation=formulation,
-        x=ended.x,
-        weight=choice.weight,
-        selection=choice.selection,
-        converged=ended.converged,
-        message=message,
-        history=ended.state.history,
-        program=ended.state.program,
-        certificate=ended.certificate,
-        asked=mapped_as(mapping, again, notes),
-        learned=learned,
-        mapping=mapping,
+        problem=problem, formulation=formulation, x=ended.x, weight=choice.weight, selection=choice.selection,
+        converged=ended.converged, message=message, history=ended.state.history, program=ended.state.program,
+        certificate=ended.certificate, asked=mapped_as(mapping, again, notes), learned=learned, mapping=mapping,
         excluded=excluded,
-    )
+    )  # fmt: skip
 
 
 def ending(ended: Ended, most: int) -> str:

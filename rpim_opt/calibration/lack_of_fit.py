@@ -25,28 +25,17 @@ from rpim_opt.problem.noise import UNITS, Repeatability
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 
-QUICK = 60
-"""Configurations that are looked at before calibrating."""
-FEWEST = 6
-"""Equations that must be left over, or repeated, to judge by."""
-CORRELATED = 4.0
-"""z-score from which on residuals are said to be autocorrelated."""
-ROUGH, FINE = 2.0, 0.3
-"""Repeatability over measurement noise above which the robot is the limit, and below which the instrument is."""
-GROSS = 300.0
-"""Repeatability over measurement noise above which data are wrong."""
-NEGLIGIBLE = 0.1
-"""Parts below this share of a larger one are not worth a word."""
-NOTABLE = 0.5
-"""Effect of a joint's compliance over the largest, below which wrong masses explain its sign."""
-SURE = 3.0
-"""Standard deviations by which a compliance is below zero before a joint is said to bend upwards."""
-RARE = 1e-3
-"""Probability that residuals exceed the standard deviation of repeated readings by chance."""
-PERMUTATIONS = 300
-"""Permutations that an autocorrelation is compared with."""
-FEWEST_NEIGHBOURS = 8
-"""Configurations below which there is no autocorrelation."""
+QUICK = 60  # configurations that are looked at before calibrating
+FEWEST = 6  # equations that must be left over, or repeated, to judge by
+CORRELATED = 4.0  # z-score from which on residuals are said to be autocorrelated
+ROUGH, FINE = 2.0, 0.3  # repeatability over noise above which the robot is the limit, below which the instrument is
+GROSS = 300.0  # repeatability over measurement noise above which data are wrong
+NEGLIGIBLE = 0.1  # parts below this share of a larger one are not worth a word
+NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
+SURE = 3.0  # standard deviations by which a compliance is below zero before a joint is said to bend upwards
+RARE = 1e-3  # probability that residuals exceed the standard deviation of repeated readings by chance
+PERMUTATIONS = 300  # permutations that an autocorrelation is compared with
+FEWEST_NEIGHBOURS = 8  # configurations below which there is no autocorrelation
 
 
 class Extension(NamedTuple):
@@ -213,6 +202,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     # an update keeps the repeatability of the calibration before it, which few new readings do not tell
     kept = result.problem.repeatability if result.record.earlier and not best.extensions else None
     after = _parts(compared, best, kept)
+    known |= after
     total = sum(part**2 for part in _parts(compared, compared.plain).values())  # the variance of a row
     share = 0.0
     if best.extensions:
@@ -232,22 +222,12 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     except InputError:  # no covariance
         overstated = False
     return LackOfFit(
-        **known,
-        instrument=after["instrument"],
-        position=after["position"],
-        joint=after["joint"],
-        repeatable=float(np.sqrt(share * total)),
-        missing=best.extensions,
+        **known, repeatable=float(np.sqrt(share * total)), missing=best.extensions,
         parameters=tuple(p for extension in best.extensions for p in EXTENSIONS[extension].identify),
-        gain=compared.plain.point.value - best.point.value,
-        share=share,
-        present=present,
-        alike=_residual_autocorrelation(compared, best),
-        upward=_upward(compared, present),
-        repeated=again,
-        excess=excess,
-        overstated=overstated,
-    )
+        gain=compared.plain.point.value - best.point.value, share=share, present=present,
+        alike=_residual_autocorrelation(compared, best), upward=_upward(compared, present), repeated=again,
+        excess=excess, overstated=overstated,
+    )  # fmt: skip
 
 
 def judged(result: Outcome) -> LackOfFit | None:

@@ -23,14 +23,10 @@ from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameters import of_joint, own_name
 
-TINY = 1e-300
-"""Divisors are no smaller."""
-ALONE = 1e-9
-"""A configuration decides a direction alone where others know less than this share of it."""
-UNIDENTIFIABLE = 1e-9
-"""Standard deviations below, in scales, are rounding: the data do not see the parameter."""
-BALANCED = 1e-4
-"""Gradient of weighted equations and penalty at the solution, relative to that of the data at nominal."""
+TINY = 1e-300  # divisors are no smaller
+ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
+UNIDENTIFIABLE = 1e-9  # standard deviations below, in scales, are rounding: the data do not see the parameter
+BALANCED = 1e-4  # gradient of weighted equations and penalty at the solution, relative to that of the data at nominal
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -133,16 +129,11 @@ def influence(result: Outcome) -> Influence:
     spread = np.sqrt(variance * np.sum((A @ T @ T.T) ** 2, axis=0))
     spread[spread < UNIDENTIFIABLE] = 0.0
     return Influence(
-        label=tuple(first_label[number] for number in numbers),
-        configuration=numbers,
-        parameters=free.names,
-        dimensions=free.dimensions,
-        leverage=leverage,
+        label=tuple(first_label[number] for number in numbers), configuration=numbers, parameters=free.names,
+        dimensions=free.dimensions, leverage=leverage,
         cook=np.sum((change @ A.T) ** 2, axis=1) / (max(used, TINY) * max(variance, TINY)),
-        change=change * free.scale,
-        deviation=spread * free.scale,
-        weight=np.bincount(which, weight) / equations,
-    )
+        change=change * free.scale, deviation=spread * free.scale, weight=np.bincount(which, weight) / equations,
+    )  # fmt: skip
 
 
 def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:
@@ -186,8 +177,7 @@ def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, 
 
 # --- improvement of the flange ----------------------------------------------------------------------------------------
 
-WORTH = 0.9
-"""A calibration whose predicted error is above this share of the nominal robot's improves nothing."""
+WORTH = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing
 
 
 @dataclass(frozen=True)

@@ -21,43 +21,28 @@ from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.problem import CalibrationProblem, around
 
-GAIN_GOOD, GAIN_POOR = 0.75, 0.25
-"""Gain ratios (actual over promised decrease) above which damping shrinks, and below which it grows."""
+GAIN_GOOD, GAIN_POOR = 0.75, 0.25  # actual over promised decrease above which damping shrinks, below which it grows
 DAMPING_GROWTH, DAMPING_SHRINK, DAMPING_FIRST, DAMPING_LEAST = 4.0, 0.5, 1.0, 1e-4
 """Factors; the first damping term over the promised decrease; the ratio below which it is dropped."""
 CURVATURE, CURVATURE_STEP, CURVATURE_TURN = 0.1, 0.1, 0.75
 """Curvature over the step's effect from which a step follows it; share of the step at which it is measured; the most
 that it may turn the step."""
-STRAIGHT = 1e-3
-"""Steps shorter than this share of the solution are straight: what bends them is rounding."""
+STRAIGHT = 1e-3  # steps shorter than this share of the solution are straight: what bends them is rounding
 EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
 """Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
-VANISHING = 1e-12
-"""Share of the first objective below which one has vanished: noise-free data end at rounding."""
-ROUNDING = 1e-9
-"""Relative rise of an objective at a step that is rounding."""
-FIRST_ACCURACY = 0.01
-"""Relative accuracy of the first solve: its linearization is no better."""
-MANY_REFUSED = 6
-"""Refused steps in a row after which a small promise is the solver's noise; the certificate judges that."""
-STALLED = 10
-"""Iterations after which an objective that did not fall is the least; the certificate judges that."""
-FEW_ITERATIONS = 10
-"""Iterations that are too few to begin with a weight that no rule was asked for."""
-NEAR_FIRST = 0.01
-"""Share of the solution that the next step at the first weight may be when the rule is asked: it would not tell."""
-NOTHING_PROMISED = 3
-"""Iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest."""
-DAMPING_MOST = 1e30
-"""Damping at which no step, however short, lowers the objective."""
-SAME_POSITIONS = 1e-4
-"""What a round may still change, relative to 1 + |z|: the error of predicted positions is its square."""
-ROUNDS, LEAST_SHARE = 20, 1 / 8
-"""Rounds at most; the least share of the way to its solution from which the next round linearizes."""
-ROUGH_TOLERANCE = 1e-3
-"""Tolerance of fits between two estimates of hyperparameters: the last fit is exact."""
-ROUNDS_FARTHEST = 6
-"""Rounds that choose anew where in a region the robot moves farthest: after that these stay, or they might circle."""
+VANISHING = 1e-12  # share of the first objective below which one has vanished: noise-free data end at rounding
+ROUNDING = 1e-9  # relative rise of an objective at a step that is rounding
+FIRST_ACCURACY = 0.01  # relative accuracy of the first solve: its linearization is no better
+MANY_REFUSED = 6  # refused steps in a row after which a small promise is the solver's noise; the certificate judges
+STALLED = 10  # iterations after which an objective that did not fall is the least; the certificate judges that
+FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
+NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
+NOTHING_PROMISED = 3  # iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest
+DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objective
+SAME_POSITIONS = 1e-4  # what a round may change, relative to 1 + |z|: the error of predicted positions is its square
+ROUNDS, LEAST_SHARE = 20, 1 / 8  # rounds at most; least share of the way to its solution at which the next linearizes
+ROUGH_TOLERANCE = 1e-3  # tolerance of fits between two estimates of hyperparameters: the last fit is exact
+ROUNDS_FARTHEST = 6  # rounds that choose anew where in a region the robot moves farthest: later they might circle
 
 
 @dataclass(frozen=True)
@@ -338,15 +323,10 @@ class Loop:
             after = candidate.objective(z, state.choice.weight)
         passed = Iteration(after, length, state.choice.weight, state.damping)
         there = replace(
-            state,
-            z=z,
-            program=candidate,
-            merit=after,
-            refused=0,
+            state, z=z, program=candidate, merit=after, refused=0, history=(*state.history, passed),
             size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
-            history=(*state.history, passed),
             outcome="rest" if state.choice.settled and short else "",
-        )
+        )  # fmt: skip
         return replace(there, choice=state.choice.after(there.relative(length)))
 
     def _accuracy(self, state: State) -> tuple[float, float]:

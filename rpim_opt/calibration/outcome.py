@@ -49,10 +49,8 @@ from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameters import own_name
 
-ACTIVE = 1e-6
-"""Relative multiplier from which on, and distance up to which, a constraint is active."""
-COVERAGE_FACTOR = 2.0
-"""Of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution."""
+ACTIVE = 1e-6  # relative multiplier from which on, and distance up to which, a constraint is active
+COVERAGE_FACTOR = 2.0  # of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution
 
 
 class Prediction(NamedTuple):
@@ -412,11 +410,6 @@ class Outcome:
         That is the Bayesian covariance with the prior that the penalty stands for (`Uncertainty` takes it apart).
         It holds for a squared loss, or for the rows that a robust loss keeps, and a squared penalty, conditional on
         the active constraints. Variances that neither data nor penalty decide are infinite.
-
-        >>> import rpim_opt as ro
-        >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
-        >>> bool((result.spread.noise + result.spread.prior == result.covariance).all())
-        True
         """
         return self.spread.covariance
 

@@ -25,46 +25,28 @@ from rpim_opt.robot.parameters import own_name
 
 BAD = "Larger than expected"
 """Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
-NOISY = 3.0
-"""Residual RMS over the stated noise above which the fit is not that of the stated instrument."""
-OVERSTATED = 0.05
-"""Residual RMS over the stated noise below which the noise is not that of these data; of 20 um and more."""
-REACH = 0.003
-"""Residual RMS over the length of the arm that a robot's own errors stay below."""
+NOISY = 3.0  # residual RMS over the stated noise above which the fit is not that of the stated instrument
+OVERSTATED = 0.05  # residual RMS over the stated noise below which the noise is not that of these data; from 20 um on
+REACH = 0.003  # residual RMS over the length of the arm that a robot's own errors stay below
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
-ANGULAR = 0.02
-"""Residual RMS of orientations [rad] that a robot's own errors stay below."""
+ANGULAR = 0.02  # residual RMS of orientations [rad] that a robot's own errors stay below
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
-UNUSUAL_LENGTH = 0.004
-"""Deviation of a length of the arm [m] from which on ready robots with nearly the same parameters are tried."""
-EXCLUDED = 0.25
-"""Share of the rows that may be outliers."""
-COMPUTED, COMPUTED_RMS = 0.05, 2e-5
-"""Nominal RMS over the stated noise, and itself [m], below which positions were computed and not measured."""
-ROUNDED = 1.1
-"""Nominal RMS over what rounding of the measured values makes, below which they were computed, too."""
-SPARE = 2.0
-"""Equations per parameter of the frames below which nominal errors may vanish by themselves."""
-WORSE = 3.0
-"""Standard errors by which squared errors on held-out rows are above those of the nominal robot."""
-ROWS = 3
-"""Held-out rows below which errors have no standard error, and only those twice the nominal ones count."""
-NOTICED = 2**0.5
-"""The same from which on an effect may explain half of the squares, and leave no less than the noise."""
-UPWARD = 5.0
-"""Standard deviations by which a compliance is below zero, which gravity cannot cause."""
-HOPELESS = 20.0
-"""Residuals over the stated noise from which something is said even if nothing explains them."""
-SCALES = 10.0
-"""Scales by which a parameter of the robot may deviate."""
-LARGEST_CURVE = 0.01
-"""Standard deviation of transmission errors [rad] that no gear exceeds: real ones are below a milliradian."""
-LARGEST = {"length": 0.02, "angle": 0.05}
-"""A machined and assembled robot deviates by less than this [m, rad]."""
-BENDS = ("compliance", "bend")
-"""Beginnings of the names of parameters with which gravity bends an arm."""
+UNUSUAL_LENGTH = 0.004  # deviation of a length [m] from which on ready robots with nearly the same parameters are tried
+EXCLUDED = 0.25  # share of the rows that may be outliers
+COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
+ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
+SPARE = 2.0  # equations per parameter of the frames below which nominal errors may vanish by themselves
+WORSE = 3.0  # standard errors by which squared errors on held-out rows are above those of the nominal robot
+ROWS = 3  # held-out rows below which errors have no standard error, and only those twice the nominal ones count
+NOTICED = 2**0.5  # the same from which on an effect may explain half of the squares, and leave no less than the noise
+UPWARD = 5.0  # standard deviations by which a compliance is below zero, which gravity cannot cause
+HOPELESS = 20.0  # residuals over the stated noise from which something is said even if nothing explains them
+SCALES = 10.0  # scales by which a parameter of the robot may deviate
+LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
+LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
+BENDS = ("compliance", "bend")  # beginnings of the names of parameters with which gravity bends an arm
 NOTHING = (
     "None of the tested input mistakes explains it. Check the nominal parameters; the arm may be compliant,"
     " or less repeatable than stated. See rpim-opt inspect."
@@ -127,7 +109,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
     out = set(np.array(result.problem.labels)[~kept].tolist())
-    if result.learned is not None:  # these are no rows of the problem any more
+    if result.learned is not None:
         out |= {row.label for row in result.learned.left_out}
     rows = len(out.union(result.problem.labels))
     if len(out) > EXCLUDED * rows:
@@ -137,13 +119,9 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 
 def kept_rows(result: Outcome) -> np.ndarray:
-    """Return which rows (N,) are not outliers: neither excluded before the fit nor flagged after a robust fit."""
-    labels: set[str] = set()
-    if result.learned is not None:
-        labels |= {row.label for row in result.learned.left_out}
-    if not result.squared_loss:
-        labels |= {flag.label for flag in result.flagged} - set(result.clustered)
-    return ~np.isin(result.problem.labels, list(labels))
+    """Return which rows (N,) are not flagged after a robust fit; those that were excluded before are none any more."""
+    flagged = () if result.squared_loss else result.flagged
+    return ~np.isin(result.problem.labels, [flag.label for flag in flagged if flag.label not in result.clustered])
 
 
 def residual_rms(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, float]]:
@@ -206,10 +184,10 @@ def worse_than_nominal(nominal: Array, identified: Array) -> bool:
     return bool(difference.mean() > WORSE * difference.std(ddof=1) / np.sqrt(rows))
 
 
-def worse_sentence(nominal: Array, identified: Array) -> str:
-    """Return a sentence comparing errors (N,) [m] on held-out rows with those of the nominal robot."""
+def worse_sentence(nominal: Array, identified: Array, rows: str = "") -> str:
+    """Return a sentence comparing errors (N,) [m] on some rows, or held-out ones, with those of the nominal robot."""
     return (
-        f"Errors on {len(nominal)} held-out rows are larger than those of the nominal robot: RMS "
+        f"Errors on {rows or f'{len(nominal)} held-out rows'} are larger than those of the nominal robot: RMS "
         f"{three_digits(1e3 * rms(identified))} mm against {three_digits(1e3 * rms(nominal))} mm."
     )
 
@@ -282,11 +260,8 @@ def _worse(result: Outcome) -> Iterator[str]:
     """Say that the robot misses rows by more than the nominal one: by a far too large weight, or held-out ones."""
     nominal, identified = result.nominal_errors(), result.errors()
     if worse_than_nominal(nominal, identified):
-        yield (
-            f"Errors on the identification rows are larger than those of the nominal robot: RMS "
-            f"{three_digits(1e3 * rms(identified))} mm against "
-            f"{three_digits(1e3 * rms(nominal))} mm: the weight is too large."
-        )
+        sentence = worse_sentence(nominal, identified, "the identification rows")
+        yield f"{sentence.removesuffix('.')}: the weight is too large."
     held, validation = result.record.held_out, result.record.validation
     if held is not None:
         nominal, identified = held.nominal, held.error

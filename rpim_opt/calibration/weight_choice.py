@@ -12,16 +12,11 @@ from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import SAME_WEIGHT, Selection, Selector, require_weight
 from rpim_opt.convex.select import weight_of
 
-SETTLED = 1e-3
-"""The weight is chosen anew while a step is longer than this share of the solution, then stays."""
-SAME = 0.01
-"""Two weights are the same when their logarithms differ by no more."""
-SAME_SEARCH = float(np.log(SAME_WEIGHT))
-"""The same of weights from a search."""
-SAME_ROBUST = 1e-6
-"""The same of a robust loss, whose weight does not depend on how the measurements are stored."""
-MOST_ANSWERS = 10
-"""How many different answers a rule may give in turn."""
+SETTLED = 1e-3  # the weight is chosen anew while a step is longer than this share of the solution, then stays
+SAME = 0.01  # two weights are the same when their logarithms differ by no more
+SAME_SEARCH = float(np.log(SAME_WEIGHT))  # the same of weights from a search
+SAME_ROBUST = 1e-6  # the same of a robust loss, whose weight does not depend on how the measurements are stored
+MOST_ANSWERS = 10  # how many different answers a rule may give in turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,9 +57,7 @@ class WeightChoice:
 
     def after(self, step: float) -> WeightChoice:
         """Return the choice after a step of that relative length."""
-        if self.settled or step > SETTLED:
-            return self
-        return replace(self, settled=True)
+        return self if step > SETTLED else replace(self, settled=True)
 
     def confirmed(self, program: Program) -> WeightChoice:
         """Return the choice after applying the rule to the final program: final, or another weight."""

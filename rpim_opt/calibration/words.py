@@ -23,10 +23,8 @@ from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.robot.extensions import EXPECTED
 from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, own_name
 
-MOST_ROWS, MOST_BOUNDS = 8, 5
-"""Number of outliers and active bounds named individually."""
-LAST_DIGIT = 1e-4
-"""What tables of parameters show [mm, degree]."""
+MOST_ROWS, MOST_BOUNDS = 8, 5  # number of outliers and active bounds named individually
+LAST_DIGIT = 1e-4  # what tables of parameters show [mm, degree]
 REPEATABILITY = {
     "position": ("mm", "in position"),
     "orientation": ("mrad", "in orientation"),
@@ -40,16 +38,11 @@ DEFLECTIONS = {
     "bend": "deflection of links under gravity",
 }
 """Model extensions whose scales are said as deflections of `EXPECTED` where these are largest."""
-UNUSUAL = 10.0
-"""Scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3."""
-MOST = 5
-"""Unusual parameters and outliers that are named one by one."""
-VAGUE = 0.5
-"""Standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said."""
-NEGLIGIBLE = 0.1
-"""Share of the largest part of the repeatability below which another is not said."""
-TWO_SIDED, ONE_SIDED = 1.96, 1.645
-"""Standard normal quantiles of intervals and of bounds with 95 % confidence."""
+UNUSUAL = 10.0  # scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3
+MOST = 5  # unusual parameters and outliers that are named one by one
+VAGUE = 0.5  # standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said
+NEGLIGIBLE = 0.1  # share of the largest part of the repeatability below which another is not said
+TWO_SIDED, ONE_SIDED = 1.96, 1.645  # standard normal quantiles of intervals and of bounds with 95 % confidence
 
 
 def rotated(row: Mapping[str, Any]) -> bool:
@@ -171,9 +164,10 @@ def remarks(result: Outcome) -> list[str]:
 
 
 def _outlying(result: Outcome) -> list[str]:
-    flagged, together = result.flagged, result.clustered
+    flagged = result.flagged
     if not flagged:
         return []
+    together = result.clustered
     named = [f"{f.label} ({f.sigmas:.0f} standard deviations, residual {f.error_mm:.2f} mm)" for f in flagged]
     lines = [f"Outliers: {listed(named, MOST_ROWS)}."]
     if together:
@@ -302,8 +296,7 @@ FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
     "shadow_prices": lambda result: [price._asdict() for price in result.shadow_prices],
 }
 """Tables of a result by name."""
-MOST_POINTS = 20
-"""Points of a table; of others one row says how many there are."""
+MOST_POINTS = 20  # points of a table; of others one row says how many there are
 HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
 
 
