@@ -245,26 +245,23 @@ class Acceptance:
         ]
         workspace = self.workspace
         if workspace is not None and np.isfinite(workspace.largest):
-            lines.append(
+            lines += [
                 f"Expanded uncertainty of the position reached (U, {percent(requirement.confidence)}): at most "
                 f"{1e3 * workspace.largest:.3f} mm (largest of {workspace.count} configurations, refined by a search), "
-                f"median {1e3 * workspace.typical:.3f} mm."
-            )
-            lines.append("It is the uncertainty of the reflector; `compensate --tool` states that of another point.")
+                f"median {1e3 * workspace.typical:.3f} mm.",
+                "It is the uncertainty of the reflector; `compensate --tool` states that of another point.",
+            ]
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
         return [*lines, *self.reasons]
 
     def __str__(self) -> str:
-        """Return the verdict and what it rests on."""
         return "\n".join(self.sentences())
 
     def content(self) -> dict[str, Any]:
         """Return the same as a document [mm]."""
         r, workspace = self.requirement, self.workspace
-        box = None
-        if r.box is not None:
-            box = {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
+        box = r.box and {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
         lengths = {"bound": self.bound, "typical": workspace and workspace.typical, "repeatability": self.repeatability}
         return {
             "verdict": self.verdict,

@@ -120,11 +120,10 @@ def noise_covariances(problem: CalibrationProblem, level: float) -> NoiseCovaria
     """
     session = unknown_sessions(problem)
     if problem.repeatability is not None:
-        robot = problem.covariances(reading=False)
-        reading = problem.covariances()
+        robot, reading = problem.covariances(reading=False), problem.covariances()
     else:
-        robot = [(level - 1) * V for V in problem.covariances()]
-        reading = [level * V for V in problem.covariances()]
+        stated = problem.covariances()
+        robot, reading = [(level - 1) * V for V in stated], [level * V for V in stated]
     return NoiseCovariances(robot, [V + more for V, more in zip(reading, session, strict=True)], session)
 
 

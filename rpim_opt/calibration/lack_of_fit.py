@@ -164,7 +164,6 @@ class LackOfFit:
         return lines
 
     def __str__(self) -> str:
-        """Return the paragraph."""
         return " ".join(self.sentences())
 
     def content(self) -> dict[str, Any]:
@@ -190,12 +189,9 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     compared = Comparison(result)
     problem, dimension = compared.problem, compared.dimension
     known: dict[str, Any] = {
-        "configurations": compared.configurations,
-        "equations": len(compared.row),
-        "spare": compared.spare,
-        "dimension": dimension,
-        "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
-    }
+        "configurations": compared.configurations, "equations": len(compared.row), "spare": compared.spare,
+        "dimension": dimension, "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
+    }  # fmt: skip
     if compared.spare < FEWEST:
         return LackOfFit(**known)
     best = compared.best
@@ -356,9 +352,6 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
     if not spread > 0:
         return None
     return Autocorrelation(product / squares, (product - float(permuted.mean())) / spread)
-
-
-# --- in words ---------------------------------------------------------------------------------------------------------
 
 
 def _size(found: LackOfFit, value: float) -> str:

@@ -26,6 +26,7 @@ from rpim_opt.robot.parameters import of_joint, own_name
 TINY = 1e-300  # divisors are no smaller
 ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
 UNIDENTIFIABLE = 1e-9  # standard deviations below, in scales, are rounding: the data do not see the parameter
+WORTH = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing
 BALANCED = 1e-4  # gradient of weighted equations and penalty at the solution, relative to that of the data at nominal
 
 
@@ -123,9 +124,7 @@ def influence(result: Outcome) -> Influence:
     change = change @ T.T
     used = float(np.sum(leverage))
     spare = len(residual) - used
-    variance = 1.0
-    if spare > 1e-6:
-        variance = float(residual @ residual) / spare
+    variance = float(residual @ residual) / spare if spare > 1e-6 else 1.0
     spread = np.sqrt(variance * np.sum((A @ T @ T.T) ** 2, axis=0))
     spread[spread < UNIDENTIFIABLE] = 0.0
     return Influence(
@@ -173,11 +172,6 @@ def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, 
         moved[alone] = np.nan
         change[chosen] = moved
     return leverage, change
-
-
-# --- improvement of the flange ----------------------------------------------------------------------------------------
-
-WORTH = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing
 
 
 @dataclass(frozen=True)
@@ -268,9 +262,7 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     J[:, :, columns] = moved(there, q, None, at=at).slope
     D = J.reshape(-1, J.shape[2])
     p = p - p.mean(axis=0)
-    turning = np.zeros((len(p), 3, 3))
-    turning[:, [0, 1, 2], [1, 2, 0]] = p[:, [2, 0, 1]]
-    turning[:, [0, 1, 2], [2, 0, 1]] = -p[:, [1, 2, 0]]
+    turning = np.cross(np.eye(3), p[:, None])
     values = dict(zip(of_robot.names, nominal, strict=True))
     base = numeric_frame([values[f"base_{c}"] for c in FRAME])
     along = base[:3, :3] @ forward_kinematics(there.robot, q)[:, :3, :3]

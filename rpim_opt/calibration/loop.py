@@ -198,8 +198,7 @@ class Loop:
         if choice.robust and not choice.answers and self.options.max_iterations > FEW_ITERATIONS:
             # where weight 1 leads: at nominal the answer would be about outliers that no fit has shown yet
             return state.weighted(replace(choice, weight=1.0, settled=True))
-        choice = choice.asked(self._judged(state))
-        return state.weighted(choice)
+        return state.weighted(choice.asked(self._judged(state)))
 
     def confirmed(self, state: State) -> State:
         """Apply the rule once more at convergence: a weight is final if the rule selects it again."""
@@ -263,8 +262,7 @@ class Loop:
         candidate = state.program.on(self.linearized(z, state.z))
         after = candidate.objective(z, state.choice.weight)
         rounding = ROUNDING * abs(state.merit) + state.floor
-        fall = state.merit - after
-        gain = 1.0
+        fall, gain = state.merit - after, 1.0
         if promised > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
             gain = fall / promised
         effect = float(np.sum((state.size * (z - state.z)) ** 2))
@@ -283,11 +281,10 @@ class Loop:
         return state
 
     def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
-        weight = state.choice.weight
         o = self.options
         damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
         how = {"solver": o.solver, "settings": o.settings, "verbose": o.verbose}
-        return program.solve(weight, damping=damping, accuracy=accuracy, **how).z
+        return program.solve(state.choice.weight, damping=damping, accuracy=accuracy, **how).z
 
     def _curved(self, state: State, straight: Array) -> Array:
         """Let a step follow the curve of the residual: the convex program again, b moved by half the curvature.
@@ -339,9 +336,6 @@ class Loop:
             return 0.0, -np.inf
         size = max(size, 1.0)  # an interior point's accuracy is absolute below one squared sigma
         return INTERIOR * size, BEST * size
-
-
-# --- the loop ---------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

@@ -67,7 +67,6 @@ class Prediction(NamedTuple):
     outside: Outside = Outside()
 
     def __repr__(self) -> str:
-        """Return one line."""
         largest = float(np.max(self.coverage_factor, initial=0.0))
         return f"<Prediction of {len(self.position)} positions, coverage factor {largest:.3g}>"
 
@@ -429,14 +428,13 @@ class Outcome:
         free = self.problem.parameters.free
         values = free.values(self.x)
         C = self.known_covariance
-        variance = np.full(len(self.x), np.inf) if C is None else np.diag(C)
+        std = np.full(len(self.x), np.inf) if C is None else np.sqrt(np.diag(C))
         rows: list[dict[str, Any]] = []
         for i, name in enumerate(free.names):
             unit, si = display(free.dimensions[i])
             row: dict[str, Any] = {"name": name, "unit": unit, "nominal": float(free.nominal[i] / si)}
             row |= {"identified": float(values[i] / si), "deviation": float(self.x[i] / si)}
-            row["std"] = float(np.sqrt(variance[i]) / si) if np.isfinite(variance[i]) else None
-            rows.append(row)
+            rows.append({**row, "std": float(std[i] / si) if np.isfinite(std[i]) else None})
         return rows
 
     @cached_property

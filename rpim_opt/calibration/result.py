@@ -103,11 +103,9 @@ class Calibration(Outcome):
         return frame_of(words.FRAMES[what](self))
 
     def __str__(self) -> str:
-        """Return the parameters and errors as a person reads them."""
         return "\n".join([words.parameter_table(self), "", *words.sentences(self, self.verdict)])
 
     def __repr__(self) -> str:
-        """Return one line."""
         ending = self.message if self.verdict.delivered else f"Not delivered. {self.verdict.reasons[0]}"
         return f"<Calibration '{self.formulation.name}', {len(self.x)} parameters, weight {self.weight:.4g}: {ending}>"
 

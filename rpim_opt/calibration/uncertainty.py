@@ -78,15 +78,14 @@ class Uncertainty(Tabled):
         free = self.result.problem.parameters.free
         spread = self.result.spread
         noise, prior, both = (np.sqrt(np.diag(C)) for C in (spread.noise, spread.prior, spread.covariance))
-        values = free.values(self.result.x)
+        columns = {"value": free.values(self.result.x), "u_noise": noise, "u_prior": prior, "u": both}
+        columns["U"] = self.coverage_factor * both
         rows: list[dict[str, Any]] = []
         for i, name in enumerate(free.names):
             unit, si = display(free.dimensions[i])
-            row: dict[str, Any] = {"parameter": name, "unit": unit, "value": float(values[i] / si)}
-            row |= {"u_noise": float(noise[i] / si), "u_prior": float(prior[i] / si), "u": float(both[i] / si)}
-            row["U"] = float(self.coverage_factor * both[i] / si)
-            row["actively_constrained"] = bool(both[i] == 0) or name in self.result.actively_constrained
-            rows.append(row)
+            figures = {key: float(values[i] / si) for key, values in columns.items()}
+            held = bool(both[i] == 0) or name in self.result.actively_constrained
+            rows.append({"parameter": name, "unit": unit, **figures, "actively_constrained": held})
         return rows
 
     def _notes(self) -> list[str]:

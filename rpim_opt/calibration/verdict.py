@@ -75,7 +75,6 @@ class Verdict:
         return not self.reasons
 
     def __str__(self) -> str:
-        """Return the verdict with its reasons."""
         return " ".join(["Delivered." if self.delivered else "Not delivered.", *self.reasons])
 
     def beside(self, causes: Sequence[str]) -> list[str]:

@@ -15,7 +15,7 @@ from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
-from rpim_opt.calibration.verdict import Verdict, rms
+from rpim_opt.calibration.verdict import REPEATABILITY, Verdict, rms
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
@@ -25,11 +25,7 @@ from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, ow
 
 MOST_ROWS, MOST_BOUNDS = 8, 5  # number of outliers and active bounds named individually
 LAST_DIGIT = 1e-4  # what tables of parameters show [mm, degree]
-REPEATABILITY = {
-    "position": ("mm", "in position"),
-    "orientation": ("mrad", "in orientation"),
-    "joint": ("mrad", "at the joints"),
-}
+WHERE = {"position": "in position", "orientation": "in orientation", "joint": "at the joints"}
 """How the parts of the robot's repeatability are said."""
 DEFLECTIONS = {
     "compliance": "deflection of joints under gravity",
@@ -226,8 +222,7 @@ def _noise(learned: Learned) -> dict[str, list[str]]:
     parts = []
     for kind, size in robot.items():
         if size.value > NEGLIGIBLE * largest:
-            unit, where = REPEATABILITY[kind]
-            parts.append(f"{_figure_or_bound(size, 1e3, unit)} {where}")
+            parts.append(f"{_figure_or_bound(size, 1e3, REPEATABILITY[kind][0])} {WHERE[kind]}")
     factor = learned.noise.get("instrument")
     instrument = [] if factor is None else [_figure_or_bound(factor, 1.0, "x the stated one")]
     return {"Robot repeatability (1 sigma)": parts, "Measurement noise": instrument}
@@ -395,10 +390,9 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     if any(problem.touches.planar):
         nearest.append("the best-fit plane of all its touches")
     definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
-    tells = "how consistently the robot reaches them"
-    if len(problem.arms) > 1:
-        tells = "how consistently the robots reach them"
-    remarks = [f"{definition}. These were not measured: the error shows {tells} from all sides."]
+    reach = "robots reach" if len(problem.arms) > 1 else "robot reaches"
+    consistently = f"the error shows how consistently the {reach} them from all sides"
+    remarks = [f"{definition}. These were not measured: {consistently}."]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
         remarks.append("No distance is known: the scale of the robot rests on its nominal lengths alone.")
     return remarks
