@@ -320,9 +320,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     against += missed
     if least > limit:
         against.append(
-            f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only a "
-            "model that "
-            'explains more of the residuals (model = "auto") or a more repeatable robot reduces it.'
+            f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only a model "
+            'that explains more of the residuals (model = "auto") or a more repeatable robot reduces it.'
         )
     if not np.isfinite(mapped.largest):
         lacking.append(
@@ -377,15 +376,13 @@ def _held_out(
     beyond = [apart.label[i] for i in np.flatnonzero(sigmas > allowed)]
     rows, count = len(apart), int(inside.sum())
     largest = 1e3 * float(error[inside].max(initial=0.0))
-    missed: list[str] = []
-    chance = 1 - requirement.confidence
+    missed, lacking, chance = [], [], 1 - requirement.confidence
     if missing and bdtrc(len(missing) - 1, count, chance) < chance:
         missed.append(
             f"{len(missing)} of {count} rows have errors above the limit plus the instrument's uncertainty: "
             f"{listed(missing, MOST)}."
         )
         missed += [moved] if moved else []
-    lacking: list[str] = []
     if count < FEWEST:
         measured = any(region.rows(part.data).any() for part in result.problem.rows())
         reason = f"Missing: at least {FEWEST} held-out rows in the region; it holds {count} of {rows}."

@@ -162,11 +162,9 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         variance = np.full(len(q), np.nan)
         if C is not None:
             variance = np.sum((columns @ C[np.ix_(place, place)]) * columns, axis=1)
-        effect = np.linalg.norm(J[np.ix_(length, place)] @ result.x[place]) / np.sqrt(rows)
+        effect = float(np.linalg.norm(J[np.ix_(length, place)] @ result.x[place]) / np.sqrt(rows))
         ends = float(at[:, curve.joint - 1].min()), float(at[:, curve.joint - 1].max())
-        errors.append(
-            TransmissionError(curve.joint, q, columns @ result.x[place], np.sqrt(variance), ends, float(effect))
-        )
+        errors.append(TransmissionError(curve.joint, q, columns @ result.x[place], np.sqrt(variance), ends, effect))
     return errors
 
 

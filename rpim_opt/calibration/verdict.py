@@ -218,12 +218,9 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
 
 def _repeatability(result: Outcome) -> Iterator[str]:
     """Say that what was taken for the robot's repeatability is beyond that of any robot."""
-    if result.learned is None:
-        return
-    for kind, size in result.learned.noise.items():
-        if kind not in REPEATABILITY:
-            continue
-        unit, largest = REPEATABILITY[kind]
+    noise = {} if result.learned is None else result.learned.noise
+    for kind in (kind for kind in noise if kind in REPEATABILITY):
+        size, (unit, largest) = noise[kind], REPEATABILITY[kind]
         dimension = "length" if kind == "position" else "angle"
         variance = stated_variance(result.problem, dimension)
         measured = variance[variance > 0]
@@ -354,14 +351,14 @@ def likely_causes(result: Outcome) -> list[str]:
     if share[worst] > 1:
         unit = "mm" if free.dimensions[worst] == "length" else "mrad"
         signs.append(f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}")
-    head: list[str] = []
+    head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = _in_table_order(result, problem)
     noticed = max(ratio for _, ratio in residuals.values())
-    if signs:
-        head = [f"{BAD}: {'; '.join(signs)}."]
+    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames  # an arm is machined better
+    another = bool((np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any()) and len(problem.arms) == 1
     if signs or not result.converged:
         causes = [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
-    elif _of_another_robot(result) and len(problem.arms) == 1 and (other := sibling(problem)) is not None:
+    elif another and (other := sibling(problem)) is not None:
         causes = [other.sentence]
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
@@ -372,13 +369,6 @@ def likely_causes(result: Outcome) -> list[str]:
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if noticed > HOPELESS else []
-
-
-def _of_another_robot(result: Outcome) -> bool:
-    """Whether a length of the arm deviates by more than one that is machined to a drawing usually does."""
-    free = result.problem.parameters.free
-    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames
-    return bool((np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any())
 
 
 def _upward(result: Outcome) -> list[str]:
