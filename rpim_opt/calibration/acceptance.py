@@ -347,11 +347,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
 def _held_out(
     result: Calibration, region: Region, requirement: Requirement, data: Dataset | None
 ) -> tuple[dict[str, Any] | None, list[str], list[str]]:
-    """Return what held-out rows, of the result's record or other ones, say of a limit.
-
-    As a document [mm] with its sentence, None without rows; that they miss the limit; and why they do not bear the
-    intervals out.
-    """
+    """Return what held-out rows say of a limit: a document [mm] or None, that they miss it, and what is lacking."""
     apart = result.record.validation if data is None else data
     held, excluded, moved = result.record.held_out, [], ""
     if apart is not None:

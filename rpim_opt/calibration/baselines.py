@@ -11,11 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.problem.problem import CalibrationProblem
 
-__all__ = [
-    "gauss_newton",
-    "levenberg_marquardt",
-    "linear_least_squares",
-]
+__all__ = ["gauss_newton", "levenberg_marquardt", "linear_least_squares"]
 
 
 class Baseline(NamedTuple):

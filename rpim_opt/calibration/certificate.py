@@ -1,7 +1,4 @@
-"""Optimality certificate of a solution: the user's functions are called and the model is linearized anew.
-
-Of data in blocks the linearization is the loop's.
-"""
+"""Optimality certificate of a solution: functions are called and the model is linearized anew (not that of blocks)."""
 
 from __future__ import annotations
 

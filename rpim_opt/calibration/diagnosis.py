@@ -101,10 +101,7 @@ class Outside:
 
 
 def measured_ranges(problem: Source, earlier: Sequence[Earlier] = ()) -> dict[str, Array]:
-    """Return the minimum and maximum measured value of every joint (2, dof) [rad or m], by robot.
-
-    With those of the ``earlier`` calibrations that serve as the prior.
-    """
+    """Return the measured range of every joint (2, dof) [rad or m] by robot, with those of earlier calibrations."""
     here = ((b.robot, b.q.reshape(-1, b.q.shape[2])) for part in problem.rows() for b in part.data.blocks)
     before = ((robot, np.array(ends)) for each in earlier for robot, ends in each.ranges.items())
     ranges: dict[str, Array] = {}

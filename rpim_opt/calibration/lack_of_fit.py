@@ -237,10 +237,7 @@ def judged(result: Outcome) -> LackOfFit | None:
 
 
 def foreseen(problem: Source) -> tuple[LackOfFit | None, list[LeftOut]]:
-    """Return the lack of fit of a quick fit of the geometry to at most 60 configurations, and its outliers.
-
-    None if the fit fails.
-    """
+    """Return the lack of fit of a quick fit to at most 60 configurations, None if it fails, and its outliers."""
     try:
         result = calibrate(sampled(problem, QUICK))
         return judged(result), [] if result.learned is None else list(result.learned.left_out)

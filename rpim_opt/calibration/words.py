@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -340,22 +340,21 @@ def touch_errors(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str,
     By its name: how many, their RMS before and after calibration, and the largest.
     """
     errors = []
-    for name, rows in _touched(data):
+    for name, rows in _touched(data).items():
         before, after = 1e3 * nominal[rows], 1e3 * error[rows]
         lengths = {"nominal_rms_mm": rms(before), "rms_mm": rms(after), "max_mm": float(after.max())}
         errors.append({"name": name, "count": len(rows), **lengths})
     return tuple(sorted(errors, key=lambda each: -each["rms_mm"]))
 
 
-def _touched(data: Dataset) -> Iterator[tuple[str, np.ndarray]]:
-    """Yield every point or plane by name, with the rows that touched it: with any tool, of any robot."""
+def _touched(data: Dataset) -> dict[str, list[int]]:
+    """Return the rows that touched a point or plane, with any tool and of any robot, by its name."""
     rows: dict[str, list[int]] = {}
     for block in data.blocks:
         if block.measurement.touching and block.touched is not None:
             for name, row in zip(block.touched[:, 0], block.row, strict=True):
                 rows.setdefault(name, []).append(int(row))
-    for name, of in rows.items():
-        yield name, np.array(of)
+    return rows
 
 
 def touch_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
@@ -373,8 +372,8 @@ def touch_rows(found: Sequence[Mapping[str, Any]]) -> list[list[str]]:
 
 def known_points(problem: CalibrationProblem, data: Dataset) -> list[str]:
     """Return a sentence on touched points that the calibration used too, so are not held out."""
-    known = {name for name, _ in _touched(problem.data)}
-    both = [name for name, _ in _touched(data) if name in known]
+    known = _touched(problem.data)
+    both = [name for name in _touched(data) if name in known]
     if not both:
         return []
     return [f"Not held out: the calibration also used touches of {listed(both)}."]

@@ -12,8 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.calibration.identify import ending
-from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State
-from rpim_opt.calibration.weight_choice import weight_choice
+from rpim_opt.calibration.loop import Ended, Iteration, Loop, Options, State, weight_choice
 from tests.simulate import simulated
 
 PROBLEM, _ = simulated(noise=5e-5)

@@ -13,7 +13,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import loop
-from rpim_opt.calibration.weight_choice import MOST_ANSWERS, SETTLED, WeightChoice, weight_choice
+from rpim_opt.calibration.loop import MOST_ANSWERS, SETTLED, WeightChoice, weight_choice
 
 PROGRAM: Any = SimpleNamespace(closed_form=True)
 DEAR: Any = SimpleNamespace(closed_form=False)
