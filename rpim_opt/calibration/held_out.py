@@ -40,8 +40,7 @@ def judged(result: Calibration, data: Dataset) -> Judged:
     A row is allowed the norm that one of N rows exceeds with probability 0.01.
     """
     N = len(data)
-    sigmas = np.full(N, np.nan)
-    allowed = np.full(N, np.nan)
+    sigmas, allowed = np.full((2, N), np.nan)
     C = result.known_covariance
     if C is None:
         return Judged(sigmas, allowed, None)

@@ -39,6 +39,8 @@ MOST = 5  # unusual parameters and outliers that are named one by one
 VAGUE = 0.5  # standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said
 NEGLIGIBLE = 0.1  # share of the largest part of the repeatability below which another is not said
 TWO_SIDED, ONE_SIDED = 1.96, 1.645  # standard normal quantiles of intervals and of bounds with 95 % confidence
+MOST_POINTS = 20  # points of a table; of others one row says how many there are
+HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
 
 
 def rotated(row: Mapping[str, Any]) -> bool:
@@ -274,9 +276,6 @@ def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
     return f"at most {factor * size.value * np.exp(ONE_SIDED * size.spread):.2g} {unit} (95 % confidence)"
 
 
-# --- tables -----------------------------------------------------------------------------------------------------
-
-
 FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
     "parameters": lambda result: [{"parameter": row.pop("name"), **row} for row in result.parameter_rows()],
     "errors": lambda result: [
@@ -291,11 +290,6 @@ FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
     "shadow_prices": lambda result: [price._asdict() for price in result.shadow_prices],
 }
 """Tables of a result by name."""
-MOST_POINTS = 20  # points of a table; of others one row says how many there are
-HEADER = ["touches by point [mm]", "touches", "RMS, nominal", "RMS, identified", "max, identified"]
-
-
-# --- cameras ----------------------------------------------------------------------------------------------------------
 
 
 def camera_remarks(result: Outcome) -> list[str]:
