@@ -155,8 +155,7 @@ class Dataset(Tabled):
 
     def of_robot(self, robot: str) -> Dataset:
         """Return the rows of one of several robots, as that robot's own."""
-        rows = [i for i, name in enumerate(self.robot) if name == robot]
-        part = self.take(rows)
+        part = self.take([i for i, name in enumerate(self.robot) if name == robot])
         return replace(part, blocks=tuple(replace(block, robot="") for block in part.blocks))
 
     @classmethod

@@ -139,8 +139,6 @@ def endings(stem: str) -> Iterator[tuple[str, str]]:
         yield stem[: match.end()], stem[match.end() :]
 
 
-# --- quaternions and matrices whose columns are numbered, turns ---------------------------------------------------
-
 ORDERS = ("wxyz", "xyzw")
 QUATERNION = re.compile(r"(q|quat|quaternion|orientation|orient|rot|rotation)[_ ]?\[?([0-4])\]?")
 ENTRY = re.compile(r"(?:m|t|h|r(?=\D*\d\D*\d)|mat|matrix|tf|pose)[_ \[(]*(\d)[_ ,\]\[]*(\d?)[\])]?")

@@ -17,10 +17,7 @@ from rpim_opt.basics.tables import EXCEL, TEXTS, decoded
 Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
-
-BINARY = frozenset(
-    {".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl"}
-)
+BINARY = (".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl")
 """Endings of files that are no tables as text; any other unknown ending may be one of an instrument's table."""
 
 
@@ -37,16 +34,11 @@ class TableFormat(NamedTuple):
     read: Callable[[str], Rows]
 
 
-def formats() -> list[TableFormat]:
-    """Return the formats of all modules here."""
-    names = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.name != "registry"]
-    return [each for name in names for each in import_module(f"{__package__}.{name}").FORMATS]
-
-
 def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     """Return the table of a file of any format."""
     ending = path.suffix.lower()
-    every = formats()
+    modules = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.name != "registry"]
+    every: list[TableFormat] = [each for name in modules for each in import_module(f"{__package__}.{name}").FORMATS]
     fitting = [each for each in every if ending in each.endings]
     if not fitting and ending in BINARY:
         plain = {*TEXTS, *EXCEL, ".parquet", ".mat", ".npz"}
