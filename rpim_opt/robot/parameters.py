@@ -179,7 +179,7 @@ class Parameters(Tabled):
     def take(self, index: np.ndarray) -> Parameters:
         """Return the entries at ``index`` (K,), in that order."""
         texts: dict[str, Any] = {key: tuple(getattr(self, key)[i] for i in index) for key in ("names", "dimensions")}
-        texts["terms"] = tuple(name for name in self.terms if name in texts["names"])
+        texts["terms"] = tuple(filter(set(texts["names"]).__contains__, self.terms))
         return replace(self, **texts, **{key: getattr(self, key)[index] for key in NUMBERS})
 
     @cached_property

@@ -119,9 +119,9 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
     for robot, arm in problem.arms.items():
         p = problem.parameters.of_robot(robot)
         touched: dict[str, list[Array]] = {}
-        for block in problem.data.blocks:
-            kind = block.measurement
-            if block.robot != robot or block.touched is None or not kind.touching or kind.planar:
+        own = [block for block in problem.data.blocks if block.robot == robot]
+        for block in own:
+            if block.touched is None or not block.measurement.touching or block.measurement.planar:
                 continue
             tool = numeric_frame(p.nominal[_frame_of(p, tool_prefix(block.markers[0]))])
             T = forward_kinematics(arm, block.q[:, 0]) @ tool
@@ -133,17 +133,15 @@ def met(problem: CalibrationProblem) -> dict[str, Array]:
         k = _frame_of(p, "base_")
         base = numeric_frame(p.nominal[k])
         common = {name: place for name, place in places.items() if name in known}
-        seen = any(block.touched is None for block in problem.data.blocks if block.robot == robot)
-        if p.identified[k].all() and not seen:
+        free = p.identified[k].all() and all(block.touched is not None for block in own)
+        if free:
             with suppress(InputError):  # too few, or on a line
                 base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
                 bases[robot] = frame_numbers(base)
         for name, place in places.items():
             there = transformed(base, place)
             distance = float(np.linalg.norm(there - known.setdefault(name, there)))
-            # of a base that touches do not place, too few of them say nothing
-            placed = robot in bases or seen or not p.identified[k].all()
-            if placed and distance > APART:
+            if (robot in bases or not free) and distance > APART:  # too few touches say nothing of a free base
                 what = f"touches of '{name}' that are {distance:.2g} m from those of another robot"
                 accepted = f"at most {APART:g} m: state or identify its base, or give another point another name"
                 raise InputError(f"together, problem '{robot}'", what, accepted)
