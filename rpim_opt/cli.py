@@ -25,6 +25,7 @@ import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
 from rpim_opt.basics.files import inside, refused, sha256_of
 from rpim_opt.basics.text import listed, progress_bar, table
+from rpim_opt.basics.units import parse_units
 from rpim_opt.report import console
 
 if TYPE_CHECKING:
@@ -189,8 +190,8 @@ class Tables(NamedTuple):
 
     def read(self, result: "ro.calibration.Calibration", sources: list[Path]) -> "Measured":
         """Return the measurements of tables."""
-        stated = {"key": self.key, "within": self.time_tolerance, "sheet": self.sheet, "decimal": self.decimal}
-        options = console.table_options(self.units, **stated)
+        stated = {"sheet": self.sheet, "decimal": self.decimal, "key": self.key, "within": self.time_tolerance}
+        options = ro.data.TableOptions(units=parse_units(self.units), **stated)
         return ro.use.read_measurements(result, sources, self.measurement, options)
 
 
@@ -261,10 +262,10 @@ def new(
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
-        options = console.table_options(
-            units, sheet=sheet, columns=columns, key=key, quaternion=quaternion, rotation=rotation, prefix=prefix,
-            constants=tuple(console.listed_words(constants)), encoding=encoding, separator=separator, decimal=decimal,
-            within=time_tolerance,
+        options = ro.data.TableOptions(
+            sheet=sheet, encoding=encoding, separator=separator, decimal=decimal, units=parse_units(units), key=key,
+            columns=tuple(map(str.strip, columns.split(","))) if columns else (), quaternion=quaternion,
+            rotation=rotation, prefix=prefix, constants=tuple(console.listed_words(constants)), within=time_tolerance,
         )  # fmt: skip
         if dry_run:
             found = ro.store.understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)
@@ -557,7 +558,7 @@ def compensate(
     with _loaded(result) as (loaded, say):
         from rpim_opt.use.reading import read_commands
 
-        read, left_out = read_commands(loaded, targets, console.table_options(units, decimal=decimal))
+        read, left_out = read_commands(loaded, targets, ro.data.TableOptions(decimal=decimal, units=parse_units(units)))
         say("compensating")
         compensation = ro.use.compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,

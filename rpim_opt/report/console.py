@@ -18,7 +18,6 @@ from rpim_opt.basics.text import visible
 from rpim_opt.basics.units import LARGEST
 
 if TYPE_CHECKING:
-    from rpim_opt.basics.layout import TableOptions
     from rpim_opt.data.record import Requirement
 
 # --- output ------------------------------------------------------------------------------------------------
@@ -150,18 +149,7 @@ def required(limit: float | None, box: str | None, stated: Requirement | None) -
         sides = ((1e-3 * x0, 1e-3 * x1), (1e-3 * y0, 1e-3 * y1), (1e-3 * z0, 1e-3 * z1))
     if stated is None:
         return Requirement(1e-3 * (limit or 0.0), sides)
-    if limit is not None:
-        stated = replace(stated, limit=1e-3 * limit)
-    return replace(stated, box=sides or stated.box)
-
-
-def table_options(units: str, columns: str = "", **stated: Any) -> TableOptions:
-    """Return the table options of a command."""
-    from rpim_opt.basics.layout import TableOptions
-    from rpim_opt.basics.units import parse_units
-
-    names = tuple(name.strip() for name in columns.split(",")) if columns else ()
-    return TableOptions(columns=names, units=parse_units(units), **stated)
+    return replace(stated, limit=stated.limit if limit is None else 1e-3 * limit, box=sides or stated.box)
 
 
 def listed_words(text: str) -> list[str]:
