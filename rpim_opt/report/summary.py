@@ -32,9 +32,6 @@ def mm(value: float) -> str:
     return f"{value:.2f}" if value < 100 else f"{value:.0f}"
 
 
-# --- figures -----------------------------------------------------------------------------------------------
-
-
 def error_rows(result: Calibration) -> list[dict[str, Any]]:
     """Return mean, RMS, 95th percentile and maximum [mm] of every set of errors, with nominal and identified model."""
     rows: list[dict[str, Any]] = []
@@ -121,9 +118,6 @@ def acceptance(result: Calibration) -> Acceptance | None:
     return None if result.record.requirement is None else accept(result)
 
 
-# --- sentences ---------------------------------------------------------------------------------------------
-
-
 def headline(result: Calibration) -> str:
     """Return a sentence on the error reduction, on data not used for identification if there are any."""
     name, nominal, identified = headline_errors(result)
@@ -201,9 +195,6 @@ def nominal_note(result: Calibration) -> str:
     fitted = (result.problem.parameters.placed & result.problem.parameters.identified).any()
     frames = ", with its base, tool and other frames fitted to the identification data" if fitted else ""
     return f"Nominal: the nominal robot{frames}."
-
-
-# --- documents ---------------------------------------------------------------------------------------------
 
 
 def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:

@@ -243,9 +243,6 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
     return formulation
 
 
-# --- the tables of a folder, without the excluded rows -----------------------------------------------------------
-
-
 def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files]:
     """Return the measurements and the names of their files by role."""
     exclude = stated.table.exclude
@@ -281,9 +278,6 @@ def _read(stated: ProblemFile, each: Observation, path: Path) -> Dataset:
             source = on_board(read_columns(path), stated.board)
     with in_file(stated.path):
         return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
-
-
-# --- [[known_distance]] and [[known_angle]] between touched points and planes ------------------------------------
 
 
 def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Dataset:

@@ -225,20 +225,14 @@ def content(result: Calibration) -> dict[str, Any]:
     solvable = formulation_of("", functions).solvable
     arms = dict(result.problem.arms)
     stored = Stored(
-        **{name: getattr(result, name) for name in (*SHARED, *DERIVED)},
-        formulation=result.formulation.name,
-        definition=functions,
+        **{name: getattr(result, name) for name in (*SHARED, *DERIVED)}, formulation=result.formulation.name,
+        definition=functions, inliers=None if solvable else _inliers(result),
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
-        inliers=None if solvable else _inliers(result),
-        robots=arms,
-        terms={name: _terms(robot.model, robot) for name, robot in arms.items()},
+        robots=arms, terms={name: _terms(robot.model, robot) for name, robot in arms.items()},
         transmission=tuple(curve for robot in arms.values() for curve in robot.model.curves),
-        origins={name: carried_by(robot.model.terms) for name, robot in arms.items()},
-        model=result.problem.parameters,
-        data=sets(result),
-        repeatability=result.problem.repeatability,
-        rows=_rows(result),
-    )
+        origins={name: carried_by(robot.model.terms) for name, robot in arms.items()}, rows=_rows(result),
+        model=result.problem.parameters, data=sets(result), repeatability=result.problem.repeatability,
+    )  # fmt: skip
     parts = {
         "format": FORMAT,
         "version": VERSION,
@@ -376,16 +370,12 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
     if learned is None:
         weight = SELECTORS.get(file.selection.name, file.weight) if file.selection else file.weight
     extensions = "auto" if learned is not None and learned.trials else "geometry"
+    asked = partial(calibrate, formulation=formulation, weight=weight, model=extensions)
     return Calibration(
-        problem,
-        formulation,
-        **{name: getattr(file, name) for name in SHARED},
-        program=program,
-        asked=mapped_as(file.mapping, partial(calibrate, formulation=formulation, weight=weight, model=extensions)),
-        record=replace(file.record, validation=validation, digest=file.digest),
-        kept=None if formulation.solvable else _kept(file, program),
-        known_causes=file.causes,
-    )
+        problem, formulation, **{name: getattr(file, name) for name in SHARED}, program=program,
+        asked=mapped_as(file.mapping, asked), record=replace(file.record, validation=validation, digest=file.digest),
+        kept=None if formulation.solvable else _kept(file, program), known_causes=file.causes,
+    )  # fmt: skip
 
 
 def _robot(name: str, file: Stored, models: Models) -> Robot:

@@ -167,9 +167,6 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
     return list(places)
 
 
-# --- what is simulated -------------------------------------------------------------------------------------------
-
-
 @dataclass(frozen=True, eq=False)
 class _Table:
     """One table of the true deviations ``x`` (n,) [SI]; it is noisy where it identifies, and draws alike where not."""
@@ -293,8 +290,6 @@ class _Table:
         L = np.linalg.cholesky(np.broadcast_to(block.covariance, (len(block.row), k, k)))
         return self.noisy * (L @ self.rng.normal(size=(len(block.row), k, 1)))[:, :, 0]
 
-    # --- cameras -------------------------------------------------------------------------------------------------
-
     def _seen(self, count: int) -> Columns:
         """Return a camera's table: configurations in which it sees its whole board, and where every point appears."""
         definition, plan, board = self.stated, self.plan, self.stated.board
@@ -312,8 +307,6 @@ class _Table:
         data = self._read(on_board({**table, **dict.fromkeys(("u_px", "v_px"), ["0"] * len(table["label"]))}, board))
         y = world.on(data).modelled(self.x)[0] + self._errors(data.blocks[0])
         return {**table, "u_px": [f"{u:.4f}" for u in y[:, 0]], "v_px": [f"{v:.4f}" for v in y[:, 1]]}
-
-    # --- touches of unmeasured points and planes -------------------------------------------------------
 
     def _touched(self) -> Columns:
         """Return a table of touches, by tools that take turns."""
