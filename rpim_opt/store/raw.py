@@ -69,10 +69,9 @@ class Understanding:
     def __str__(self) -> str:
         parts = []
         for each in self.tables:
-            rows = [["column", "meaning", "name here", "unit", "why"]]
-            rows += [[m.column, m.meaning, m.name, m.unit, m.why] for m in each.meant]
+            rows = [("column", "meaning", "name here", "unit", "why"), *each.meant]
             width = [max(map(len, column)) for column in zip(*rows, strict=True)]
-            rows.insert(1, ["-" * w for w in width])
+            rows.insert(1, tuple("-" * w for w in width))
             lines = ["   ".join(cell.ljust(w) for cell, w in zip(row, width, strict=True)).rstrip() for row in rows]
             title = [each.file] if len(self.tables) > 1 else []
             parts.append("\n".join([*title, *lines, *(f"{each.file}: {note}" for note in each.notes)]))
@@ -143,8 +142,8 @@ def rows_of(
         own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
         where = f"{row}{mark}'{own[ours]}'" if own.get(ours, ours) != ours else error.where
         accepted = error.accepted
-        others = [(name, split(name)[1]) for name in found.left_out]
-        lengths = [name for name, unit in others if unit and dimension_of(unit) == "length"]
+        units = {name: split(name)[1] for name in found.left_out}
+        lengths = [name for name, unit in units.items() if unit and dimension_of(unit) == "length"]
         lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
         if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
             accepted += f", or rename '{lengths[0]}'"
@@ -171,10 +170,8 @@ def understand_of(
         stems = set().union(*(each.stems for each in tables))
         if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
             understanding = _whole(files, arm, kind, options, tables)
-            doubt = next((each.doubt for each in tables if each.doubt), "")
-            return (
-                _checked(understanding, files, arm, doubt) if doubt and kind.turning and not targets else understanding
-            )
+            doubt = next((each.doubt for each in tables if each.doubt and kind.turning and not targets), "")
+            return _checked(understanding, files, arm, doubt) if doubt else understanding
     names = ", ".join(name for _, raw in files for name in raw.columns)
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
@@ -214,7 +211,7 @@ def _tables(
     for path, raw in files:
         with in_file(path):
             understood = understand(raw, arm.robot, kind, options, arm.names, targets)
-            tables.append(replace(understood, file=path.name) if path else understood)
+        tables.append(replace(understood, file=path.name) if path else understood)
     return tables
 
 
@@ -224,11 +221,10 @@ def _whole(
     with in_file(files[0][0] if len(files) == 1 else None):
         whole = together(tables, arm.robot, kind, options.key, options.within)
     shown = []  # in what is shown the columns by which rows were joined are not left out
+    join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
     for each in tables:
-        joins = [m.column.lower() in whole.keys and m.meaning == "not used" for m in each.meant]
-        join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
-        meant = tuple(m._replace(**join) if joined else m for m, joined in zip(each.meant, joins, strict=True))
-        shown.append(replace(each, meant=meant))
+        joining = {m for m in each.meant if m.column.lower() in whole.keys and m.meaning == "not used"}
+        shown.append(replace(each, meant=tuple(m._replace(**join) if m in joining else m for m in each.meant)))
     return Understanding(kind, whole.columns, whole.raw, tuple(shown), whole.notes, options, str(files[0][0] or ""))
 
 
@@ -239,12 +235,11 @@ def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> 
     """
     alternatives: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
+    noise = {"position_mm": 1.0, "orientation_mrad": 1.0}
     for reading in READINGS[doubt]:
         options = replace(first.options, **{doubt: reading})
         alternatives[reading] = _whole(files, arm, first.kind, options, _tables(files, arm, first.kind, options))
-        data = read_data(
-            alternatives[reading].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, first.kind
-        )
+        data = read_data(alternatives[reading].columns, arm.robot, noise, first.kind)
         misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data)))
     best, second = sorted(misfit, key=lambda reading: misfit[reading])[:2]
     figures = ", ".join(f"{reading} {misfit[reading]:.2f} deg" for reading in (best, second))

@@ -142,9 +142,8 @@ class PriorTable(Table):
         files = {}
         for name, key in named:
             try:
-                files[name] = inside(path.parent, name, key, path)
-                if files[name].is_dir():
-                    files[name] = inside(path.parent, str(Path(name) / "result.json"), key, path)
+                folder = inside(path.parent, name, key, path).is_dir()
+                files[name] = inside(path.parent, str(Path(name) / "result.json") if folder else name, key, path)
             except InputError as error:
                 accepted = f"{error.accepted}; a copy there, `rpim-opt update`, or calibrate(prior=...) in a script"
                 raise InputError(key, error.found, accepted, path) from None

@@ -32,15 +32,9 @@ class Arm(NamedTuple):
 
     @classmethod
     def of(
-        cls,
-        robot: Robot,
-        values: Mapping[str, float],
-        nominal: Mapping[str, float],
-        tool: str,
-        before: Array,
-        kind: Measurement,
-        loads: Loads,
-    ) -> Arm:
+        cls, robot: Robot, values: Mapping[str, float], nominal: Mapping[str, float], tool: str, before: Array,
+        kind: Measurement, loads: Loads,
+    ) -> Arm:  # fmt: skip
         """Build the function from parameter values by name; gravity acts on the nominal ones."""
         command = loads.symbols(len(robot.joint_types), 1)
         y = ca.SX.sym("y", len(kind.columns))
@@ -80,12 +74,10 @@ def nearest(
     to_low = (low - start) / unit
     to_high = (high - start) / unit
 
-    def joints(rows: np.ndarray, D: Array) -> Array:
-        return np.clip(start[rows] + unit * D, low[rows], high[rows])
-
     def state(rows: np.ndarray, D: Array) -> tuple[Array, Array, Array, Array]:
         """Return errors, weighted errors, their slopes, and the objectives."""
-        _, error, J = arm.at(joints(rows, D), load[rows], y[rows])
+        q = np.clip(start[rows] + unit * D, low[rows], high[rows])
+        _, error, J = arm.at(q, load[rows], y[rows])
         weighted = times(W[rows], error)
         value = np.sum(weighted**2, axis=1) + np.sum(D * times(P[rows], D), axis=1)
         return error, weighted, W[rows] @ (J * unit), value
@@ -121,7 +113,7 @@ def nearest(
         left = left[long & promising & (value[left] > 1e-24)]
     g = descent(every)
     active = ((to_low >= D) & (g < 0)) | ((to_high <= D) & (g > 0))
-    return joints(every, D), error, active
+    return np.clip(start + unit * D, low, high), error, active
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, in_file
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
 from rpim_opt.basics.text import Tabled, counted, listed, table
 from rpim_opt.basics.units import FOREIGN, LARGEST, UNITS, dimension_of, parse_units, split
@@ -215,12 +215,9 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     >>> round(1e3 * found.accuracy, 3), round(1e3 * found.repeatability, 3)
     (2.0, 1.0)
     """
-    file = source if isinstance(source, str | Path) else None
-    try:
-        columns: Mapping[str, Sequence[Any]] = read_columns(source) if file is None else read_raw(Path(file)).columns
+    with in_file(source):
+        columns = read_raw(Path(source)).columns if isinstance(source, str | Path) else read_columns(source)
         return _performance(columns, parse_units(units))
-    except InputError as error:
-        raise error.within(file) from None
 
 
 def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str]) -> Performance:

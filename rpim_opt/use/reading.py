@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices, pick
+from rpim_opt.basics.exceptions import InputError, choices, in_file, pick
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import EXCEL, read_columns
 from rpim_opt.basics.units import display, joint_columns, split_unit
@@ -62,10 +62,8 @@ def read_targets(source: Any, robot: Robot) -> Targets:
     >>> targets.label, targets.q, targets.poses
     (('P1',), None, array([[0.4, 0. , 0.5]]))
     """
-    try:
+    with in_file(source):
         return _targets(dict(read_columns(source)), robot)
-    except InputError as error:
-        raise error.within(source if isinstance(source, str | Path) else None) from None
 
 
 def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
@@ -100,12 +98,10 @@ def read_commands(
 ) -> tuple[Targets, tuple[str, ...]]:
     """Return the targets of a table, read with the options of the calibration's tables, and the ignored columns."""
     understanding = _understood(result, source, pose, options or TableOptions(), targets=True)
-    try:
+    with in_file(source):
         if any(each.doubt == "quaternion" for each in understanding.tables):
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
         return _targets(dict(understanding.columns), result.problem.robot), understanding.left_out
-    except InputError as error:
-        raise error.within(source) from None
 
 
 class Measured(NamedTuple):
