@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import io
 from collections.abc import Callable, Iterable, Sequence
-from functools import cache, partial
+from functools import partial
 from hashlib import sha256
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -73,14 +73,9 @@ def coded(text: str) -> Markup:
     return Markup("").join(parts)
 
 
-@cache
-def _environment() -> Environment:
-    environment = Environment(
-        loader=FileSystemLoader(TEMPLATES), autoescape=True, undefined=StrictUndefined,
-        trim_blocks=True, lstrip_blocks=True,
-    )  # fmt: skip
-    environment.filters["coded"] = coded
-    return environment
+LAYOUT = {"trim_blocks": True, "lstrip_blocks": True, "autoescape": True, "undefined": StrictUndefined}
+ENVIRONMENT = Environment(loader=FileSystemLoader(TEMPLATES), **LAYOUT)
+ENVIRONMENT.filters["coded"] = coded
 
 
 def render(
@@ -93,7 +88,7 @@ def render(
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
     digest = base64.b64encode(sha256(style.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"
-    return _environment().get_template("page.html").render(
+    return ENVIRONMENT.get_template("page.html").render(
         title=title, kind=kind, heading=heading, top=top, sections=sections, policy=policy, style=Markup(style),
     )  # fmt: skip
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 from functools import cache, partial
 from hashlib import sha256
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar, get_origin
+from typing import Any, NamedTuple, get_origin
 
 import numpy as np
 
@@ -46,10 +46,6 @@ from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Curve, Model, Term, transmission
 from rpim_opt.store.own_code import is_own, own_object
 
-if TYPE_CHECKING:
-    from cattrs import Converter
-
-T = TypeVar("T")
 FORMAT = "rpim-opt result"
 VERSION = 3
 Models = Model | Mapping[str, Model]
@@ -104,7 +100,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
     stored = read_json(path)
     try:
         _require_whole(stored)
-        file = structured(stored, Stored)
+        file: Stored = _converter().structure(stored, Stored)
         ready = {**READY, **{m.name: m for m in measurements}}
         kinds = {str(block.measurement) for part in file.data.values() for block in part.blocks}
         for kind in filter(is_own, kinds - set(ready)):
@@ -122,6 +118,8 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         result.outside(result.problem.data)  # ranges of earlier calibrations are of this robot's joints
     except InputError as error:
         raise error.within(path) from None
+    except ExceptionGroup as error:
+        raise _refusal(error).within(path) from None
     except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
         # well-formed parts that somebody put together by hand
         found = f"inconsistent content ({error})"
@@ -426,16 +424,6 @@ def _kept(file: Stored, program: Program) -> Kept:
 # --- dataclasses, named tuples, arrays and mappings as JSON and back, by annotations -----------------------------
 
 
-def structured(content: Any, kind: type[T]) -> T:
-    """Return the instance of a class from a file's content, without functions, which a file cannot hold."""
-    from cattrs import BaseValidationError
-
-    try:
-        return _converter().structure(content, kind)
-    except BaseValidationError as error:
-        raise _refusal(error) from None
-
-
 def digest(content: Mapping[str, Any]) -> str:
     """Return the SHA-256 of a file's content without its digest, independent of layout and order."""
     rest = {key: value for key, value in content.items() if key != "digest"}
@@ -444,7 +432,7 @@ def digest(content: Mapping[str, Any]) -> str:
 
 
 @cache
-def _converter() -> Converter:
+def _converter() -> Any:
     from cattrs import Converter
     from cattrs.cols import is_namedtuple, namedtuple_dict_structure_factory, namedtuple_dict_unstructure_factory
     from cattrs.gen import make_dict_structure_fn, make_dict_unstructure_fn, override

@@ -288,8 +288,8 @@ def export_urdf(
     link's.
 
     ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`, by
-    default those that the robot was read between;
-    ``despite_verdict`` as for `export_files`. InputError for several reflectors of which none is named as the tip.
+    default those that the robot was read between; ``despite_verdict`` as for `export_files`. InputError for several
+    reflectors of which none is named as the tip.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -315,27 +315,25 @@ def export_urdf(
     known = reflectors(p.names)
     if tip_measured and marker is None and len(known) > 1:
         raise InputError("--tip-measured", f"{len(known)} reflectors", f"--marker with one of {', '.join(known)}")
-    root_at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
-    reflector_at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
-    written: list[Array | None] = []
+    of_base, of_tool = (any(name.startswith(frame) for name in p.free.names) for frame in ("base_", "tool_"))
+    base = arm.base if of_base and same_place(arm.base, own.base) else None
+    tool = arm.tool if of_tool and tip_measured else None
     notes = []
-    for name, link, where, there in (
-        ("base", "root", "the instrument's frame", f"the instrument's frame it is at {root_at}"),
-        ("tool", "tip", "the DH table's flange frame", f"its frame the reflector is at {reflector_at}"),
-    ):
-        place = getattr(arm, name)
-        free = any(each.startswith(f"{name}_") for each in p.free.names)
-        moves = free and (tip_measured if name == "tool" else same_place(place, own.base))
-        written.append(place if moves else None)
-        if moves:
-            notes.append(f"URDF: its {link} is at the identified {name}, {placed(place)} in {where}.")
-        elif free:
-            option = "; where the reflector is the tip, --tip-measured moves it there" if name == "tool" else ""
-            notes.append(f"URDF: its {link} link keeps its pose from the file; in {there}{option}.")
+    if base is not None:
+        notes.append(f"URDF: its root is at the identified base, {placed(base)} in the instrument's frame.")
+    elif of_base:
+        at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
+        notes.append(f"URDF: its root link keeps its pose from the file; in the instrument's frame it is at {at}.")
+    if tool is not None:
+        notes.append(f"URDF: its tip is at the identified tool, {placed(tool)} in the DH table's flange frame.")
+    elif of_tool:
+        at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
+        there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
+        notes.append(f"URDF: its tip link keeps its pose from the file; {there}.")
     notes += _orientation(result, marker)
 
     def write(path: Path) -> list[str]:
-        write_urdf(source, arm.robot, path, root, tip, *written)
+        write_urdf(source, arm.robot, path, root, tip, base, tool)
         return notes
 
     return write_all([(Path(target), write)], note)
