@@ -49,8 +49,6 @@ from rpim_opt.store.problem_file import (
 from rpim_opt.store.statements import place_fixtures, stated_details, stated_prior, stated_requirement
 
 ROLES = ("identification", "validation")
-Tools = Mapping[str, tuple[float, ...]]
-Files = Mapping[str, list[str]]
 UNSTATED = 1e-5
 """Standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool."""
 
@@ -243,7 +241,7 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
     return formulation
 
 
-def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], Files]:
+def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], dict[str, list[str]]]:
     """Return the measurements and the names of their files by role."""
     exclude = stated.table.exclude
     files: dict[str, list[str]] = {role: [] for role in ROLES}
