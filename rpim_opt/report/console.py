@@ -20,8 +20,6 @@ from rpim_opt.basics.units import LARGEST
 if TYPE_CHECKING:
     from rpim_opt.data.record import Requirement
 
-# --- output ------------------------------------------------------------------------------------------------
-
 
 def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
     """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
@@ -88,9 +86,6 @@ def written_to(path: Path | None, text: str) -> list[Path]:
     with refused(path):
         write_text(path, text)
     return [path]
-
-
-# --- options -----------------------------------------------------------------------------------------------
 
 
 def require_positive(where: str, value: float | None) -> None:

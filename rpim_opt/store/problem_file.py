@@ -38,9 +38,6 @@ LEARNED_NOISE = ("robot", "free", "level", "declared")
 PACKAGE = Path(__file__).resolve().parents[1]
 
 
-# --- what people name in a file or on the command line -----------------------------------------------------------
-
-
 def problems_folder() -> Path:
     """Return the folder of the shipped problems: inside the package, or beside it in a checkout."""
     inside = PACKAGE / "problems"
@@ -80,9 +77,6 @@ def named_weight(text: str, file: Path | None = None) -> float | Selector | None
     except ValueError:
         return pick(SELECTORS, text, "key selector", file, f"a number, {LEARNED}, ")
     return require_weight(value, "selector", file)
-
-
-# --- the schema --------------------------------------------------------------------------------------------------
 
 
 class FrameTable(Table):

@@ -50,9 +50,6 @@ def _joints(robot: Robot) -> dict[str, tuple[str, ...]]:
     return {f"q{i}": (dimension,) for i, dimension in enumerate(robot.joint_dimensions, start=1)}
 
 
-# --- [constraints] -----------------------------------------------------------------------------------------------
-
-
 class Constraints(Table):
     """The keys of ``[constraints]``."""
 
@@ -112,9 +109,6 @@ def _rows(data: Dataset, labels: Any, where: str = "") -> Array:
         found = f"'{missing[0]}'" if missing else "no row"
         raise InputError(f"{where}.rows", found, "labels of the identification data: " + choices(found, known))
     return np.unique(np.concatenate(chosen), axis=0)
-
-
-# --- [prior] -------------------------------------------------------------------------------------------------------
 
 
 class PriorTable(Table):
@@ -204,9 +198,6 @@ def _of_prior(key: str, path: Path) -> Iterator[None]:
         raise error if error.file else InputError(f"key prior.{key}", error.found, error.accepted, path) from None
 
 
-# --- [record] and [acceptance] -----------------------------------------------------------------------------------
-
-
 def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
     """Return the entries of ``[record]``, in the order of `FIELDS`."""
     for key, value in table.items():
@@ -247,9 +238,6 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
     box = (sides["x"], sides["y"], sides["z"]) if axes else None
     ranges = tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX)
     return Requirement(keys["limit"], box, ranges, keys["marker"], keys["confidence"])
-
-
-# --- places of anchors, planes, spheres --------------------------------------------------------------------------
 
 
 def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:
