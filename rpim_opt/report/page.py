@@ -20,8 +20,7 @@ from rpim_opt.report.summary import mm
 from rpim_opt.use.monitoring import Monitoring
 
 TEMPLATES = Path(__file__).resolve().parent / "templates"
-Block = tuple[str, Any]
-"""Kind and content of a part of a page: a macro of ``templates/parts.html`` and its argument."""
+Block = tuple[str, Any]  # kind and content of a part of a page: a macro of ``templates/parts.html``, its argument
 
 
 class Table(NamedTuple):
@@ -41,9 +40,7 @@ class Figure(NamedTuple):
     caption: str
 
 
-WIDTH = 420.0
-HEIGHT = 270.0
-"""Size of a chart [px]; the page scales it to its place."""
+WIDTH, HEIGHT = 420.0, 270.0  # of a chart [px]; the page scales it to its place
 INKED = ("text.color", "axes.edgecolor", "axes.labelcolor", "xtick.color", "ytick.color")
 STYLE = {
     **dict.fromkeys(INKED, plot.COLORS["ink"]),

@@ -290,8 +290,7 @@ def _times(found: Monitoring, ax: Axes) -> Array:
 COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
 """Colours by meaning, as in the page's style sheet, which has others in the dark."""
 SHAPES = "osD^v<>"
-CLOSE, VERY_CLOSE = 3.0, 1.6
-"""Ratios of a logarithmic axis's ends below which it has ticks between 1, 2 and 5, and at every tenth."""
+CLOSE, VERY_CLOSE = 3.0, 1.6  # ratios of an axis's ends below which it has ticks between 1, 2, 5; at every tenth
 MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
 """Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""

@@ -36,21 +36,11 @@ from rpim_opt.problem.registration.frames import starting_parameters
 from rpim_opt.robot.chain import OF_JOINTS
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.terms import Model as KinematicModel
-from rpim_opt.store.problem_file import (
-    DistanceTable,
-    Observation,
-    ProblemFile,
-    ProblemTable,
-    named_formulation,
-    named_weight,
-    read_problem,
-    stated_repeatability,
-)
+from rpim_opt.store import problem_file
 from rpim_opt.store.statements import place_fixtures, stated_details, stated_prior, stated_requirement
 
 ROLES = ("identification", "validation")
-UNSTATED = 1e-5
-"""Standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool."""
+UNSTATED = 1e-5  # standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -120,7 +110,7 @@ def load(
     >>> len(instance.problem.data), len(instance.validation), instance.formulation.name
     (16, 9, 'Tikhonov')
     """
-    definition = read_problem(name, variant, measurements, model, chain)
+    definition = problem_file.read_problem(name, variant, measurements, model, chain)
     table = definition.table
     if len(table.chain) > 1 and chain is None:
         return _of_chains(definition, {each: load(name, variant, measurements, model, each) for each in table.chain})
@@ -134,7 +124,7 @@ def load(
         fixtures = place_fixtures(definition.placed, rows)
         parameters = starting_parameters(definition.robot, rows, definition.base, tools, fixtures, temperature)
         problem = CalibrationProblem(definition.robot, definition.chosen(parameters, rows), rows)
-        problem = problem.with_repeatability(stated_repeatability(table, path))
+        problem = problem.with_repeatability(problem_file.stated_repeatability(table, path))
         if validation is not None:
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
@@ -161,14 +151,14 @@ def load(
         reading=table.reading, terms=tuple(table.terms) if model is None else (),
     )  # fmt: skip
     return Instance(
-        problem, formulation, named_weight(table.selector, path), prior, table.model,
+        problem, formulation, problem_file.named_weight(table.selector, path), prior, table.model,
         noise=table.repeatability if isinstance(table.repeatability, str) else "declared", record=record,
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
         reference={key: (value, spread) for key, (value, spread) in table.reference.items()}, held_out=table.held_out,
     )  # fmt: skip
 
 
-def _of_chains(stated: ProblemFile, parts: Mapping[str, Instance]) -> Instance:
+def _of_chains(stated: problem_file.ProblemFile, parts: Mapping[str, Instance]) -> Instance:
     """Return the problem of several chains of one URDF: formulation, prior and record are the first one's."""
     count = Counter(name for part in parts.values() for name in part.problem.parameters.terms)
     several = tuple(name for name in count if count[name] > 1)
@@ -222,9 +212,9 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 """
 
 
-def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulation:
+def _formulation(stated: problem_file.ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
-    formulation = named_formulation(stated.table.formulation, stated.path)
+    formulation = problem_file.named_formulation(stated.table.formulation, stated.path)
     own = stated.table.constraints.all(problem.robot, problem.data)
     formulation = replace(formulation, constraints=(*formulation.constraints, *own))
     parameters = problem.identified
@@ -241,7 +231,7 @@ def _formulation(stated: ProblemFile, problem: CalibrationProblem) -> Formulatio
     return formulation
 
 
-def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], dict[str, list[str]]]:
+def _read_tables(stated: problem_file.ProblemFile) -> tuple[dict[str, Dataset], dict[str, list[str]]]:
     """Return the measurements and the names of their files by role."""
     exclude = stated.table.exclude
     files: dict[str, list[str]] = {role: [] for role in ROLES}
@@ -268,7 +258,7 @@ def _read_tables(stated: ProblemFile) -> tuple[dict[str, Dataset], dict[str, lis
     return data, files
 
 
-def _read(stated: ProblemFile, each: Observation, path: Path) -> Dataset:
+def _read(stated: problem_file.ProblemFile, each: problem_file.Observation, path: Path) -> Dataset:
     kind = stated.kinds[each.measurement]
     source: Any = path
     if stated.board is not None and kind.by_camera:
@@ -278,7 +268,7 @@ def _read(stated: ProblemFile, each: Observation, path: Path) -> Dataset:
         return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
 
 
-def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Dataset:
+def _with_known(data: Dataset, table: problem_file.ProblemTable, role: str, path: Path) -> Dataset:
     """Return the measurements of a role with the known distances and angles of what they touch."""
     known: list[Known] = []
     distances = [(f"key known_distance {i}.sigma_mm", each) for i, each in enumerate(table.known_distance, start=1)]
@@ -290,7 +280,7 @@ def _with_known(data: Dataset, table: ProblemTable, role: str, path: Path) -> Da
             continue
         first, second = each.between
         sigma = UNSTATED if each.sigma is None else each.sigma
-        if isinstance(each, DistanceTable):
+        if isinstance(each, problem_file.DistanceTable):
             known.append(KnownDistance((first, second), each.distance, sigma))
         else:
             known.append(KnownAngle((first, second), each.deg == 0, sigma))

@@ -36,17 +36,15 @@ from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of
 from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
 
-TABLES = ("identification.csv", "validation.csv", "target.csv")
+TABLES = ("identification.csv", "validation.csv", "target.csv")  # of a new folder
 ROBOT_OF_CHAINS = "robot.urdf"
-"""Files of a new folder."""
 SHARED = (
     "Chains share the joints that they have in common. Other common parameters: `shared` in problem.toml, "
     '["base_*"] where one instrument measured several chains from one link, by chain { left = ["base_*"], ... }.'
 )
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
-FARTHEST = 50.0
-"""Distance from the instrument to a base beyond which the units are likely wrong [m]."""
+FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
 CAMERA_CLEARLY = 3.0  # The camera is where the poses fit so many times better.
 

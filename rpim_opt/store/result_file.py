@@ -52,8 +52,7 @@ Models = Model | Mapping[str, Model]
 SHARED = ("x", "weight", "selection", "converged", "message", "history", "certificate", "learned", "mapping")
 DERIVED = ("active_bounds", "shadow_prices", "record", "causes")
 """What a calibration and its file hold under the same name, and what a calibration derives of what it holds."""
-RELATIVE = 1e-4
-"""Standard deviations of hardly identifiable directions differ by that much from one processor to another."""
+RELATIVE = 1e-4  # standard deviations of hardly identifiable directions differ by that much between processors
 ABSOLUTE = 1e-6  # Largest difference of a small figure [mm, deg] and the one that follows from the data.
 NOT_FINITE = ("inf", "-inf", "nan")  # how a file spells the numbers that JSON does not have
 KINDS = {bool: "boolean", int: "integer", str: "string"}

@@ -30,8 +30,7 @@ from rpim_opt.store.problem_file import Observation, ProblemFile, read_problem
 from rpim_opt.store.statements import place_fixtures
 
 Columns = dict[str, list[str]]
-MOST = 1_000_000
-"""Configurations of a table."""
+MOST = 1_000_000  # configurations of a table
 TORQUE = 20.0  # Simulated joint torques are uniform up to this [Nm].
 DIGITS, EXACT_DIGITS, CAMERA_DIGITS = 4, 9, 5
 """Of joint values in degrees or millimetres; where the noise is in them none may come from rounding."""

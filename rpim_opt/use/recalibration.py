@@ -33,15 +33,13 @@ from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
 
 FALSE_ALARM = 0.01  # probability with which a robot that did not change is said to have changed, over all causes
-SIZES = (1.0, 3.0, 10.0, 30.0)
-"""Multiples of a deviation's prior width that a change may have, each as likely: tails that no crash leaves."""
+SIZES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
 UNCHANGED = 0.5  # prior probability that nothing changed; the other half is dealt out to the kinds of causes in use
 OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `SIZES`
 UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do not observe a direction of a change
 MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
 SPARED = 0.25  # part of the readings that may be wrong
-STRANGE = 5.0
-"""Readings that no change explains, and that miss by so many times the error before any calibration, are another's."""
+STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
 RIVAL = 0.05  # probability from which on another cause is named beside the most probable one
 SHOWN = 5  # causes that are shown
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
