@@ -207,16 +207,15 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
     A parameter ``tables`` stands for the options of `Tables`; a command that runs a folder's code takes --allow-code.
     """
     own = signature(function).parameters
-    options = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in own.values() if each.annotation is not Tables]
-
-    def add(name: str, annotation: Any, default: Any) -> None:
-        options.append(Parameter(name, Parameter.KEYWORD_ONLY, annotation=annotation, default=default))
-
-    for name, annotation in Tables.__annotations__.items() if "tables" in own else ():
-        add(name, annotation, Tables._field_defaults[name])
+    added: dict[str, tuple[Any, Any]] = {}
+    if "tables" in own:
+        added = {name: (kind, Tables._field_defaults[name]) for name, kind in Tables.__annotations__.items()}
     if function.__name__ not in CODELESS:
-        add("allow_code", Code, False)
-    add("as_json", Json, False)
+        added["allow_code"] = Code, False
+    added["as_json"] = Json, False
+    options = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in own.values() if each.annotation is not Tables]
+    for name, (kind, default) in added.items():
+        options.append(Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default))
 
     @wraps(function)
     def run(as_json: bool, allow_code: bool = False, **values: Any) -> None:

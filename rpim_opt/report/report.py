@@ -19,7 +19,7 @@ from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import headline_errors
 from rpim_opt.calibration.held_out import judged as predicted
 from rpim_opt.calibration.lack_of_fit import judged
@@ -82,7 +82,7 @@ def page(result: Calibration) -> str:
     if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
         warnings = [" ".join(composition), *warnings]
         composition = []
-    accepted = summary.acceptance(result)
+    accepted = None if result.record.requirement is None else accept(result)
     workspace = measured_workspace(result) if accepted is None else accepted.workspace
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None

@@ -10,7 +10,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.text import counted, joined, listed, percent, table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -113,11 +113,6 @@ def workspace_sentence(found: Workspace) -> str:
     )
 
 
-def acceptance(result: Calibration) -> Acceptance | None:
-    """Return the verdict on the requirement of a result's record; None without a requirement."""
-    return None if result.record.requirement is None else accept(result)
-
-
 def headline(result: Calibration) -> str:
     """Return a sentence on the error reduction, on data not used for identification if there are any."""
     name, nominal, identified = headline_errors(result)
@@ -208,7 +203,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         for method, mean in methods.items():
             errors.append({"what": f"{name}, published: {method}", "mean_mm": mean, "printed": True})
     lacking = judged(result)
-    accepted = acceptance(result)
+    accepted = None if record.requirement is None else accept(result)
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
     remarks = [
         *filter(None, [inconclusive(result, uncertainty)]),

@@ -45,12 +45,7 @@ def problems_folder() -> Path:
 
 
 def find_problem(name: str | Path) -> Path:
-    """Return the folder of a problem from its path, or of a shipped problem by name.
-
-    >>> import rpim_opt as ro
-    >>> ro.store.find_problem("position").name
-    'position'
-    """
+    """Return the folder of a problem from its path, or of a shipped problem by name."""
     path = Path(name)
     if path.is_file() and path.name == "problem.toml":
         return path.parent

@@ -36,6 +36,7 @@ from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origin
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 
+CURVES = "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
 CONVENTION = {
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
@@ -202,11 +203,6 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
     rows are calibrated once more, also those that only the extension explains. A calibration to which nothing was added
     is returned as it is.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("position").problem, model="auto")  # nothing was added
-    >>> ro.use.geometry_alone(result) == (result, [])
-    True
     """
     if result.learned is None or not result.learned.added:
         return result, []
@@ -251,10 +247,7 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     """Write four rows a period of the finest harmonic, with standard deviations; say how large the errors are."""
     curves = transmission_errors(result)
     if not curves:
-        accepted = (
-            "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
-        )
-        raise InputError("the calibration", "no transmission error", accepted)
+        raise InputError("the calibration", "no transmission error", CURVES)
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
     for curve in curves:
         rows = zip(np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard, strict=True)
