@@ -30,6 +30,14 @@ if TYPE_CHECKING:
 __all__ = ["error_vectors", "errors", "l_curve", "parameters"]
 
 Axes = Any  # matplotlib's, imported where axes are made
+COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
+"""Colours by meaning, as in the page's style sheet, which has others in the dark."""
+SHAPES = "osD^v<>"
+CLOSE, VERY_CLOSE = 3.0, 1.6  # ratios of an axis's ends below which it has ticks between 1, 2, 5; at every tenth
+MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
+FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
+"""Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
+LINE_HEIGHT = 1.25  # distance of names over their size
 MODELS = {"before": "nominal", "after": "identified"}  # model that errors before and after calibration are of
 MANY_ROWS = 100  # above it each row is a small point without a name
 TIMES = ((86400.0, "days"), (3600.0, "hours"))  # units of an axis of time [s]
@@ -283,18 +291,6 @@ def _times(found: Monitoring, ax: Axes) -> Array:
     unit, name = next(((size, name) for size, name in TIMES if span > 2 * size), (1.0, "seconds"))
     ax.set_xlabel(f"{name} since the first check")
     return (found.when - found.when[0]) / unit
-
-
-# --- marks and axes ----------------------------------------------------------------------------------------
-
-COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
-"""Colours by meaning, as in the page's style sheet, which has others in the dark."""
-SHAPES = "osD^v<>"
-CLOSE, VERY_CLOSE = 3.0, 1.6  # ratios of an axis's ends below which it has ticks between 1, 2, 5; at every tenth
-MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
-FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
-"""Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
-LINE_HEIGHT = 1.25  # distance of names over their size
 
 
 def _axes(ax: Axes, rows: int = 0, **kwargs: Any) -> Axes:

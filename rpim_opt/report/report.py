@@ -5,10 +5,10 @@ from __future__ import annotations
 import contextlib
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import stdtrit
@@ -63,8 +63,7 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     write_text(Path(path), page(replace(calibration, record=record)))
 
 
-@dataclass(frozen=True)
-class Content:
+class Content(NamedTuple):
     """A result, with evaluations that several sections share."""
 
     result: Calibration

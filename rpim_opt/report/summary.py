@@ -214,9 +214,8 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         *words.turned_frames(result),
         nominal_note(result),
         *warnings(result),
+        *([result.message] if result.converged else []),
     ]
-    if result.converged:
-        remarks.append(result.message)
     whole = figures(result)
     return {
         "title": record.title,

@@ -39,6 +39,7 @@ from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store import problem_file
 from rpim_opt.store.statements import place_fixtures, stated_details, stated_prior, stated_requirement
 
+_Options = ParamSpec("_Options")
 ROLES = ("identification", "validation")
 UNSTATED = 1e-5  # standard deviation [m or rad] of what only validates, where none is stated: of a good machine tool
 
@@ -177,9 +178,6 @@ def _of_chains(stated: problem_file.ProblemFile, parts: Mapping[str, Instance]) 
     validated = {name: part.validation for name, part in parts.items() if part.validation is not None}
     validation = Dataset.of_robots(validated).grouped_by_points() if validated else None
     return replace(first, problem=problem, record=replace(record, validation=validation), published={})
-
-
-_Options = ParamSpec("_Options")
 
 
 def _also_of_folders(

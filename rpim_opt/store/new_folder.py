@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -49,8 +49,7 @@ UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above whi
 CAMERA_CLEARLY = 3.0  # The camera is where the poses fit so many times better.
 
 
-@dataclass(frozen=True)
-class Started:
+class Started(NamedTuple):
     """A new folder: its files with their rows, notes on what was guessed, and what was understood of the tables."""
 
     folder: Path

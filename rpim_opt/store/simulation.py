@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import product
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field
@@ -67,8 +67,7 @@ class Simulation(Table):
     truth: dict[str, Any] = Field(default_factory=dict)
 
 
-@dataclass(frozen=True, eq=False)
-class Simulated:
+class Simulated(NamedTuple):
     """Simulated tables by file name, with the true deviations [SI] by parameter and the labels of gross errors."""
 
     tables: Mapping[str, Columns]

@@ -28,7 +28,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import JOINT_OFFSET, Parameters, is_joint_offset
 
 MEASURED = "measured"  # The place that every problem has: the configurations of its identification data.
-FIELDS = {
+FIELDS = {  # keys of ``[record]``, and what a report calls them
     "by": "Measured by",
     "when": "Measured",
     "where": "Place",
@@ -42,7 +42,6 @@ FIELDS = {
     "order": "Order",
     "notes": "Notes",
 }
-"""Keys of ``[record]``, and what a report calls them."""
 LONGEST_TEXT = 1000  # Characters of a text that somebody may want to read.
 
 

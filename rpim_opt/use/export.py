@@ -37,13 +37,12 @@ from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 
 CURVES = "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
-CONVENTION = {
+CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
     "standard": "standard DH (Paul, Hayati), Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta), from "
     "axis 1 to the flange frame of [tool] and --tool: a and alpha of the last row are 0",
 }
-"""What is said of a table in a convention."""
 
 
 class Exported(NamedTuple):

@@ -28,8 +28,6 @@ from rpim_opt.robot.chain import Described
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.raw import Understanding, rows_of, understand_of
 
-PLACE = ("x_mm", "y_mm", "z_mm")
-
 
 class Targets(NamedTuple):
     """Rows of a table: labels; joint values (N, dof), poses (N, 7) or positions (N, 3), torques, payloads, or None.
@@ -74,7 +72,8 @@ def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
     positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
     if not joints and not positions:
         raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
-    absent = [*([] if joints else joint_columns(robot.joint_dimensions)), *([] if positions else PLACE)]
+    absent = [] if joints else list(joint_columns(robot.joint_dimensions))
+    absent += [] if positions else ["x_mm", "y_mm", "z_mm"]
     columns = columns | dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
     noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
     data = read_data(columns, robot, noise, pose if oriented else position)
