@@ -176,7 +176,7 @@ def update(
     prior_inflation: float = 1.0,
     reset: Sequence[str] = (),
     source: str = "New measurements",
-    progress: Callable[[str], None] = lambda step: None,
+    progress: Callable[[str], None] | None = None,
 ) -> Update:
     """Recalibrate a robot: the posterior of its previous calibration is the prior of this one.
 
@@ -202,11 +202,12 @@ def update(
     >>> [earlier.title for earlier in found.result.record.earlier], found.changes
     (['ABB IRB 120-3/0.58'], ())
     """
+    say = progress or (lambda step: None)
     problem = with_data(result, data)
     free = problem.parameters.free
     matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
     released = tuple(np.array(free.names)[matches].tolist())
-    progress("comparing with the last calibration")
+    say("comparing with the last calibration")
     # a frame that was reset may be anywhere: then it is registered anew
     start = None if released else previous_deviations(result, problem)
     changes: list[Cause] = []
@@ -222,7 +223,7 @@ def update(
         alike = [each for each in changes if (each.kind == "reading") == (cause.kind == "reading")]
         if len(alike) >= (max(SPARED * len(data), 1) if cause.kind == "reading" else MOST):
             break
-        progress(f"releasing {cause.name}")
+        say(f"releasing {cause.name}")
         changes.append(cause)
         if cause.kind == "reading":
             problem = problem.without(set(cause.members))
