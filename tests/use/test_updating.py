@@ -149,6 +149,16 @@ def test_an_instrument_that_was_set_up_anew(crashed: Robot) -> None:
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
 
 
+def test_gear_ratios_can_be_reset() -> None:
+    """Their unit is ppm: no dimension needs a unit of SI in its names."""
+    problem = ro.load("joints").problem
+    rows = np.arange(len(problem.data))
+    first = ro.calibrate(problem.on(problem.data.take(rows[:-8])), ro.tikhonov, weight=1.0)
+    found = ro.use.update(first, problem.data.take(rows[-8:]), reset=["ratio*"])
+    assert [each.name for each in found.moved] == ["ratio1", "ratio2"]
+    assert all(abs(each.change) < 4 * each.std for each in found.moved)
+
+
 def test_without_a_change_it_equals_calibrating_with_all_data() -> None:
     """The posterior holds what the first data say: pooled rows give the same, as far as the model is linear."""
     robot = happened(5)
