@@ -829,7 +829,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
         what, remedy = best.addition.said(best.coefficients)
         yield f"{what} (that leaves {100 * best.left:.0f} % of the residuals): {remedy}."
     elif kinds is not None or transmission:
-        yield from first(two_positions(problem, x), [] if kinds is None else [_said_of_kinds(problem, kinds)])
+        most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
+        yield from first(two_positions(problem, x, most), [] if kinds is None else [_said_of_kinds(problem, kinds)])
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
@@ -967,9 +968,10 @@ def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
     )
 
 
-def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterator[str]:
     """Report one or two joints that explain residuals at x (n,) if each is at either of two positions in every row.
 
+    They leave less than a part ``most`` of them.
     The parameters are fitted beside, with their prior. Random errors leave 60 % of the residuals, as their signs are
     fitted then and not their sizes, and much less where there are fewer than three equations a parameter.
     """
@@ -981,7 +983,7 @@ def two_positions(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     without = _without_parameters(model)
     joints = [(i, free.names.index(name)) for i, name in enumerate(_zeros(problem.robot), 1) if name in free.names]
     joints = [(i, k) for i, k in joints if model.A[:, k].any()]
-    best, said = TWO_KINDS, ""
+    best, said = most, ""
     for some in [*combinations(joints, 1), *combinations(joints, 2)]:
         numbers = [k for _, k in some]
         A = columns = model.A[:, numbers]
