@@ -611,7 +611,7 @@ BAD = {
     "unknown unit": ([*NEW[:7], "grad,m"], ["--units", "'grad'", "mrad"]),
     "two units": ([*NEW[:7], "m,mm"], ["--units", "m and mm"]),
     "no such robot": ([*NEW[:3], "ur55", *NEW[4:]], ["'ur55'", "ur5"]),
-    "no such robot file": ([*NEW[:3], "arm.toml", *NEW[4:]], ["arm.toml", "no such file"]),
+    "no such robot file": ([*NEW[:3], "arm.toml", *NEW[4:]], ["arm.toml", "found nothing"]),
     "no such data": ([*NEW[:5], "measurd.csv", *NEW[6:]], ["measurd.csv", "mean measured.csv"]),
     "no such measurement": ([*NEW, "--measurement", "posn"], ["'posn'", "position"]),
     "missing measurement": ([*NEW, "--measurement", "cable"], ["measured.csv", "no column for 'distance'"]),

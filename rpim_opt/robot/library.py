@@ -73,11 +73,7 @@ def read_arm(
 
 def find_source(robot: str | Path) -> Path:
     """Return the file of a robot that a command or a script names: of a ready one by name, or a file."""
-    robot = str(robot)
-    if not robot.endswith(ROBOT_FILES):
-        return find_robot(robot)
-    file = Path(robot)
-    if not file.exists():
-        raise InputError("the robot", "no such file", f"a file {', '.join(ROBOT_FILES)}, or a ready robot", file)
-    require_file(file)
-    return file
+    if not str(robot).endswith(ROBOT_FILES):
+        return find_robot(str(robot))
+    require_file(Path(robot), endings=ROBOT_FILES)
+    return Path(robot)
