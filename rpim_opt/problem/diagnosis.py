@@ -899,16 +899,11 @@ def _changes(
 
 
 class Kinds(NamedTuple):
-    """Which rows (N,) are of the smaller kind, and which part of the residuals two calibrations leave."""
+    """The rows (K,) of the smaller kind, whether they are consecutive, and which part two calibrations leave."""
 
-    second: np.ndarray
+    rows: np.ndarray
+    consecutive: bool
     left: float
-
-    @property
-    def consecutive(self) -> bool:
-        """Whether the rows of the smaller kind follow each other."""
-        rows = np.flatnonzero(self.second)
-        return bool(np.ptp(rows) == len(rows) - 1)
 
 
 def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
@@ -946,14 +941,15 @@ def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
         one = errors(kept[owners])
         kept = one <= np.sort(one)[N - N // OUTLYING - 1]
     left = float(np.sqrt(best / spare / (errors(kept[owners])[kept].sum() / (kept[owners].sum() - rank))))
-    if second.sum() > N / 2:
-        second = ~second
-    return Kinds(second, left) if left < TWO_KINDS and second.sum() >= FEWEST else None
+    rows = np.flatnonzero(second == (second.sum() <= N / 2))
+    if left >= TWO_KINDS or len(rows) < FEWEST:
+        return None
+    return Kinds(rows, bool(np.ptp(rows) == len(rows) - 1), left)
 
 
 def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
     """Return the sentence on rows of two kinds; whether the smaller one agrees with the nominal robot."""
-    rows, label = np.flatnonzero(kinds.second), problem.data.label
+    rows, label = kinds.rows, problem.data.label
     named = _rows([label[i] for i in rows], "fits", "fit")
     if kinds.consecutive:
         named = f"rows {label[rows[0]]} to {label[rows[-1]]} fit"
