@@ -187,7 +187,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     """Return a warning if U exceeds the error of the nominal robot; otherwise an empty text."""
     name, errors, _ = headline_errors(result)
     nominal = rms(errors)
-    if found is None or not of_positions(result) or not found.typical > nominal:
+    if found is None or not (of_positions(result) and result.verdict.delivered and found.typical > nominal):
         return ""
     return (
         f"Inconclusive: the median U over the region, {1e3 * found.typical:.3f} mm, is above the error of the "

@@ -363,7 +363,7 @@ def likely_causes(result: Outcome) -> list[str]:
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
         if not causes and noticed > NOTICED and len(problem.arms) == 1:
-            causes = list(diagnosis.shown_by_residuals(_without_outliers(ordered, problem, result.x), result.x))
+            causes = list(diagnosis.shown_by_residuals(_without_outliers(result, ordered), result.x))
     if noticed > NOTICED:
         causes += _upward(result)
     if causes or shared:
@@ -411,7 +411,7 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
         return causes
     causes = first(diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem))
     if not causes:
-        alone, x = _without_outliers(ordered, problem, result.x), result.x
+        alone, x = _without_outliers(result, ordered), result.x
         added = () if result.learned is None else result.learned.added
         curves = [name for name in added if not name.startswith(BENDS)]
         if curves:  # they take up ratios and scales of all kinds
@@ -439,9 +439,10 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
     return problem.on(Dataset.together(list(there.values()), list(there)).take(order))
 
 
-def _without_outliers(ordered: CalibrationProblem, problem: CalibrationProblem, x: Array) -> CalibrationProblem:
-    """Return the rows that are those of the problem, or no larger errors: of held-out ones gross errors are unknown."""
-    errors, own = ordered.errors(x), np.isin(ordered.labels, problem.labels)
+def _without_outliers(result: Outcome, ordered: CalibrationProblem) -> CalibrationProblem:
+    """Return the problem's rows without outliers, and others with no larger errors: of these gross ones are unknown."""
+    single = {flag.label for flag in result.flagged} - set(result.clustered)
+    errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(set(result.problem.labels) - single))
     largest = np.nan_to_num(errors[own]).max()
     return ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
 

@@ -257,8 +257,9 @@ def _of_poses() -> Iterator[Misreading]:
         for kind, axes in (("fixed", order), ("moving", order.upper())):
             what = f"Euler angles about {kind} axes in the order {', '.join(order)}"
             remedy = "convert them to roll, pitch, yaw, or to quaternions"
-            if axes not in ("xyz", "ZYX"):  # one and the same: roll, pitch, yaw
-                yield turned(what, remedy, euler(axes, ["xyz".index(axis) for axis in order]))
+            if kind == "moving" and order != "zyx":  # the same as about fixed axes in reverse; zyx: roll, pitch, yaw
+                stated = f"state --rotation 'intrinsic {order}', or {remedy}"
+                yield turned(what, stated, euler(axes, ["xyz".index(axis) for axis in order]))
             if order != "xyz":  # KUKA's A, B, C for instance
                 yield turned(f"{what}, columns in this order", remedy, euler(axes))
     for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):

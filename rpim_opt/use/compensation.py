@@ -27,7 +27,6 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.global_start import described
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -239,13 +238,7 @@ def compensate(
     """
     verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
     note = verdict.require(despite_verdict)
-    mapping = result.mapping
-    if mapping is not None:
-        note = (
-            f"{note} Joint values of targets and commands count as in the calibrated table: "
-            f"{described(mapping.joint_types, mapping.sign, mapping.zero)} against the robot file. If the controller "
-            "counts as the file does, correct the table's columns and calibrate again before using these commands."
-        ).strip()
+    note = " ".join(filter(None, [note, result.mapping and result.mapping.caution]))
     arm = pick(result.problem.arms, robot, "robot")
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:

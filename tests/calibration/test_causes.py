@@ -338,6 +338,17 @@ def test_rows_of_reflectors_that_no_column_names_are_told_apart(rows: np.ndarray
     assert float(found[1]) == pytest.approx(apart, abs=2)
 
 
+@pytest.mark.parametrize("row", [9, 20, 30])
+def test_an_outlier_of_a_squared_loss_is_no_moved_base(row: int) -> None:
+    problem = ro.load("position").problem
+    block = problem.data.blocks[0]
+    y = block.y.copy()
+    y[row] += [3e-3, -2e-3, 2.5e-3]
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, y=y),))), ro.tikhonov, weight=1.0)
+    assert problem.data.label[row] in [flag.label for flag in result.flagged]
+    assert not any("base" in cause for cause in result.causes)
+
+
 def test_an_exchanged_reflector_is_no_moved_foot() -> None:
     """What moves far in the flange and not in the room is on the flange."""
     problem = simulated_arm("ur5e", markers=2)

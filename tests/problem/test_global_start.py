@@ -103,6 +103,18 @@ def test_many_random_signs_and_zeros_are_found(name: str, seed: int) -> None:
     assert error(result, unseen) < 1.2 * error(ro.calibrate(truth), unseen) or result.mapping.alternatives
 
 
+def test_another_description_of_the_same_robot_is_named() -> None:
+    """A reversed joint 5 is half a turn of joint 4 and of the reflector: exports say how joints count."""
+    problem = ro.load("position").problem
+    block = problem.data.blocks[0]
+    turned = replace(block, q=block.q * np.array([1, 1, 1, 1, -1, 1]))
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(turned,))))
+    assert result.mapping is not None
+    assert "zero of joint 4 +180.0 deg (" in result.message
+    assert "The same robot with other frames: joint 5 reversed (sign = -1)." in result.message
+    assert "Joint values count as in the calibrated table: zero of joint 4 +180.0 deg" in result.mapping.caution
+
+
 def test_zeros_that_were_found_are_not_held_there() -> None:
     """20 points tell zeros to some mrad: held there the error was 1.18 times as large."""
     problem, unseen, truth = simulated("panda", 101)

@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.text import joined, three_digits
+from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
@@ -84,6 +84,16 @@ class JointMapping:
     starts: int  # random starts of the search
     alternatives: tuple[Alternative, ...] = ()  # that the data cannot tell from it though they predict otherwise
     mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
+    same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
+
+    @property
+    def caution(self) -> str:
+        """Return how joint values count in what is made of the calibrated robot."""
+        return (
+            f"Joint values count as in the calibrated table: {described(self.joint_types, self.sign, self.zero)} "
+            "against the robot file. If the controller counts as the file does, correct the table's columns and "
+            "calibrate again before using this."
+        )
 
     @property
     def sentence(self) -> str:
@@ -94,6 +104,10 @@ class JointMapping:
             f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
+        also = [described(self.joint_types, other.sign, other.zero) for other in self.same]
+        if also:
+            text += f" The same robot with other frames: {listed(also)}. Write what the set-up confirms as sign "
+            text += "and theta_deg in robot.toml."
         return " ".join([text, *self._said(self.alternatives)])
 
     @property
@@ -306,7 +320,7 @@ def _judged(
     zeros = [_gauged(robot, zero) for zero in fits.zero]
     plain = [_plain(*each) for each in zip(sign, zeros, strict=True)]
     same = 0.5 * max(least, LEAST_NOISE)
-    plainest: list[int] = []  # of fits that predict the same elsewhere, each with that prediction
+    alike: list[list[int]] = []  # fits that predict the same elsewhere, the plainest first, with that prediction
     predictions: list[Array] = []
     for i in near:
         T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
@@ -315,11 +329,11 @@ def _judged(
             there -= there.mean(axis=(0, 1))
         gaps = [_apart(there, other, points.lengths) for other in predictions]
         if gaps and min(gaps) <= same:
-            k = int(np.argmin(gaps))
-            plainest[k] = min(plainest[k], i, key=plain.__getitem__)
+            alike[int(np.argmin(gaps))].append(i)
         else:
-            plainest.append(i)
+            alike.append([i])
             predictions.append(there)
+    plainest = [min(each, key=plain.__getitem__) for each in alike]
 
     def mirrors(first: int) -> list[bool]:
         return [points.lengths and bool(_apart(-there, predictions[first], True) <= same) for there in predictions]
@@ -340,9 +354,10 @@ def _judged(
         small_zeros = np.abs(_gauged(robot, other.zero[0])).max() < NEAR_ZERO
         left_handed = bool(small_zeros and rms(other)[0] < MIRRORED * left[plainest[first]])
     i = plainest[first]
-    return JointMapping(
-        robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others), left_handed
-    )
+    again = {plain[k]: k for k in alike[first] if plain[k][0] == plain[i][0] and plain[k] != plain[i]}
+    described_so = [Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof)) for _, k in sorted(again.items())]
+    found = JointMapping(robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others))
+    return replace(found, mirrored=left_handed, same=tuple(described_so))
 
 
 def _apart(one: Array, other: Array, lengths: bool) -> float:
@@ -365,7 +380,7 @@ def _gauged(robot: Robot, zero: Array) -> Array:
     return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < np.radians(2)), quarter, zero)
 
 
-def _plain(sign: Array, zero: Array) -> tuple[int, int, float, list[float]]:
+def _plain(sign: Array, zero: Array) -> tuple[int, int, float, tuple[float, ...]]:
     """How far a mapping is from the stated one: joints that change, reversed ones, size of the zeros, then signs."""
     changed = (sign < 0) | (np.abs(zero) > NEAR_ZERO)
-    return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2), sign.tolist()
+    return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2), tuple(sign.tolist())
