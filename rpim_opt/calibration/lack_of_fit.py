@@ -245,9 +245,6 @@ def foreseen(problem: Source) -> tuple[LackOfFit | None, list[LeftOut]]:
         return None, []
 
 
-# --- parts of the residuals -------------------------------------------------------------------------------------------
-
-
 def _parts(compared: Comparison, model: Candidate, known: Repeatability | None = None) -> dict[str, float]:
     """Return the RMS of a row's instrument, robot (in position, or orientation without lengths) and joints."""
     repeatability = known or model.evidence.repeatability(model.point.logs)

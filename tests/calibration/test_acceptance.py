@@ -364,8 +364,8 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
     document = json.loads(capsys.readouterr().out)
     assert document["verdict"] == "rejected"
     assert document["limit_mm"] == pytest.approx(1.0)
-    assert run(monkeypatch, "accept", out, "--box", "0,800,-900,900,0,900") == 0
-    assert "the box x 0 to 800, y -900 to 900, z 0 to 900 mm" in capsys.readouterr().out
+    assert run(monkeypatch, "accept", out, "--box=-1200,1200,-1200,1200,0,1500") == 0
+    assert "the box x -1200 to 1200, y -1200 to 1200, z 0 to 1500 mm" in capsys.readouterr().out
     bound = document["bound_mm"]
     assert run(monkeypatch, "accept", out, "--limit", f"{0.8 * bound:g}") == 4
     assert run(monkeypatch, "accept", out, "--data", str(folder / "validation.csv")) == 0
