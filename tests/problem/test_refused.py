@@ -59,7 +59,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a known distance of nothing": (lambda: KnownDistance(("A", "B"), 0.0, 1e-5), "a length greater than zero"),
     "a known distance without a deviation": (lambda: KnownDistance(("A", "B"), 0.3, 0.0), "sigma 0"),
     "an angle between one": (lambda: KnownAngle(("A", "A"), parallel=True, sigma=1e-5), "'A' twice"),
-    "touches of fewer names": (lambda: touches(Q, ["A"], 1e-4), "1 names, accepted: 4, one per touch"),
+    "touches of fewer names": (lambda: touches(Q, ["A"], 1e-4), "1 names, accepted: 4, one per row"),
     "a point of another board": (
         lambda: on_board({"label": ["first", "second"], "point": ["3", "33"]}, BOARD),
         "row second, column point: found '33', accepted: a point of the target",
