@@ -159,7 +159,8 @@ def understand_of(
 ) -> Understanding:
     """Interpret raw tables (files or data frames) as `understand_tables` does, or tables of targets."""
     options = options or TableOptions()
-    files = [(path, _upright(raw, arm)) for source in data for path, raw in _sheets(source, options)]
+    once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}  # once a sheet is once
+    files = [(path, _upright(raw, arm)) for source in once.values() for path, raw in _sheets(source, options)]
     columns = [raw.columns for _, raw in files]
     if measurement is None:
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)

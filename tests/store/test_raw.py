@@ -375,3 +375,13 @@ def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, ar
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints]) == 2
     assert "columns 'ID' and 'Point Name' for label" in capsys.readouterr().err
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "Point Name") == 0
+
+
+def test_a_file_that_is_stated_twice_is_read_once(monkeypatch, capsys, tmp_path, arm) -> None:
+    """As for two sheets of one file; rows that occur twice would be taken for measurements."""
+    file = tmp_path / "both.csv"
+    file.write_text(text([HEAD], ROWS))
+    assert new(monkeypatch, arm, tmp_path / "cell", [file, file], "--dry-run") == 0
+    said = capsys.readouterr().out
+    assert "stacked" not in said
+    assert f"{COUNT} rows, measurement position" in said
