@@ -114,9 +114,12 @@ def numeral(text: str) -> float:
 
 
 def quantities(
-    table: Mapping[str, Any], dimensions: Mapping[str, tuple[str, ...]], where: str = "",
-    lists: bool = False, also: Iterable[str] = (),
-) -> dict[tuple[str, str], Any]:  # fmt: skip
+    table: Mapping[str, Any],
+    dimensions: Mapping[str, tuple[str, ...]],
+    where: str = "",
+    lists: bool = False,
+    also: Iterable[str] = (),
+) -> dict[tuple[str, str], Any]:
     """Return the values [SI] of a table of quantities, ``{"x_mm": 1.0, "rx_deg": 90}``, by (stem, dimension).
 
     ``dimensions`` are those that stems may have, ``{"x": ("length",), "rx": ("angle",)}``; ``where`` is what errors

@@ -45,9 +45,14 @@ class Certificate(NamedTuple):
 
 
 def certified(
-    formulation: Formulation, model: LinearModel, z: Array, weight: float, floor: float = 0.0,
-    residual: Callable[[Array], Array] | None = None, before: Program | None = None,
-) -> Certificate:  # fmt: skip
+    formulation: Formulation,
+    model: LinearModel,
+    z: Array,
+    weight: float,
+    floor: float = 0.0,
+    residual: Callable[[Array], Array] | None = None,
+    before: Program | None = None,
+) -> Certificate:
     """Return the certificate that z (n,) minimizes the nonlinear problem; the formulation's functions are called anew.
 
     ``model`` is the problem linearized at z, anew; ``floor`` the objective below which one has vanished. Where

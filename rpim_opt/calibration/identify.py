@@ -49,11 +49,21 @@ ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the
 
 @one_blas_thread
 def calibrate(
-    problem: Source, formulation: Formulation | str = tikhonov, weight: float | str | Selector | None = None, *,
-    prior: Prior | None = None, model: str = "geometry", noise: str = "robot", start: Array | None = None,
-    max_iterations: int = 500, tolerance: float = 1e-8, progress: Callable[[Iteration], None] | None = None,
-    solver: str | None = None, settings: Mapping[str, Any] | None = None, verbose: bool = False,
-) -> Calibration:  # fmt: skip
+    problem: Source,
+    formulation: Formulation | str = tikhonov,
+    weight: float | str | Selector | None = None,
+    *,
+    prior: Prior | None = None,
+    model: str = "geometry",
+    noise: str = "robot",
+    start: Array | None = None,
+    max_iterations: int = 500,
+    tolerance: float = 1e-8,
+    progress: Callable[[Iteration], None] | None = None,
+    solver: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    verbose: bool = False,
+) -> Calibration:
     """Identify the parameters of a problem.
 
     Without a weight, hyperparameters are estimated from the data first, by marginal likelihood (`Evidence` has the

@@ -151,9 +151,14 @@ class Outcome:
         return robots
 
     def forward(
-        self, q: Array, marker: str = "", torque: Array | None = None, payload: float | Array | None = None,
-        columns: Mapping[str, Array] = MappingProxyType({}), robot: str = "",
-    ) -> Array:  # fmt: skip
+        self,
+        q: Array,
+        marker: str = "",
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        columns: Mapping[str, Array] = MappingProxyType({}),
+        robot: str = "",
+    ) -> Array:
         """Return the transforms (N, 4, 4) of a reflector in the instrument's frame, with the identified parameters.
 
         Base, robot and tool, gears and joints' elasticity included, joints in the middle of their backlash unless
@@ -174,10 +179,16 @@ class Outcome:
         return there.modelled(self.x)[0].reshape(-1, 4, 4)
 
     def predict(
-        self, q: Array, marker: str = "", torque: Array | None = None, payload: float | Array | None = None,
-        of: Interval = "reached", columns: Mapping[str, Array] = MappingProxyType({}), robot: str = "",
+        self,
+        q: Array,
+        marker: str = "",
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        of: Interval = "reached",
+        columns: Mapping[str, Array] = MappingProxyType({}),
+        robot: str = "",
         confidence: float | None = None,
-    ) -> Prediction:  # fmt: skip
+    ) -> Prediction:
         """Return predicted positions of a reflector with their uncertainty; arguments as for `forward`.
 
         Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u, or U = k u with

@@ -231,12 +231,20 @@ class Dataset(Tabled):
 
     @classmethod
     def of(
-        cls, q: Array, y: Array, sigma: float | Array, label: tuple[str, ...] = (),
-        measurement: Measurement | str = position, *,
-        torque: Array | None = None, payload: Array | None = None, approach: Array | None = None,
+        cls,
+        q: Array,
+        y: Array,
+        sigma: float | Array,
+        label: tuple[str, ...] = (),
+        measurement: Measurement | str = position,
+        *,
+        torque: Array | None = None,
+        payload: Array | None = None,
+        approach: Array | None = None,
         columns: Mapping[str, ArrayLike] = MappingProxyType({}),
-        session: Sequence[str] = (), point: Sequence[str] | np.ndarray = (),
-    ) -> Dataset:  # fmt: skip
+        session: Sequence[str] = (),
+        point: Sequence[str] | np.ndarray = (),
+    ) -> Dataset:
         """Return a dataset from arrays.
 
         ``q`` (N, dof) are joint values of the controller [rad or m], (N, p, dof) where a row involves p points; ``y``

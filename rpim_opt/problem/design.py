@@ -93,9 +93,13 @@ def joint_cells(robot: Robot, q: Array, index: np.ndarray) -> dict[str, list[str
 
 
 def choose(
-    problem: CalibrationProblem, candidates: Array, count: int, criterion: str = "V",
-    progress: Callable[[str], None] = lambda text: None, measured: Dataset | None = None,
-) -> Design:  # fmt: skip
+    problem: CalibrationProblem,
+    candidates: Array,
+    count: int,
+    criterion: str = "V",
+    progress: Callable[[str], None] = lambda text: None,
+    measured: Dataset | None = None,
+) -> Design:
     """Choose the configurations that are most informative about the identified parameters.
 
     With rows A_i of the whitened, scaled Jacobian at nominal and the prior of the scales, the information of a set is

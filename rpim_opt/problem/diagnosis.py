@@ -867,9 +867,16 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
 
 
 def _changes(
-    problem: CalibrationProblem, x: Array, A: Array, names: Collection[str], what: str, cause: str, *,
-    least: int = 0, steadily: bool = False,
-) -> Iterator[Addition]:  # fmt: skip
+    problem: CalibrationProblem,
+    x: Array,
+    A: Array,
+    names: Collection[str],
+    what: str,
+    cause: str,
+    *,
+    least: int = 0,
+    steadily: bool = False,
+) -> Iterator[Addition]:
     """Yield that parameters changed at a row, between two rows, or ``steadily``; of ``least`` equations a parameter."""
     free, data, owners = problem.parameters.free, problem.data, problem.owners
     some = np.flatnonzero(np.isin(free.names, list(names)))

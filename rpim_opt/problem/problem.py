@@ -244,10 +244,16 @@ class CalibrationProblem(RobotModel):
         return replace(self, data=data)
 
     def measuring(
-        self, q: Array, measurement: Measurement = position, marker: str | None = None, torque: Array | None = None,
-        payload: float | Array | None = None, columns: Mapping[str, Any] = MappingProxyType({}), robot: str = "",
+        self,
+        q: Array,
+        measurement: Measurement = position,
+        marker: str | None = None,
+        torque: Array | None = None,
+        payload: float | Array | None = None,
+        columns: Mapping[str, Any] = MappingProxyType({}),
+        robot: str = "",
         covariance: float | Array = 1.0,
-    ) -> CalibrationProblem:  # fmt: skip
+    ) -> CalibrationProblem:
         """Return the same problem with a reflector measured at joint values q (N, dof) [rad or m], all values zero.
 
         The reflector is by default that of the first row, ``robot`` one of several. ``torque`` (N, dof) [Nm],

@@ -125,9 +125,13 @@ THERE = 1e-11  # largest distance [m] of a configuration from its target; one mo
 
 
 def configurations_at(
-    problem: CalibrationProblem, points: Array, seed: int | np.random.Generator = 0, x: Array | None = None,
-    share: float = 1.0, marker: str | None = None,
-) -> Array:  # fmt: skip
+    problem: CalibrationProblem,
+    points: Array,
+    seed: int | np.random.Generator = 0,
+    x: Array | None = None,
+    share: float = 1.0,
+    marker: str | None = None,
+) -> Array:
     """Return joint values (N, dof) [rad or m] at which the tool is at N points.
 
     From random configurations, as `random_candidates` draws them, by Newton's steps (`Target`), all the way within the
@@ -240,9 +244,14 @@ UPRIGHT = 0.5
 
 
 def visible_configurations(
-    problem: CalibrationProblem, points: Array, count: int, seed: int | np.random.Generator = 0,
-    x: Array | None = None, share: float = 1.0, image: tuple[float, float] = (1280, 960),
-) -> Array:  # fmt: skip
+    problem: CalibrationProblem,
+    points: Array,
+    count: int,
+    seed: int | np.random.Generator = 0,
+    x: Array | None = None,
+    share: float = 1.0,
+    image: tuple[float, float] = (1280, 960),
+) -> Array:
     """Return joint values (count, dof) [rad or m] at which a camera sees all of its board, large and upright enough.
 
     They are drawn as by `random_candidates`. Frames and intrinsics are those of the problem's camera, at deviations

@@ -76,8 +76,12 @@ ENVIRONMENT.filters["coded"] = coded
 
 
 def render(
-    title: str, kind: str, heading: str, top: Iterable[Block], sections: Iterable[tuple[str, Iterable[Block]]],
-) -> str:  # fmt: skip
+    title: str,
+    kind: str,
+    heading: str,
+    top: Iterable[Block],
+    sections: Iterable[tuple[str, Iterable[Block]]],
+) -> str:
     """Return a page as HTML, with escaped texts and inline style, without scripts or external resources.
 
     Pictures may stand in the page as data.

@@ -309,9 +309,13 @@ class Parameters(Tabled):
 
 
 def overlay(
-    parameters: Parameters, values: Array, table: Mapping[str, float], where: str, signed: bool = False,
+    parameters: Parameters,
+    values: Array,
+    table: Mapping[str, float],
+    where: str,
+    signed: bool = False,
     file: object = None,
-) -> Array:  # fmt: skip
+) -> Array:
     """Return values (P,) [SI] with those of a table (keys as in `Parameters.scaled`) in their places.
 
     What names fewer parameters goes before. ``where`` and ``file`` are named in errors; ``signed``: whether zero and
@@ -348,10 +352,14 @@ def overlay(
 
 
 def model_parameters(
-    robot: Robot, base: Sequence[float] | Array = (0.0,) * 6,
-    tools: Mapping[str, Sequence[float] | Array] | None = None, own: Mapping[str, tuple[str, float]] | None = None,
-    own_frames: tuple[str, ...] = (), sessions: Iterable[str] = (), temperature: float | None = None,
-) -> Parameters:  # fmt: skip
+    robot: Robot,
+    base: Sequence[float] | Array = (0.0,) * 6,
+    tools: Mapping[str, Sequence[float] | Array] | None = None,
+    own: Mapping[str, tuple[str, float]] | None = None,
+    own_frames: tuple[str, ...] = (),
+    sessions: Iterable[str] = (),
+    temperature: float | None = None,
+) -> Parameters:
     """Return every parameter of a model, none of them identified yet, with `DEFAULT_SCALE` and without tolerances.
 
     ``base`` (6,) is the robot's in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; ``tools`` are

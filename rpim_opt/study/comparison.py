@@ -48,12 +48,22 @@ Rows = Sequence[Mapping[str, Any]]
 
 
 def compare(
-    problems: Any, formulations: Any = "tikhonov", selectors: Any = "learned", *,
-    methods: Any = (), splits: Any = FOLDER, counts: Any = None, noise: Any = 1.0, seeds: int | Iterable[int] = 1,
-    metrics: Any = USUAL, options: Mapping[str, Any] | None = None, workers: int = 1,
-    journal: str | Path | None = None, resume: bool | None = True,
+    problems: Any,
+    formulations: Any = "tikhonov",
+    selectors: Any = "learned",
+    *,
+    methods: Any = (),
+    splits: Any = FOLDER,
+    counts: Any = None,
+    noise: Any = 1.0,
+    seeds: int | Iterable[int] = 1,
+    metrics: Any = USUAL,
+    options: Mapping[str, Any] | None = None,
+    workers: int = 1,
+    journal: str | Path | None = None,
+    resume: bool | None = True,
     progress: bool | Callable[[int, int], None] = True,
-) -> Comparison:  # fmt: skip
+) -> Comparison:
     """Compare formulations, selectors and user-defined methods on problems, by errors on held-out data.
 
     Every problem with every formulation and every selector, every split and every seed: one replicate each. What cannot

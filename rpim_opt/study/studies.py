@@ -199,9 +199,14 @@ def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> st
 
 
 def run_study(
-    name: str | Path, quick: bool = False, workers: int = 1, resume: bool | None = None,
-    redraw: bool = False, out: Path | None = None, progress: Progress = lambda _done, _every: None,
-) -> tuple[Report, Path]:  # fmt: skip
+    name: str | Path,
+    quick: bool = False,
+    workers: int = 1,
+    resume: bool | None = None,
+    redraw: bool = False,
+    out: Path | None = None,
+    progress: Progress = lambda _done, _every: None,
+) -> tuple[Report, Path]:
     """Run a study; return its report and the folder with ``README.md``, ``metrics.json``, replicates and figures.
 
     Every replicate is a case, a table of plain values with the seed among them, so that results do not depend on who
@@ -296,9 +301,14 @@ def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> 
 
 
 def run_cases(
-    cases: Sequence[Mapping[str, Any]], work: Callable[[Mapping[str, Any]], Work], workers: int,
-    progress: Progress, journal: Path | None = None, code: Mapping[str, str] | None = None, resume: bool | None = True,
-) -> list[Row]:  # fmt: skip
+    cases: Sequence[Mapping[str, Any]],
+    work: Callable[[Mapping[str, Any]], Work],
+    workers: int,
+    progress: Progress,
+    journal: Path | None = None,
+    code: Mapping[str, str] | None = None,
+    resume: bool | None = True,
+) -> list[Row]:
     """Return every case with its figures, in the order of the cases.
 
     ``cases`` are plain tables, and ``work`` returns what computes one; ``workers`` is as `compute` has it,

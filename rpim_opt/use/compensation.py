@@ -394,9 +394,16 @@ class _Cell(NamedTuple):
 
     @classmethod
     def of(
-        cls, result: Calibration, which: str, robot: Robot, kind: Measurement, tool: Sequence[float] | Array | None,
-        marker: str, base: bool, torques: bool,
-    ) -> _Cell:  # fmt: skip
+        cls,
+        result: Calibration,
+        which: str,
+        robot: Robot,
+        kind: Measurement,
+        tool: Sequence[float] | Array | None,
+        marker: str,
+        base: bool,
+        torques: bool,
+    ) -> _Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
         p, x, covariance, marker, point = _tooled(result, which, tool, marker)
         values = p.values(x)

@@ -32,9 +32,15 @@ class Arm(NamedTuple):
 
     @classmethod
     def of(
-        cls, robot: Robot, values: Mapping[str, float], nominal: Mapping[str, float], tool: str, before: Array,
-        kind: Measurement, loads: Loads,
-    ) -> Arm:  # fmt: skip
+        cls,
+        robot: Robot,
+        values: Mapping[str, float],
+        nominal: Mapping[str, float],
+        tool: str,
+        before: Array,
+        kind: Measurement,
+        loads: Loads,
+    ) -> Arm:
         """Build the function from parameter values by name; gravity acts on the nominal ones."""
         command = loads.symbols(len(robot.joint_types), 1)
         y = ca.SX.sym("y", len(kind.columns))

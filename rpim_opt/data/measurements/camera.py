@@ -38,10 +38,19 @@ MOST = 300
 
 
 def pixels(
-    X: Any, Y: Any, Z: Any,
-    fx: Any, fy: Any, cx: Any, cy: Any,
-    k1: Any = 0.0, k2: Any = 0.0, p1: Any = 0.0, p2: Any = 0.0, k3: Any = 0.0,
-) -> tuple[Any, Any]:  # fmt: skip
+    X: Any,
+    Y: Any,
+    Z: Any,
+    fx: Any,
+    fy: Any,
+    cx: Any,
+    cy: Any,
+    k1: Any = 0.0,
+    k2: Any = 0.0,
+    p1: Any = 0.0,
+    p2: Any = 0.0,
+    k3: Any = 0.0,
+) -> tuple[Any, Any]:
     """Return u and v [px] of a point in the camera's frame, x right, y down, z forwards; symbols, numbers or arrays.
 
     With x = X / Z, y = Y / Z and r^2 = x^2 + y^2 (Brown and Conrady)::

@@ -93,9 +93,13 @@ class Understood:
 
 
 def understand(
-    raw: RawTable, robot: Robot, kind: Measurement, options: TableOptions | None = None,
-    joints: Sequence[str] = (), targets: bool = False,
-) -> Understood:  # fmt: skip
+    raw: RawTable,
+    robot: Robot,
+    kind: Measurement,
+    options: TableOptions | None = None,
+    joints: Sequence[str] = (),
+    targets: bool = False,
+) -> Understood:
     """Interpret a raw table for a robot and a measurement type, with the names that `read_data` takes.
 
     Names that it takes already stay; others are recognized where they can mean one thing only (`names`). What is not
@@ -373,9 +377,12 @@ def _leave_out(read: Readings, targets: bool) -> None:
 
 
 def _under_our_names(
-    table: Columns, read: Readings, kind: Measurement,
-    known: Mapping[str, Sequence[str]], units: Mapping[str, tuple[str, str]],
-) -> tuple[dict[str, Sequence[Any]], list[Meant]]:  # fmt: skip
+    table: Columns,
+    read: Readings,
+    kind: Measurement,
+    known: Mapping[str, Sequence[str]],
+    units: Mapping[str, tuple[str, str]],
+) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
     """Return the columns with canonical names and units, and the meaning of every column.
 
     ``units`` are those of columns whose name has none, by stem or dimension, and where they are stated.

@@ -63,9 +63,14 @@ class CertifiedStart:
 
 @one_blas_thread
 def certified_hand_eye(
-    flange: Array, measured: Array, *, sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
-    expected: Place = (0, 0, 0), spread: float = np.inf, loss: str = "squares",
-) -> CertifiedStart:  # fmt: skip
+    flange: Array,
+    measured: Array,
+    *,
+    sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
+    expected: Place = (0, 0, 0),
+    spread: float = np.inf,
+    loss: str = "squares",
+) -> CertifiedStart:
     """Return base Z and tool X of A X = Z B, measured_i = Z flange_i X, with an optimality certificate.
 
     ::

@@ -152,9 +152,12 @@ MISPLACED = 3.0  # how many scales a frame may be from where it is stated before
 
 
 def problem_from(
-    robot: Robot | Described | str | Path, data: Dataset, identify: Iterable[str] = "auto",
-    base: ArrayLike | Literal["auto"] = "auto", tool: ArrayLike | None = None,
-) -> CalibrationProblem:  # fmt: skip
+    robot: Robot | Described | str | Path,
+    data: Dataset,
+    identify: Iterable[str] = "auto",
+    base: ArrayLike | Literal["auto"] = "auto",
+    tool: ArrayLike | None = None,
+) -> CalibrationProblem:
     """Return the problem of a robot and its measurements, base and tool located in closed form.
 
     The ``robot`` is the nominal one, what `read_urdf` returns, a file that describes one, or the name of a ready robot;
@@ -209,9 +212,14 @@ TRIMMED, STEPS, GROSS = 3, 30, 5.0
 
 
 def starting_parameters(
-    robot: Robot, data: Dataset, base: Place | None = (0.0,) * 6, tools: Mapping[str, Place] | None = None,
-    own: Mapping[str, float] | None = None, temperature: float | None = None, sessions: Sequence[str] = (),
-) -> Parameters:  # fmt: skip
+    robot: Robot,
+    data: Dataset,
+    base: Place | None = (0.0,) * 6,
+    tools: Mapping[str, Place] | None = None,
+    own: Mapping[str, float] | None = None,
+    temperature: float | None = None,
+    sessions: Sequence[str] = (),
+) -> Parameters:
     """Return the model's parameters with closed-form values for what is not stated; none identified yet.
 
     ``base`` (6,) is the robot's in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad]; None for registration.

@@ -129,9 +129,14 @@ def remembered_ends(path: str | Path, robot: Robot) -> tuple[str | None, str | N
 
 @of_file
 def write_urdf(
-    source: str | Path, robot: Robot, target: str | Path, base: str | None = None, tip: str | None = None,
-    base_frame: Array | None = None, tool_frame: Array | None = None,
-) -> None:  # fmt: skip
+    source: str | Path,
+    robot: Robot,
+    target: str | Path,
+    base: str | None = None,
+    tip: str | None = None,
+    base_frame: Array | None = None,
+    tool_frame: Array | None = None,
+) -> None:
     """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
 
     ``source`` is the original; its `read_urdf` with the same ``base`` and ``tip`` has to be the robot whose parameters
