@@ -210,9 +210,10 @@ def least_between(score: Score, weights: Array, best: int, ratio: float = 1 + 1e
 
 
 def searched(score: Score, grid: Array, begin: Score | None = None) -> tuple[Array, Array, int]:
-    """Return weights (K,), their scores and the index of the smallest, known to a ratio of `SAME_WEIGHT`.
+    """Return weights (K,), their scores and the index of the smallest, known to a ratio of `SAME_WEIGHT` either way.
 
-    A coarse grid tells where to search: by the scores, or by cheaper ones, ``begin``.
+    A coarse grid tells where to search: by the scores, or by cheaper ones, ``begin``; scores that fall towards an end
+    of what was searched are followed.
     """
     tried: dict[float, float] = {}
 
@@ -226,7 +227,7 @@ def searched(score: Score, grid: Array, begin: Score | None = None) -> tuple[Arr
     while True:
         if grid[centre] not in tried:
             recorded(grid[[centre]])
-        least_between(recorded, grid, centre, SAME_WEIGHT)
+        least_between(recorded, grid, centre, SAME_WEIGHT**2)
         weights = np.array(sorted(tried))
         scores = np.array([tried[weight] for weight in weights])
         best = int(np.nanargmin(scores))
