@@ -139,3 +139,8 @@ def test_a_loss_over_triangles_is_a_sum_of_squares_and_its_maker() -> None:
     assert squares is not None
     assert (squares.loss, squares.over, squares.before) == (ro.robust.loss, "configuration", None)
     assert squares.after(Z).before is Z
+
+
+def test_a_length_of_norms_is_that_of_the_residual() -> None:
+    solved, squares = in_blocks(ro.Formulation("norms", loss=cp.sum_squares, loss_over="configuration"))
+    assert (solved.loss_over, squares) == ("equation", None)

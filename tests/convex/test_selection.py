@@ -204,3 +204,14 @@ def test_a_tiny_weight_of_redundant_parameters_is_no_failure() -> None:
     program = ro.convex.pose(absolute, m.scaled(np.where(m.group == 19, 0.0, 1.0)))
     path = program.path(np.geomspace(1e-12, 1e-6, 13))
     assert np.ptp([estimate.objective for estimate in path]) < 1e-4
+
+
+def test_a_rule_reads_a_penalty_with_own_variables_beside_a_robust_loss() -> None:
+    def nearest_shift(z: Any) -> Any:
+        shift = cp.Variable()
+        return cp.sum_squares(z - shift) + cp.square(shift)
+
+    mine = ro.Formulation("shifted", loss=ro.huber(1.5), penalty=nearest_shift)
+    program = ro.convex.pose(mine, model(condition=30.0).scaled(np.full(30, 3.0)))
+    program.value(np.ones(program.structure.n))  # asked for own variables of the loss as it is
+    assert ro.l_curve(program).weight > 0
