@@ -126,8 +126,9 @@ class Box:
         """Return the CVXPY constraints."""
         lower, upper = self.bounds(parameters)
         fixed, low, high = (np.flatnonzero(side) for side in box_sides(lower, upper))
-        made = [z[fixed] == lower[fixed], z[low] >= lower[low], z[high] <= upper[high]]
-        return [each for each in made if each.size]
+        made = [z[fixed] == lower[fixed]] if len(fixed) else []  # CVXPY before 1.8 knows no empty expression
+        made += [z[low] >= lower[low]] if len(low) else []
+        return [*made, z[high] <= upper[high]] if len(high) else made
 
 
 def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
