@@ -212,13 +212,15 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
         added = {name: (kind, Tables._field_defaults[name]) for name, kind in Tables.__annotations__.items()}
     if function.__name__ not in CODELESS:
         added["allow_code"] = Code, False
-    added["as_json"] = Json, False
+    if "as_json" not in own:  # which some commands need while they run
+        added["as_json"] = Json, False
     options = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in own.values() if each.annotation is not Tables]
     for name, (kind, default) in added.items():
         options.append(Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default))
 
     @wraps(function)
-    def run(as_json: bool, allow_code: bool = False, **values: Any) -> None:
+    def run(allow_code: bool = False, **values: Any) -> None:
+        as_json = values["as_json"] if "as_json" in own else values.pop("as_json")
         if "tables" in own:
             values["tables"] = Tables(**{name: values.pop(name) for name in Tables._fields})
         answer = function(**values)
@@ -258,6 +260,7 @@ def new(
     chain: Chain = "",
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
+    as_json: Json = False,
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
@@ -273,7 +276,7 @@ def new(
             made = ro.store.new_problem(
                 folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
                 seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
-                understood=None if "--json" in sys.argv else lambda found: console.show(f"{found}\n"),
+                understood=None if as_json else lambda found: console.show(f"{found}\n"),
             )  # fmt: skip
     document = made.understood.content()
     document["notes"] += made.notes
@@ -469,9 +472,13 @@ def update(
     with _loaded(result) as (loaded, say):
         read = tables.read(loaded, data)
         recalibration = ro.use.update(
-            loaded, read.data, prior_inflation=prior_inflation, reset=reset.replace(",", " ").split(),
-            source=source or ", ".join(file.name for file in data), progress=say,
-        )  # fmt: skip
+            loaded,
+            read.data,
+            prior_inflation=prior_inflation,
+            reset=reset.replace(",", " ").split(),
+            source=source or ", ".join(file.name for file in data),
+            progress=say,
+        )
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
     failed = not (recalibration.explained and updated.verdict.delivered)
@@ -637,6 +644,7 @@ def study(
     redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from stored replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
+    as_json: Json = False,
 ) -> Answer:
     """Run a study: replicates in parallel, resumable, with provenance in the results.
 
@@ -644,13 +652,13 @@ def study(
     """
     from rpim_opt.study.studies import regressions, run_study
 
-    with progress_bar(name, "--json" not in sys.argv) as say:
+    with progress_bar(name, not as_json) as say:
         report, folder = run_study(name, quick, workers, resume, redraw, out, progress=say)
     worse = regressions(name, quick, report.metrics) if gate else []
     document = {"report": report.text, "metrics": report.metrics, "worse": worse}
     answer = Answer(f"{report.text}\n", document, written=[folder])
     if worse:
-        answer.show("--json" in sys.argv)
+        answer.show(as_json)
         console.fail("\n".join(f"Worse: {line}" for line in worse), 1)
     return answer
 
@@ -670,6 +678,7 @@ def compare(
     workers: Workers = 1,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,
+    as_json: Json = False,
 ) -> Answer:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
@@ -682,7 +691,7 @@ def compare(
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
         counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
-        workers=workers, journal=journal, resume=resume, progress="--json" not in sys.argv,
+        workers=workers, journal=journal, resume=resume, progress=not as_json,
     )  # fmt: skip
     summary = comparison.summary(against=against)
     written: list[Path] = []

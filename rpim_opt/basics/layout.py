@@ -448,39 +448,54 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point; others as is."""
-    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
     axis = next((name for name, cells in table.columns.items() if {str(c).lower() for c in cells} == set("xyz")), "")
     if not axis:
         return table
-    letters = [cell.lower() for cell in texts.pop(axis)]
-    for name, cells in texts.items():  # P1.X names the coordinate besides
-        pairs = zip(cells, letters, strict=True)
-        named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
-        texts[name] = [match[1] for match in named if match] if all(named) else cells
+    letters = [str(cell).strip().lower() for cell in table.columns[axis]]
+    texts = {
+        name: _without_letters([str(cell).strip() for cell in cells], letters)
+        for name, cells in table.columns.items()
+        if name != axis
+    }
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
         accepted = "a column naming the point; x, y, z once each"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
     columns: dict[str, Sequence[Any]] = {}
-    values = []
     for name, cells in texts.items():
         own = [{cells[i] for i in rows.values()} for rows in points]
         if all(len(each) == 1 for each in own):
             columns[name] = [each.pop() for each in own]
-        elif _is_numeric(cells):
-            values.append(name)
-    measured = [name for name in values if VALUE.search(name)] or values
-    if len(measured) != 1:
-        found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
-        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
-    (value,) = measured
-    units = {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
-    unit = split(value)[1] or (units.pop() if len(units) == 1 else "")
+    value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
+    unit = _unit_beside(value, columns)
     for letter in "xyz":
         cells = [texts[value][rows[letter]] if letter in rows else "" for rows in points]
         columns[_with_unit(letter, unit)] = cells
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
+
+
+def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
+    """Return the names of points where every cell names the coordinate besides, ``P1.X``; others as they are."""
+    pairs = zip(cells, letters, strict=True)
+    named = [re.fullmatch(rf"(.+?)[\s._:-]+{letter}", cell, re.IGNORECASE) for cell, letter in pairs]
+    return [match[1] for match in named if match] if all(named) else cells
+
+
+def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
+    """Return the only column of numbers, or the only one of these that says so."""
+    numeric = [name for name, cells in columns.items() if _is_numeric(cells)]
+    measured = [name for name in numeric if VALUE.search(name)] or numeric
+    if len(measured) != 1:
+        found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
+        raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
+    return measured[0]
+
+
+def _unit_beside(value: str, columns: Mapping[str, Sequence[str]]) -> str:
+    """Return the unit of a column of values: in its name, or that which another column has in every row."""
+    units = {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
+    return split(value)[1] or (units.pop() if len(units) == 1 else "")
 
 
 def _points(names: Sequence[str], letters: Sequence[str]) -> list[dict[str, int]]:

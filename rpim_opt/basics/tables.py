@@ -183,10 +183,10 @@ def array_columns(path: Path) -> Columns:
             with np.load(path, allow_pickle=False) as file:
                 arrays = {name: np.atleast_2d(file[name].T).T for name in file.files if file[name].dtype.kind == "f"}
         else:
-            sizes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind in ("double", "single")}
-            _require_few(sum(map(math.prod, sizes.values())))
-            arrays = scipy.io.loadmat(path, variable_names=list(sizes)) if sizes else {}
-            arrays = {name: arrays[name] for name in sizes}
+            shapes = {name: shape for name, shape, kind in scipy.io.whosmat(path) if kind in ("double", "single")}
+            _require_few(sum(map(math.prod, shapes.values())))
+            arrays = scipy.io.loadmat(path, variable_names=list(shapes)) if shapes else {}
+            arrays = {name: arrays[name] for name in shapes}
     except (OSError, ValueError, TypeError, NotImplementedError, MemoryError, BadZipFile) as error:
         raise InputError("the file", _first_line(error), accepted) from None
     rows = Counter(len(array) for array in arrays.values() if array.ndim == 2 and len(array) > 1)
@@ -280,8 +280,9 @@ def _separator(text: str) -> str:
     best = max(parted, key=parted.__getitem__)
     if blanks > BLANKS_CLEARLY * parted[best]:
         return " "
-    # a header may be so wide that no row is seen
-    return best if parted[best] else max(parted, key=lambda mark: sum(map(len, rows[mark])))
+    if not parted[best]:  # a header so wide that no row is seen
+        best = max(parted, key=lambda mark: sum(map(len, rows[mark])))
+    return best
 
 
 def _parted(row: Sequence[str]) -> int:

@@ -140,12 +140,15 @@ class Tabled(Brief):
 
 
 def _cell(value: Any) -> str:
+    if value is None:
+        return ""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
     if isinstance(value, float):
         return f"{value:.6g}"
     if isinstance(value, list | tuple):
         return ", ".join(map(_cell, value))
-    known = {"None": "", "True": "yes", "False": "no"}
-    return known.get(str(value), str(value))
+    return str(value)
 
 
 Progress = Callable[[int, int], None]  # receives how many of how many are done

@@ -158,9 +158,14 @@ def calibrate(
         if elsewhere is not None:
             notes, problem = _displaced_frames(problem, elsewhere), elsewhere
     again: Callable[[Source], Calibration] = partial(
-        calibrate, formulation=formulation, weight=weight, prior=prior, model=model, noise=noise,
+        calibrate,
+        formulation=formulation,
+        weight=weight,
+        prior=prior,
+        model=model,
+        noise=noise,
         **(vars(options) | {"progress": None}),
-    )  # fmt: skip
+    )
     if weight is None and formulation.penalty is None:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
@@ -184,11 +189,21 @@ def calibrate(
     message = " ".join([ending(ended, max_iterations), *notes, *_contradicted(prior or Prior(), problem, ended.x)])
     LOGGER.info(message)
     return Calibration(
-        problem=problem, formulation=formulation, x=ended.x, weight=choice.weight, selection=choice.selection,
-        converged=ended.converged, message=message, history=ended.state.history, program=ended.state.program,
-        certificate=ended.certificate, asked=mapped_as(mapping, again, notes), learned=learned, mapping=mapping,
+        problem=problem,
+        formulation=formulation,
+        x=ended.x,
+        weight=choice.weight,
+        selection=choice.selection,
+        converged=ended.converged,
+        message=message,
+        history=ended.state.history,
+        program=ended.state.program,
+        certificate=ended.certificate,
+        asked=mapped_as(mapping, again, notes),
+        learned=learned,
+        mapping=mapping,
         excluded=excluded,
-    )  # fmt: skip
+    )
 
 
 def ending(ended: Ended, most: int) -> str:

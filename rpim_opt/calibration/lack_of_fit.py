@@ -189,9 +189,12 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     compared = Comparison(result)
     problem, dimension = compared.problem, compared.dimension
     known: dict[str, Any] = {
-        "configurations": compared.configurations, "equations": len(compared.row), "spare": compared.spare,
-        "dimension": dimension, "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
-    }  # fmt: skip
+        "configurations": compared.configurations,
+        "equations": len(compared.row),
+        "spare": compared.spare,
+        "dimension": dimension,
+        "left": float(np.sqrt(np.nanmean(problem.errors(result.x, dimension) ** 2))),
+    }
     if compared.spare < FEWEST:
         return LackOfFit(**known)
     best = compared.best
@@ -218,12 +221,19 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     except InputError:  # no covariance
         overstated = False
     return LackOfFit(
-        **known, repeatable=float(np.sqrt(share * total)), missing=best.extensions,
+        **known,
+        repeatable=float(np.sqrt(share * total)),
+        missing=best.extensions,
         parameters=tuple(p for extension in best.extensions for p in EXTENSIONS[extension].identify),
-        gain=compared.plain.point.value - best.point.value, share=share, present=present,
-        alike=_residual_autocorrelation(compared, best), upward=_upward(compared, present), repeated=again,
-        excess=excess, overstated=overstated,
-    )  # fmt: skip
+        gain=compared.plain.point.value - best.point.value,
+        share=share,
+        present=present,
+        alike=_residual_autocorrelation(compared, best),
+        upward=_upward(compared, present),
+        repeated=again,
+        excess=excess,
+        overstated=overstated,
+    )
 
 
 def judged(result: Outcome) -> LackOfFit | None:

@@ -128,11 +128,16 @@ def influence(result: Outcome) -> Influence:
     spread = np.sqrt(variance * np.sum((A @ T @ T.T) ** 2, axis=0))
     spread[spread < UNIDENTIFIABLE] = 0.0
     return Influence(
-        label=tuple(first_label[number] for number in numbers), configuration=numbers, parameters=free.names,
-        dimensions=free.dimensions, leverage=leverage,
+        label=tuple(first_label[number] for number in numbers),
+        configuration=numbers,
+        parameters=free.names,
+        dimensions=free.dimensions,
+        leverage=leverage,
         cook=np.sum((change @ A.T) ** 2, axis=1) / (max(used, TINY) * max(variance, TINY)),
-        change=change * free.scale, deviation=spread * free.scale, weight=np.bincount(which, weight) / equations,
-    )  # fmt: skip
+        change=change * free.scale,
+        deviation=spread * free.scale,
+        weight=np.bincount(which, weight) / equations,
+    )
 
 
 def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:

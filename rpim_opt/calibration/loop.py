@@ -431,10 +431,15 @@ class Loop:
             after = candidate.objective(z, state.choice.weight)
         passed = Iteration(after, length, state.choice.weight, state.damping)
         there = replace(
-            state, z=z, program=candidate, merit=after, refused=0, history=(*state.history, passed),
+            state,
+            z=z,
+            program=candidate,
+            merit=after,
+            refused=0,
+            history=(*state.history, passed),
             size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
             outcome="rest" if state.choice.settled and short else "",
-        )  # fmt: skip
+        )
         return replace(there, choice=state.choice.after(there.relative(length)))
 
     def _accuracy(self, state: State) -> tuple[float, float]:

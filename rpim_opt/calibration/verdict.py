@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
 
@@ -322,53 +322,75 @@ def likely_causes(result: Outcome) -> list[str]:
     if not result.problem.keeps_rows:
         return []
     problem = cast(CalibrationProblem, result.problem)
-    learned, free = result.learned, problem.parameters.free
-    shared = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
-    if learned is not None:
-        shared += diagnosis.left_out_together(problem.labels, {row.label for row in learned.left_out})
-    if result.mapping is not None:
-        shared += result.mapping.ambiguities
     kept = kept_rows(result)
     residuals = residual_rms(result, kept)
-    signs = []
-    for dimension, (size, ratio) in residuals.items():
-        unit, si = UNITS[dimension]
-        if ratio > NOISY:
-            signs.append(f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the stated noise")
-    if learned is not None and learned.curves is not None:  # beyond those of gears, or no transmission errors at all
-        size, ratio = learned.curves.size.value, result.noise_test().ratio
-        if size > LARGEST_CURVE:
-            signs.append(f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)")
-        if ratio > NOISY:
-            noise = f"{three_digits(ratio)} times the stated noise"
-            signs.append(f"residuals {noise}, counting the degrees of freedom of transmission errors")
-    # no nominal model is as wrong as that; an estimated scale is not the expected one
-    expected = free.scale if learned is None else learned.stated
-    largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
-    share = np.abs(result.x) / np.maximum(largest, SCALES * expected)
-    share[problem.parameters.of_frames[problem.parameters.identified]] = 0.0
-    worst = int(np.argmax(share))
-    if share[worst] > 1:
-        unit = "mm" if free.dimensions[worst] == "length" else "mrad"
-        signs.append(f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}")
+    noticed = max(ratio for _, ratio in residuals.values()) > NOTICED
+    signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = _in_table_order(result, problem)
-    noticed = max(ratio for _, ratio in residuals.values())
-    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames  # an arm is machined better
-    another = bool((np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any()) and len(problem.arms) == 1
     if signs or not result.converged:
         causes = [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
-    elif another and (other := sibling(problem)) is not None:
+    elif (other := _other_robot(result, problem)) is not None:
         causes = [other.sentence]
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
-        if not causes and noticed > NOTICED and len(problem.arms) == 1:
+        if not causes and noticed and len(problem.arms) == 1:
             causes = list(diagnosis.shown_by_residuals(_without_outliers(result, ordered), result.x))
-    if noticed > NOTICED:
+    if noticed:
         causes += _upward(result)
+    shared = _of_any_fit(result, problem)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
-    return [*head, NOTHING] if noticed > HOPELESS else []
+    return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []
+
+
+def _of_any_fit(result: Outcome, problem: CalibrationProblem) -> list[str]:
+    """Return what is said however good a fit is: of rows that are there twice, left out together, or told apart."""
+    said = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
+    if result.learned is not None:
+        said += diagnosis.left_out_together(problem.labels, {row.label for row in result.learned.left_out})
+    if result.mapping is not None:
+        said += result.mapping.ambiguities
+    return said
+
+
+def _large_residuals(result: Outcome, residuals: Mapping[str, tuple[float, float]]) -> Iterator[str]:
+    """Say which residuals are beyond the stated noise, and which transmission errors beyond those of gears."""
+    for dimension, (size, ratio) in residuals.items():
+        unit, si = UNITS[dimension]
+        if ratio > NOISY:
+            yield f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the stated noise"
+    if result.learned is None or result.learned.curves is None:
+        return
+    size, ratio = result.learned.curves.size.value, result.noise_test().ratio
+    if size > LARGEST_CURVE:
+        yield f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)"
+    if ratio > NOISY:
+        noise = f"{three_digits(ratio)} times the stated noise"
+        yield f"residuals {noise}, counting the degrees of freedom of transmission errors"
+
+
+def _large_deviations(result: Outcome) -> Iterator[str]:
+    """Say which parameter of the robot deviates most, where no nominal model is as wrong as that."""
+    parameters = result.problem.parameters
+    free = parameters.free
+    expected = free.scale if result.learned is None else result.learned.stated  # an estimated scale is no expectation
+    largest = np.array([LARGEST.get(dimension, np.inf) for dimension in free.dimensions])
+    share = np.abs(result.x) / np.maximum(largest, SCALES * expected)
+    share[parameters.of_frames[parameters.identified]] = 0.0
+    worst = int(np.argmax(share))
+    if share[worst] > 1:
+        unit = "mm" if free.dimensions[worst] == "length" else "mrad"
+        yield f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}"
+
+
+def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
+    """Return the ready robot that fits far better, sought where a length of the arm is not machined as stated."""
+    free = problem.parameters.free
+    lengths = (np.array(free.dimensions) == "length") & ~free.of_frames
+    if len(problem.arms) > 1 or not (np.abs(result.x[lengths]) > UNUSUAL_LENGTH).any():
+        return None
+    return sibling(problem)
 
 
 def _upward(result: Outcome) -> list[str]:

@@ -204,12 +204,12 @@ class Program(Brief):
     def _rows(self) -> Rows:
         """The equations in the order in which the solver has them."""
         A, b = self.rows
-        sizes = None
+        counts = None
         if self.structure.over_norms:
-            order, sizes = np.argsort(self.structure.groups, kind="stable"), np.bincount(self.structure.groups)
+            order, counts = np.argsort(self.structure.groups, kind="stable"), np.bincount(self.structure.groups)
             A, b = A[order], b[order]
         model = self.model if self.loss_form is None else self.squared
-        return Rows(A, b, sizes, model.triangle)
+        return Rows(A, b, counts, model.triangle)
 
     # --- values --------------------------------------------------------------------------------------------------
 

@@ -295,14 +295,19 @@ class Dataset(Tabled):
         rows = np.arange(N)
         names = _names(point, "point", N)
         block = Block(
-            measurement, q, y, _covariances(sigma, N, len(measurement.components)), rows, ("",) * measurement.points,
+            measurement,
+            q,
+            y,
+            _covariances(sigma, N, len(measurement.components)),
+            rows,
+            ("",) * measurement.points,
             torque=_beside(torque, "torque", q),
             payload=_beside(payload, "payload", rows),
             approach=_beside(approach, "approach", q),
             columns={name: _beside(values, f"column {name}", rows) for name, values in columns.items()},
             point=None if names is None else names[:, None],
             session=named_sessions(session, N),
-        )  # fmt: skip
+        )
         return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
 
     @classmethod

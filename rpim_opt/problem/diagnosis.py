@@ -1004,8 +1004,8 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
         if left < best and apart.min() >= 1e3 * LOOSE:
             best = left
             units = ["mrad" if free.dimensions[k] == "angle" else "mm" for k in numbers]
-            sizes = [f"joint {some[k][0]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]
-            said = f"either of two positions in every row, {joined(sizes)} apart"
+            steps = [f"joint {some[k][0]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]
+            said = f"either of two positions in every row, {joined(steps)} apart"
     if said:
         yield (
             f"{said}, explains the residuals (that leaves {100 * best:.0f} %): backlash; approach all rows from one "

@@ -259,11 +259,15 @@ def _parameters(content: Content) -> Iterator[Block]:
         if free.of_curves[i]:
             continue
         _, si = display(free.dimensions[i])
-        marks = f"{', at its bound' * (row['name'] in at_bound)}{' *' * words.rotated(row)}"
+        name = f"{row['name']} [{row['unit']}]"
+        if row["name"] in at_bound:
+            name += ", at its bound"
+        if words.rotated(row):
+            name += " *"
         expanded = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
         bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
         figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
-        rows.append([f"{row['name']} [{row['unit']}]{marks}", *figures, expanded, bound][:columns])
+        rows.append([name, *figures, expanded, bound][:columns])
     yield "text", words.weight_lines(result)
     yield "text", [note, *words.turned_frames(result)]
     own = np.array(free.dimensions)[~free.of_frames & ~free.of_curves]

@@ -146,17 +146,30 @@ def load(
     used = {path.name: path, robot.name: robot} | {file: path.parent / file for file in named} | table.prior.files(path)
     digests = {name: sha256_of(file) for name, file in used.items()}
     record = Record(
-        title=table.title, source=table.source, validation=validation, excluded=table.exclude,
+        title=table.title,
+        source=table.source,
+        validation=validation,
+        excluded=table.exclude,
         files=digests | {f"{name} (raw data)": digest for name, digest in table.raw.items()},
-        simulated=bool(table.simulation), noise_assumed=table.noise_assumed, details=details, requirement=requirement,
-        reading=table.reading, terms=tuple(table.terms) if model is None else (),
-    )  # fmt: skip
+        simulated=bool(table.simulation),
+        noise_assumed=table.noise_assumed,
+        details=details,
+        requirement=requirement,
+        reading=table.reading,
+        terms=tuple(table.terms) if model is None else (),
+    )
     return Instance(
-        problem, formulation, problem_file.named_weight(table.selector, path), prior, table.model,
-        noise=table.repeatability if isinstance(table.repeatability, str) else "declared", record=record,
+        problem,
+        formulation,
+        problem_file.named_weight(table.selector, path),
+        prior,
+        table.model,
+        noise=table.repeatability if isinstance(table.repeatability, str) else "declared",
+        record=record,
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
-        reference={key: (value, spread) for key, (value, spread) in table.reference.items()}, held_out=table.held_out,
-    )  # fmt: skip
+        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
+        held_out=table.held_out,
+    )
 
 
 def _of_chains(stated: problem_file.ProblemFile, parts: Mapping[str, Instance]) -> Instance:

@@ -124,8 +124,6 @@ def new_problem(
     counts = {name: len(next(iter(each.values()), ())) for name, each in tables.items()}
     tables = {name: each for name, each in tables.items() if counts[name]}
     noise = usual_noise(kind)
-    supplied = [*paths, *later]
-    several = len({file.name for file in supplied}) < len(supplied)  # of one name: then by their paths
     with in_file(understanding.file):
         text, guessed = _problem_text(
             arm, kind, rows.take(np.flatnonzero(~held)), chain, noise=noise, first=not before, source=source,
@@ -133,31 +131,32 @@ def new_problem(
             identification=identified, columns=how, data=paths[0].name, validation=validated, held_out=held.any(),
             seed=seed, validated_by=next((file.name for file in later), ""),
             assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
-            raw={str(file) if several else file.name: files.sha256_of(file) for file in supplied},
+            raw=_digests([*paths, *later]),
             reading=replace(understanding.options, joints=arm.names).texts(),
         )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
     contents["problem.toml"] = before + text.encode()
     if before:
         files.write_files({folder / name: content for name, content in contents.items()})
+        of_chain = [SHARED]
     else:
         _write_whole(folder, contents, arm, source, bool(chain))
+        added = f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}."
+        of_chain = [added] if chain else []
+    notes = (f"Measurement {kind.name}: {how}.", guessed, *_remarks(arm, source, understanding, noise), *of_chain)
+    return Started(folder, {name: counts[name] for name in tables}, notes, replace(understanding, kind=kind))
+
+
+def _digests(supplied: Sequence[Path]) -> dict[str, str]:
+    """Return the SHA-256 of files by their names, or by their paths where two have one name."""
+    several = len({file.name for file in supplied}) < len(supplied)
+    return {str(file) if several else file.name: files.sha256_of(file) for file in supplied}
+
+
+def _remarks(arm: Described, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
+    """Yield the assumed noise, where the flange frame of a converted table is, and joint values of no joint."""
     assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
-    notes = [
-        f"Measurement {kind.name}: {how}.",
-        guessed,
-        f"Assumed measurement noise (1 sigma) where no column states it: {assumed}, in [noise] of problem.toml.",
-        *_remarks(arm, source, understanding),
-    ]
-    if before:
-        notes.append(SHARED)
-    elif chain:
-        notes.append(f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}.")
-    return Started(folder, {name: counts[name] for name in tables}, tuple(notes), replace(understanding, kind=kind))
-
-
-def _remarks(arm: Described, source: Path, understanding: Understanding) -> Iterator[str]:
-    """Yield where the flange frame of a converted DH table is, and which joint values are of no joint."""
+    yield f"Assumed measurement noise (1 sigma) where no column states it: {assumed}, in [noise] of problem.toml."
     if arm.tool.any():  # of a URDF, or of a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         yield (
@@ -327,12 +326,21 @@ def _problem_text(arm: Described, kind: Measurement, rows: Dataset, chain: str, 
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
     template.filters |= {"toml": toml, "key": _key, "frame": _frame}
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
-        **context, chain=chain, robot=robot, kind=kind, rows=rows, how=how, markers=markers, tool=arm.tool,
-        cameras=cameras, touched=list(dict.fromkeys(touched))[:2], base=None if base is None else _frame(base),
+        **context,
+        chain=chain,
+        robot=robot,
+        kind=kind,
+        rows=rows,
+        how=how,
+        markers=markers,
+        tool=arm.tool,
+        cameras=cameras,
+        touched=list(dict.fromkeys(touched))[:2],
+        base=None if base is None else _frame(base),
         mounting=known.get(robot.gravity.direction, list(robot.gravity.direction)),
         followers=[i for i in range(1, len(robot.mdh) + 1) if i - 1 not in robot.leading],
         identify=_patterns(names, len(robot.mdh)),
-    )  # fmt: skip
+    )
     return text, how
 
 

@@ -222,14 +222,20 @@ def content(result: Calibration) -> dict[str, Any]:
     solvable = formulation_of("", functions).solvable
     arms = dict(result.problem.arms)
     stored = Stored(
-        **{name: getattr(result, name) for name in (*SHARED, *DERIVED)}, formulation=result.formulation.name,
-        definition=functions, inliers=None if solvable else _inliers(result),
+        **{name: getattr(result, name) for name in (*SHARED, *DERIVED)},
+        formulation=result.formulation.name,
+        definition=functions,
+        inliers=None if solvable else _inliers(result),
         forms=None if solvable else Forms(result.program.loss_form, result.program.penalty_form),
-        robots=arms, terms={name: _terms(robot.model, robot) for name, robot in arms.items()},
+        robots=arms,
+        terms={name: _terms(robot.model, robot) for name, robot in arms.items()},
         transmission=tuple(curve for robot in arms.values() for curve in robot.model.curves),
-        origins={name: carried_by(robot.model.terms) for name, robot in arms.items()}, rows=_rows(result),
-        model=result.problem.parameters, data=sets(result), repeatability=result.problem.repeatability,
-    )  # fmt: skip
+        origins={name: carried_by(robot.model.terms) for name, robot in arms.items()},
+        rows=_rows(result),
+        model=result.problem.parameters,
+        data=sets(result),
+        repeatability=result.problem.repeatability,
+    )
     parts = {
         "format": FORMAT,
         "version": VERSION,
@@ -369,10 +375,15 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
     extensions = "auto" if learned is not None and learned.trials else "geometry"
     asked = partial(calibrate, formulation=formulation, weight=weight, model=extensions)
     return Calibration(
-        problem, formulation, **{name: getattr(file, name) for name in SHARED}, program=program,
-        asked=mapped_as(file.mapping, asked), record=replace(file.record, validation=validation, digest=file.digest),
-        kept=None if formulation.solvable else _kept(file, program), known_causes=file.causes,
-    )  # fmt: skip
+        problem,
+        formulation,
+        **{name: getattr(file, name) for name in SHARED},
+        program=program,
+        asked=mapped_as(file.mapping, asked),
+        record=replace(file.record, validation=validation, digest=file.digest),
+        kept=None if formulation.solvable else _kept(file, program),
+        known_causes=file.causes,
+    )
 
 
 def _robot(name: str, file: Stored, models: Models) -> Robot:

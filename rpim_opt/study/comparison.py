@@ -27,6 +27,7 @@ from rpim_opt.study.methods import (
     UNCONVERGED,
     USUAL,
     WITH_FIGURES,
+    Problem,
     Row,
     methods_of,
     metrics_of,
@@ -116,11 +117,7 @@ def compare(
     ways = splits_of(splits)
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
-    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):
-        if seeds > MOST_DRAWS:
-            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
-        seeds = range(max(int(seeds), 0))
-    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
+    numbered = _seeds(seeds)
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
@@ -131,10 +128,7 @@ def compare(
     drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
     cases: list[Row] = []
     for (label, problem), (split, size), count, factor in product(asked.items(), ways.items(), sizes, factors):
-        # what no seed changes is there once
-        seeded = label in drawn or split != FOLDER or factor > 1
-        if count is not None and isinstance(problem, Instance):
-            seeded = seeded or count < len(np.unique(problem.problem.data.configuration))
+        seeded = split != FOLDER or factor > 1 or _varies(problem, count)
         folds = range(1, max(int(size), 1) + 1)
         for seed, fold, (name, method) in product(numbered if seeded else numbered[:1], folds, compared.items()):
             case = {"problem": label, "method": name, "formulation": method.formulation, "selector": method.selector}
@@ -149,13 +143,33 @@ def compare(
     with progress_bar("comparing", progress) as say:
         rows = studies.run_cases(cases, work, workers, say, path, code, resume)
     axes = {
-        "Problems": asked, "Methods": compared, "Held out": ways,
+        "Problems": asked,
+        "Methods": compared,
+        "Held out": ways,
         "Configurations": ["all" if count is None else str(count) for count in sizes],
-        "Noise factors": [f"{factor:g}" for factor in factors], "Seeds": map(str, numbered),
-        "Metrics": figured, "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
-    }  # fmt: skip
+        "Noise factors": [f"{factor:g}" for factor in factors],
+        "Seeds": map(str, numbered),
+        "Metrics": figured,
+        "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
+    }
     settings = {name: ", ".join(values) for name, values in axes.items() if values}
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
+
+
+def _seeds(stated: int | Iterable[int]) -> list[int]:
+    """Return seeds that are stated one by one, or by how many there are."""
+    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
+        if stated > MOST_DRAWS:
+            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
+        stated = range(max(int(stated), 0))
+    return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
+
+
+def _varies(problem: Problem, count: int | None) -> bool:
+    """Whether a seed changes the data: a generated problem's, or which configurations are drawn."""
+    if not isinstance(problem, Instance):
+        return True
+    return count is not None and count < len(np.unique(problem.problem.data.configuration))
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:

@@ -33,9 +33,9 @@ from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
 
 FALSE_ALARM = 0.01  # probability with which a robot that did not change is said to have changed, over all causes
-SIZES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
+MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
 UNCHANGED = 0.5  # prior probability that nothing changed; the other half is dealt out to the kinds of causes in use
-OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `SIZES`
+OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `MULTIPLES`
 UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do not observe a direction of a change
 MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
 SPARED = 0.25  # part of the readings that may be wrong
@@ -296,7 +296,7 @@ def posterior_as_prior(
     for i in [free.names.index(name) for name in released]:
         unit, si = display(free.dimensions[i])
         centre[f"{free.names[i]}_{unit}"] = float(x[i]) / si
-        scale[f"{free.names[i]}_{unit}"] = float(SIZES[-1] * widths[i]) / si  # so wide that readings alone decide
+        scale[f"{free.names[i]}_{unit}"] = float(MULTIPLES[-1] * widths[i]) / si  # so wide that readings alone decide
     prior = Prior(centre=centre, scale=scale)
     if len(released) < len(free):
         known = set(result.problem.parameters.free.names)
@@ -327,10 +327,13 @@ def _recalibrated(
     if learned is not None:
         more = problem.parameters.free.scale[len(learned.stated) :]
         learned = replace(
-            learned, left_out=(), notes=(), stated=np.append(learned.stated, more),
+            learned,
+            left_out=(),
+            notes=(),
+            stated=np.append(learned.stated, more),
             local=np.append(learned.local, np.ones(len(more))),
             drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
-        )  # fmt: skip
+        )
     return replace(updated, learned=learned, asked=partial(calibrate, formulation=formulation, weight=1.0))
 
 
@@ -434,15 +437,15 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
 
 
 def _log_bayes_factor(g: Array, G: Array, width: Array) -> float:
-    """Return ln of the Bayes factor for a change against none, of widths (p,) times each of `SIZES`.
+    """Return ln of the Bayes factor for a change against none, of widths (p,) times each of `MULTIPLES`.
 
     ::
 
         ln p(y | d ~ N(0, W^2)) / p(y | 0) = (g' (G + W^-2)^-1 g - ln det(I + W G W)) / 2
     """
     logs = []
-    for W in [size * width for size in SIZES]:
+    for W in [multiple * width for multiple in MULTIPLES]:
         inner = np.eye(len(g)) + W[:, None] * G * W
         squares = (W * g) @ np.linalg.solve(inner, W * g)
         logs.append(0.5 * (squares - np.linalg.slogdet(inner)[1]))
-    return float(logsumexp(logs) - np.log(len(SIZES)))
+    return float(logsumexp(logs) - np.log(len(MULTIPLES)))

@@ -333,12 +333,14 @@ class Point:
 class ReducedProgram:
     """minimize |R z - y|^2 + g'z + loss(A z - b) + weight * penalty(z) subject to constraints(z).
 
-    R has ``rows`` rows; ``loss`` is the form of rows that are taken as they are; ``sizes`` (N,) counts the equations
-    of norms that it gets.
+    R has ``rows`` rows; ``loss`` is the form of rows that are taken as they are; ``counts`` (N,) are the numbers of
+    equations of the norms that it gets.
     """
 
-    def __init__(self, canonical: Canonical, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None):
-        self.canonical, self.rows, self.loss, self.sizes = canonical, rows, loss, sizes
+    def __init__(
+        self, canonical: Canonical, rows: int, loss: Canonical | None = None, counts: np.ndarray | None = None
+    ):
+        self.canonical, self.rows, self.loss, self.counts = canonical, rows, loss, counts
         self.face = np.zeros(0, dtype=int)
         self.near = np.zeros(canonical.size)
 
@@ -395,7 +397,7 @@ class ReducedProgram:
     @cached_property
     def data(self) -> _ConicData:
         """Clarabel's data and solver."""
-        return _ConicData(self.canonical, self.rows, self.loss, self.sizes)
+        return _ConicData(self.canonical, self.rows, self.loss, self.counts)
 
     def _by_cones(
         self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
@@ -439,7 +441,7 @@ class _ConicData:
     (v_k, A_k z - b_k) in a second-order cone each, and that variables which both have are the same.
     """
 
-    def __init__(self, p: Canonical, k: int, loss: Canonical | None, sizes: np.ndarray | None):
+    def __init__(self, p: Canonical, k: int, loss: Canonical | None, counts: np.ndarray | None):
         clarabel = import_module("clarabel")
         cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.clarabel_cones]
         top, size = k + len(p.b), p.size + k
@@ -453,14 +455,14 @@ class _ConicData:
             entries += [_entries(loss.A, top, size)]
             curvature += [_entries(loss.P, size, size, upper=True)]
             begin = top + len(loss.b)
-            if sizes is None:
+            if counts is None:
                 links = begin + np.arange(len(loss.at))
                 cones += [clarabel.ZeroConeT(len(links))]
                 entries += [(links, size + loss.at, np.ones(len(links)))]
             else:
-                first = begin + np.cumsum(sizes + 1) - sizes - 1
-                links = np.setdiff1d(np.arange(begin, begin + int(np.sum(sizes + 1))), first)
-                cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in sizes]
+                first = begin + np.cumsum(counts + 1) - counts - 1
+                links = np.setdiff1d(np.arange(begin, begin + int(np.sum(counts + 1))), first)
+                cones += [clarabel.SecondOrderConeT(int(count) + 1) for count in counts]
                 entries += [(first, size + loss.at, -np.ones(len(first)))]
             dense += [_block(links, p.at)]
             same = links[-1] + 1 + np.arange(len(loss.shared))

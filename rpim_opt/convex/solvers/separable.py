@@ -38,7 +38,7 @@ NARROWEST = 1e-9
 """Smallest width, relative to the mean residual."""
 PROXIMAL = 1e-13
 """Weight of |z - z_k|^2 in a quadratic model, relative to its curvature."""
-UNSEEN = 1e-12
+VANISHED = 1e-12
 """Singular values of A below this part of the largest are rounding."""
 TINY = 1e-12
 """Norms are taken as no smaller."""
@@ -61,19 +61,20 @@ PROBES = 64
 class Rows:
     """Equations A z ~ b, (m, n) and (m,), with the QR factor of [A b], or of what a quadratic loss squares.
 
-    ``sizes`` (N,) counts the equations of configurations, which stand together; None where the loss gets equations.
+    ``counts`` (N,) are the numbers of equations of configurations, which stand together; None where the loss gets
+    equations.
     """
 
     A: Array
     b: Array
-    sizes: np.ndarray | None
+    counts: np.ndarray | None
     triangle: Array
 
     @cached_property
     def starts(self) -> np.ndarray:
         """First equation of every configuration (N,)."""
-        sizes: Any = self.sizes
-        return np.cumsum(sizes) - sizes
+        counts: Any = self.counts
+        return np.cumsum(counts) - counts
 
     @cached_property
     def squares(self) -> ReducedSquares:
@@ -86,27 +87,27 @@ class Rows:
         n = self.A.shape[1]
         _, s, V = np.linalg.svd(self.triangle[:, :n])
         V = V[: len(s)]
-        seen = s > UNSEEN * s[0]
+        seen = s > VANISHED * s[0]
         s, V = s[seen], V[seen]
         return self.A @ (V.T / s), s[:, None] * V
 
     def spread(self, v: Array) -> Array:
         """Return numbers of entries (N,) by equation (m,)."""
-        return v if self.sizes is None else np.repeat(v, self.sizes)
+        return v if self.counts is None else np.repeat(v, self.counts)
 
     def entries(self, r: Array) -> Array:
         """Return the argument of the loss for a residual (m,): the residual, or the norms of configurations (N,)."""
-        return r if self.sizes is None else np.sqrt(np.add.reduceat(r * r, self.starts))
+        return r if self.counts is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
     def alone(
         self, loss: Loss, which: np.ndarray, canonical: Canonical, squares: int
     ) -> tuple[ReducedProgram, Array, Array]:
         """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
-        sizes, places = None, which
-        if self.sizes is not None:
-            sizes = self.sizes[which]
-            places = np.concatenate([np.arange(int(self.sizes[i])) + self.starts[i] for i in which])
-        return ReducedProgram(canonical, squares, loss.some(which), sizes), self.A[places], self.b[places]
+        counts, places = None, which
+        if self.counts is not None:
+            counts = self.counts[which]
+            places = np.concatenate([np.arange(int(self.counts[i])) + self.starts[i] for i in which])
+        return ReducedProgram(canonical, squares, loss.some(which), counts), self.A[places], self.b[places]
 
 
 @dataclass(eq=False)
@@ -133,7 +134,7 @@ class Newton:
 
     def _slope(self, r: Array, h: float) -> Array:
         """Return the slope (m,) of the smoothed loss by residuals."""
-        if self.rows.sizes is None:
+        if self.rows.counts is None:
             return self.loss.smooth(r, h)[0] if h else self.loss.slope(r)
         v = np.sqrt(np.add.reduceat(r * r, self.rows.starts) + h * h)
         return self.rows.spread(self.loss.slope(v) / np.maximum(v, 1e-300)) * r
@@ -141,7 +142,7 @@ class Newton:
     def _model(self, r: Array, h: float, out: np.ndarray | None = None) -> tuple[Array, Array]:
         """Return gradient and Hessian of the smoothed loss by u = T z, without the entries ``out``."""
         U = self.rows.whitened[0]
-        if self.rows.sizes is None:
+        if self.rows.counts is None:
             slope, curvature = self.loss.smooth(r, h)
             if out is not None:
                 slope[out] = 0.0
@@ -287,7 +288,7 @@ class Newton:
 
     def _near(self, v: Array, h: float) -> np.ndarray:
         """Return the entries within h of a kink."""
-        if self.rows.sizes is None:
+        if self.rows.counts is None:
             rise = self.loss.slope(v + h) - self.loss.slope(v - h)
             return np.flatnonzero(rise > 0.1 * self.kink)
         rise = self.loss.slope(v + h) - self.loss.slope(np.maximum(v - h, -1e-12))

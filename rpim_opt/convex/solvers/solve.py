@@ -35,7 +35,7 @@ GAP = 1e-8
 
 @dataclass(eq=False)
 class WarmStart:
-    """Warm start of the next solution: point, smoothing width, sizes of working sets, Clarabel's data."""
+    """Warm start of the next solution: point, smoothing width, entries of working sets, Clarabel's data."""
 
     structure: Structure
     z: Array | None = None
@@ -52,11 +52,11 @@ class WarmStart:
         """Penalty and constraints in canonical form."""
         return self.structure.canonical
 
-    def program(self, rows: int, loss: Canonical | None = None, sizes: np.ndarray | None = None) -> ReducedProgram:
+    def program(self, rows: int, loss: Canonical | None = None, counts: np.ndarray | None = None) -> ReducedProgram:
         """Return the small program with so many rows of squares, and with all rows of a loss."""
         key = rows, loss is None
         if key not in self.small:
-            self.small[key] = ReducedProgram(self.canonical, rows, loss, sizes)
+            self.small[key] = ReducedProgram(self.canonical, rows, loss, counts)
         return self.small[key]
 
     def begin(self, z: Array) -> WarmStart:
@@ -74,7 +74,7 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     quadratic                    the small program of its QR factor
     separable, few entries       all rows as they are, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
-    separable, non-smooth        the same on the smoothed loss, then rows near kinks
+    separable, non-smooth        the same on the smoothed loss, then rows where it bends
     with a threshold             entries near a kink as they are, tangents of others
     any other                    all rows
     ============================ ===================================================
@@ -138,7 +138,7 @@ def _alone(n: int, damping: Damping | None) -> ReducedSquares:
 def _all_rows(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     """Return the minimum with all rows of the loss in Clarabel."""
     terms = _alone(rows.A.shape[1], damping)
-    whole = warm.program(len(terms.y), loss.canonical, rows.sizes if loss.positive else None)
+    whole = warm.program(len(terms.y), loss.canonical, rows.counts if loss.positive else None)
     return whole.solve(terms, weight, rows.A, rows.b)
 
 

@@ -177,10 +177,18 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
                 own[what] = np.concatenate(both, axis=1)
         covariance = each.sigma**2 * np.eye(len(each.measurement.components))[None]
         relation = replace(
-            first, measurement=each.measurement, y=np.array([[each.value]]), covariance=covariance, columns={}, **own,
-            row=np.array([len(data) + i]), markers=(*first.markers, *second.markers), fixture="", session=None,
+            first,
+            measurement=each.measurement,
+            y=np.array([[each.value]]),
+            covariance=covariance,
+            columns={},
+            **own,
+            row=np.array([len(data) + i]),
+            markers=(*first.markers, *second.markers),
+            fixture="",
+            session=None,
             point=np.array([each.between], dtype=object),
-        )  # fmt: skip
+        )
         blocks.append(relation)
         label = " to ".join(each.between)
         if label in labels:  # planes may have both an angle and a distance

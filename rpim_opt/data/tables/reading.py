@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, quantities, split_unit, with_unit
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.mdh import Robot
@@ -73,48 +73,74 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         y = kind.prepare(convert(_beside_each_other(columns, stems, N)))
     except RowError as error:
         raise error.named(f"row {label[error.row]}") from None
-    q = _of_joints("q", columns, robot, kind, N)
+    q, torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("q", "tau", "approach"))
     payload = columns.get(("payload", ""))
+    _require_states(payload, approach, label)
+    naming = _naming_column(table, kind)
+    whole = Dataset.of(
+        q,
+        y,
+        covariances(columns, declared, kind, y, label),
+        label,
+        kind,
+        torque=torque,
+        payload=payload,
+        approach=approach,
+        columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
+        session=texts(table.get("session", ()), "session"),
+        point=texts(table[naming], naming) if naming else (),
+    )
+    blocks = _by_markers(whole.blocks[0], table, kind, label)
+    data = Dataset(blocks, label, _configurations(table, q.reshape(N, -1)))
+    return data.grouped_by_points() if kind.touching else data
+
+
+def _require_states(payload: Array | None, approach: Array | None, label: Sequence[str]) -> None:
+    """Refuse negative payloads (N,) and directions (N, p, dof) that are none."""
     if payload is not None and payload.min() < 0:
         row = int(np.argmin(payload))
         raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
-    torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("tau", "approach"))
     if approach is not None:
         for row, point, joint in np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0))):
             where = f"row {label[row]}, column approach{joint + 1}"
             raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
-    naming = [column for column in kind.names if column in table]  # points that were touched, or that a camera sees
+
+
+def _naming_column(table: Columns, kind: Measurement) -> str:
+    """Return the column that names the points that were touched, or that a camera sees; empty without one."""
+    naming = [column for column in kind.names if column in table]
     if kind.touching and len(naming) != 1:
         accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: the touched point"
         raise InputError("the header", ", ".join(table), accepted)
-    further = {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
-    session, point = (texts(table.get(column, ()), column) for column in ("session", *(naming[:1] or ["point"])))
-    whole = Dataset.of(
-        q, y, covariances(columns, declared, kind, y, label), label, kind, torque=torque, payload=payload,
-        approach=approach, columns=further, session=session, point=point if naming else (),
-    )  # fmt: skip
+    return naming[0] if naming else ""
+
+
+def _configurations(table: Columns, joints: Array) -> np.ndarray:
+    """Return the configuration (N,) of every row: as stated, or rows of equal joint values (N, d) are one."""
+    if "configuration" in table:
+        return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
+    order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
+    configuration = np.empty(len(joints), dtype=int)
+    configuration[order] = np.cumsum(np.any(np.diff(joints[order], axis=0, prepend=joints[order[:1]]) != 0, axis=1))
+    return configuration
+
+
+def _by_markers(whole: Block, table: Columns, kind: Measurement, label: Sequence[str]) -> tuple[Block, ...]:
+    """Return a block's rows by reflectors and fixture, in the order of their first rows."""
+    N = len(label)
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     if kind.points == 2:
         for i, name in enumerate(label):
-            if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
+            if markers[0][i] == markers[1][i] and np.array_equal(whole.q[i, 0], whole.q[i, 1]):
                 found = "the same reflector twice in one configuration"
                 raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
-    if "configuration" in table:
-        configuration = np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
-    else:
-        joints = q.reshape(N, -1)
-        order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
-        configuration = np.empty(N, dtype=int)
-        configuration[order] = np.cumsum(np.any(np.diff(joints[order], axis=0, prepend=joints[order[:1]]) != 0, axis=1))
-    blocks = whole.blocks
-    if {"marker", "to_marker", "fixture"} & set(table):
-        groups: dict[tuple[str, ...], list[int]] = {}  # by reflectors and fixture, in the order of their first rows
-        for i, key in enumerate(zip(*markers, _names(table, ["fixture"], N), strict=True)):
-            groups.setdefault(key, []).append(i)
-        parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
-        blocks = tuple(replace(blocks[0].take(i, i), markers=tuple(names), fixture=place) for names, place, i in parts)
-    data = Dataset(blocks, label, configuration)
-    return data.grouped_by_points() if kind.touching else data
+    if not {"marker", "to_marker", "fixture"} & set(table):
+        return (whole,)
+    groups: dict[tuple[str, ...], list[int]] = {}
+    for i, key in enumerate(zip(*markers, _names(table, ["fixture"], N), strict=True)):
+        groups.setdefault(key, []).append(i)
+    parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
+    return tuple(replace(whole.take(i, i), markers=tuple(names), fixture=place) for names, place, i in parts)
 
 
 def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:

@@ -51,7 +51,7 @@ GROSS = 6.0  # rows farther off than so many medians of the best fit's errors do
 FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
 MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
-UNSEEN = 200  # configurations at which mappings are compared
+ELSEWHERE = 200  # configurations at which mappings are compared
 RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
 
 
@@ -316,7 +316,7 @@ def _judged(
     near = [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
     measured = points.q.reshape(-1, robot.dof)
     low, high = np.where(_turning(robot), [[-np.pi], [np.pi]], [measured.min(axis=0), measured.max(axis=0)])
-    elsewhere = rng.uniform(low, high, (UNSEEN, robot.dof))
+    elsewhere = rng.uniform(low, high, (ELSEWHERE, robot.dof))
     zeros = [_gauged(robot, zero) for zero in fits.zero]
     plain = [_plain(*each) for each in zip(sign, zeros, strict=True)]
     same = 0.5 * max(least, LEAST_NOISE)
