@@ -9,7 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_bytes
-from rpim_opt.basics.text import LONGEST, shortened
+from rpim_opt.basics.text import LONGEST, Tabled, shortened
 from rpim_opt.basics.units import UNITS, split_unit
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
@@ -69,3 +69,16 @@ def test_a_robot_whose_joints_say_two_things(tmp_path: Path, old: str, new: str,
     with pytest.raises(ro.InputError) as error:
         ro.read_robot(path)
     assert said in str(error.value)
+
+
+def test_texts_in_notebook_tables_stay_as_they_are() -> None:
+    class Rows(Tabled):
+        def _frame_rows(self) -> list[dict[str, object]]:
+            return [{"label": "True", "value": True}, {"label": "None", "value": None}]
+
+        def _short(self) -> str:
+            return "rows"
+
+    shown = Rows()._repr_html_()
+    assert '<th scope="row">True</th><td>yes</td>' in shown
+    assert '<th scope="row">None</th><td></td>' in shown
