@@ -205,6 +205,9 @@ def _also_of_folders(
         if isinstance(problem, str | Path):
             problem = load(problem)
         if not isinstance(problem, Instance):
+            if not hasattr(problem, "parameters"):  # measurements alone, for instance
+                accepted = "a problem, what `load` returns, or a problem's name or folder"
+                raise InputError("problem", f"a {type(problem).__name__}", accepted)
             return function(problem, *arguments, **options)
         bound = signature(function).bind(problem.problem, *arguments, **options).arguments
         return problem.calibrate(**{name: value for name, value in bound.items() if name != "problem"})

@@ -261,3 +261,9 @@ def test_repeatability_is_a_word_or_a_table(tmp_path: Path) -> None:
 def test_the_word_auto_is_for_calibrate() -> None:
     with pytest.raises(ro.InputError, match=r"model: found 'auto', accepted: a ro.robot.Model"):
         ro.load("position", model="auto")
+
+
+def test_what_is_no_problem_is_refused() -> None:
+    data: Any = ro.load("position").problem.data
+    with pytest.raises(ro.InputError, match="problem: found a Dataset, accepted: a problem, what `load` returns, or"):
+        ro.calibrate(data)
