@@ -10,16 +10,15 @@ import sys
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
-from functools import cache, wraps
+from functools import wraps
 from importlib import import_module
 from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer import Argument, Option
-from typer.core import TyperGroup
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
@@ -27,9 +26,6 @@ from rpim_opt.basics.files import inside, refused, sha256_of
 from rpim_opt.basics.text import listed, progress_bar, table
 from rpim_opt.basics.units import parse_units
 from rpim_opt.report import console
-
-if TYPE_CHECKING:
-    from rpim_opt.use.reading import Measured
 
 HELP = """Robot calibration by convex optimization.
 
@@ -40,41 +36,7 @@ acceptance inconclusive.
 """
 
 
-def _others() -> dict[str, Any]:
-    return {each.name: each for each in entry_points(group="rpim_opt.commands")}
-
-
-class Commands(TyperGroup):
-    """The commands, those of other packages too (entry points ``rpim_opt.commands``), with whole first lines."""
-
-    def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names."""
-        own = super().list_commands(ctx)
-        return [*own, *sorted(set(_others()) - set(own))]
-
-    def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of a name; one of ours goes before another's."""
-        own = super().get_command(ctx, cmd_name)
-        if own is not None or cmd_name not in _others():
-            return own
-        alone = typer.Typer(rich_markup_mode=None)
-        alone.command(cmd_name)(_others()[cmd_name].load())
-        return typer.main.get_command(alone)
-
-    def format_commands(self, ctx: Any, formatter: Any) -> None:
-        """Write the list of commands; one of another package that cannot be loaded does not hide the others."""
-        rows = []
-        for name in self.list_commands(ctx):
-            try:
-                text = self.get_command(ctx, name).help or ""
-            except Exception as error:  # code of somebody else may raise anything
-                text = f"cannot be loaded: {str(error) or type(error).__name__}"
-            rows.append((name, text.partition("\n\n")[0]))
-        with formatter.section("Commands"):
-            formatter.write_dl(rows)
-
-
-app = typer.Typer(cls=Commands, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
+app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
@@ -120,10 +82,7 @@ PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated n
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or its folder.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
-Decimal = Annotated[str, Option(help="Decimal mark, a comma or a point.")]
-Sheet = Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")]
-Key = Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")]
-TimeTolerance = Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")]
+Kind = Annotated[Text, Option(help="Measurement type: position, pose, cable, ...; guessed, or that of the result.")]
 Several = "several files are stacked, or joined as by rpim-opt new."
 Tolerance = Annotated[Number, Option(help="Acceptance tolerance [mm]: exit code 1 if rejected, 4 if inconclusive.")]
 Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
@@ -179,20 +138,30 @@ class Answer(NamedTuple):
 
 
 class Tables(NamedTuple):
-    """Options of the commands that read tables of measurements."""
+    """Options of the commands that read tables of measurements or targets."""
 
     units: Units = ""
-    key: Key = ""
-    time_tolerance: TimeTolerance = None
-    sheet: Sheet = ""
-    decimal: Decimal = ""
-    measurement: Annotated[Text, Option(help="Measurement type of the new data, if the result has several.")] = None
+    sheet: Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")] = ""
+    columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = ""
+    key: Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")] = ""
+    time_tolerance: Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")] = (
+        None
+    )
+    quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = ""
+    rotation: Annotated[str, Option(help="Meaning of rx, ry, rz: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = ""
+    prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = ""
+    constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = ""
+    encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = ""
+    separator: Annotated[str, Option(help="Column separator: comma, semicolon, tab, bar, space.")] = ""
+    decimal: Annotated[str, Option(help="Decimal mark, a comma or a point.")] = ""
 
-    def read(self, result: "ro.calibration.Calibration", sources: list[Path]) -> "Measured":
-        """Return the measurements of tables."""
-        stated = {"sheet": self.sheet, "decimal": self.decimal, "key": self.key, "within": self.time_tolerance}
-        options = ro.data.TableOptions(units=parse_units(self.units), **stated)
-        return ro.use.read_measurements(result, sources, self.measurement, options)
+    @property
+    def options(self) -> "ro.data.TableOptions":
+        """The options as functions take them."""
+        stated: dict[str, Any] = self._asdict()
+        stated |= {"units": parse_units(self.units), "within": stated.pop("time_tolerance")}
+        stated["columns"] = tuple(map(str.strip, self.columns.split(","))) if self.columns else ()
+        return ro.data.TableOptions(**{**stated, "constants": tuple(console.listed_words(self.constants))})
 
 
 TABLES = Tables()
@@ -229,8 +198,33 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
             raise typer.Exit(answer.code)
 
     vars(run)["__signature__"] = signature(run).replace(parameters=options)
-    app.command()(run)
+    _add(function.__name__, run)
     return function
+
+
+def _add(name: str, function: Callable[..., Any]) -> None:
+    """Add a command, which the list of commands shows with the whole first line of its docstring."""
+    app.command(name, short_help=(function.__doc__ or "").partition("\n\n")[0])(function)
+
+
+def _add_others() -> None:
+    """Add the commands of other packages (entry points ``rpim_opt.commands``); ours go before one of the same name."""
+    for each in entry_points(group="rpim_opt.commands"):
+        if each.name in {own.name for own in app.registered_commands}:
+            continue
+        try:
+            function = each.load()
+        except Exception as error:  # code of somebody else may raise anything, and hides no other command
+            function = _failing(f"cannot be loaded: {str(error) or type(error).__name__}")
+        _add(each.name, function)
+
+
+def _failing(text: str) -> Callable[[], None]:
+    def fail() -> None:
+        raise RpimError(f"The command {text}.")
+
+    fail.__doc__ = text
+    return fail
 
 
 @command
@@ -238,20 +232,9 @@ def new(
     folder: Annotated[Path, Argument(help="Problem folder to create, or with --chain to extend.")],
     robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
-    units: Units = "",
+    tables: Tables = TABLES,
     dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
-    sheet: Sheet = "",
-    columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = "",
-    key: Key = "",
-    time_tolerance: TimeTolerance = None,
-    quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = "",
-    rotation: Annotated[str, Option(help="Meaning of rx, ry, rz: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = "",
-    prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = "",
-    constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = "",
-    encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = "",
-    separator: Annotated[str, Option(help="Column separator: comma, semicolon, tab, bar, space.")] = "",
-    decimal: Decimal = "",
-    measurement: Annotated[Text, Option(help="position, pose, cable, distance, ...; guessed from columns.")] = None,
+    measurement: Kind = None,
     validation: Annotated[list[Path] | None, Option(help="A table for validation; several are joined.")] = None,
     hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead: 0.25.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the held-out configurations.")] = 0,
@@ -264,18 +247,13 @@ def new(
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
-        options = ro.data.TableOptions(
-            sheet=sheet, encoding=encoding, separator=separator, decimal=decimal, units=parse_units(units), key=key,
-            columns=tuple(map(str.strip, columns.split(","))) if columns else (), quaternion=quaternion,
-            rotation=rotation, prefix=prefix, constants=tuple(console.listed_words(constants)), within=time_tolerance,
-        )  # fmt: skip
         if dry_run:
-            found = ro.store.understand_tables(robot, data, measurement, options, urdf_base, urdf_tip, dh)
+            found = ro.store.understand_tables(robot, data, measurement, tables.options, urdf_base, urdf_tip, dh)
             return Answer(found, found.content())
         with refused(folder):
             made = ro.store.new_problem(
-                folder, robot, data, measurement=measurement, options=options, validation=validation, hold_out=hold_out,
-                seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
+                folder, robot, data, measurement=measurement, options=tables.options, validation=validation,
+                hold_out=hold_out, seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
                 understood=None if as_json else lambda found: console.show(f"{found}\n"),
             )  # fmt: skip
     document = made.understood.content()
@@ -378,6 +356,7 @@ def validate(
     result: Result,
     data: Annotated[list[Path], Argument(help=f"New measurements; {Several}")],
     tables: Tables = TABLES,
+    measurement: Kind = None,
     limit: Annotated[Number, Option(help="Largest permitted error [mm]; exit code 1 if exceeded.")] = None,
     register: Register = False,
     out: Table = None,
@@ -393,7 +372,7 @@ def validate(
     """
     console.require_positive("--limit", limit)
     with _loaded(result) as (loaded, _):
-        read = tables.read(loaded, data)
+        read = ro.use.read_measurements(loaded, data, measurement, tables.options)
         validation = ro.use.validate(loaded, read.data, register)
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
@@ -409,6 +388,7 @@ def accept(
     box: Box = None,
     data: Annotated[list[Path] | None, Option(help=f"New measurements, instead of the result's; {Several}")] = None,
     tables: Tables = TABLES,
+    measurement: Kind = None,
     register: Register = False,
 ) -> Answer:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
@@ -420,7 +400,7 @@ def accept(
 
         left_out, notes, measured = (), (), None
         if data:
-            read = tables.read(loaded, data)
+            read = ro.use.read_measurements(loaded, data, measurement, tables.options)
             left_out, notes, measured = read.left_out, read.notes, read.data
             if register:
                 measured, motion = registered(loaded, measured)
@@ -460,6 +440,7 @@ def update(
     result: Result,
     data: Annotated[list[Path], Argument(help=f"New measurements, in the same instrument's frame; {Several}")],
     tables: Tables = TABLES,
+    measurement: Kind = None,
     prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     source: Source = None,
@@ -470,7 +451,7 @@ def update(
     Exit code 1 if errors on the new measurements stay unexplained, or the robot is not delivered.
     """
     with _loaded(result) as (loaded, say):
-        read = tables.read(loaded, data)
+        read = ro.use.read_measurements(loaded, data, measurement, tables.options)
         recalibration = ro.use.update(
             loaded,
             read.data,
@@ -490,6 +471,7 @@ def monitor(
     result: Result,
     checks: Annotated[list[Path], Argument(help=f"Readings; a column time, timestamp or date orders them; {Several}")],
     tables: Tables = TABLES,
+    measurement: Kind = None,
     out: Annotated[File, Option(help="Control chart over time as .html, or its points as .csv.")] = None,
 ) -> Answer:
     """Detect drift in check readings over time, by their prediction intervals and a CUSUM chart.
@@ -499,7 +481,7 @@ def monitor(
     with _loaded(result) as (loaded, _):
         from rpim_opt.report.page import written_checks
 
-        read = tables.read(loaded, checks)
+        read = ro.use.read_measurements(loaded, checks, measurement, tables.options)
         monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
         written = written_checks(monitoring, out, loaded.record.title)
     return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read.left_out, read.notes)
@@ -542,8 +524,7 @@ def export(
 def compensate(
     result: Result,
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
-    units: Units = "",
-    decimal: Decimal = "",
+    tables: Tables = TABLES,
     position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
     tool: Annotated[Text, Option(help="TCP in the DH table's flange frame [mm, deg]: x,y,z,roll,pitch,yaw.")] = None,
     marker: Marker = None,
@@ -564,7 +545,7 @@ def compensate(
     with _loaded(result) as (loaded, say):
         from rpim_opt.use.reading import read_commands
 
-        read, left_out = read_commands(loaded, targets, ro.data.TableOptions(decimal=decimal, units=parse_units(units)))
+        read, left_out = read_commands(loaded, targets, tables.options)
         say("compensating")
         compensation = ro.use.compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
@@ -774,9 +755,6 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
     return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if within else 'above'} {limit:g} mm."], within
 
 
-_command = cache(lambda: typer.main.get_command(app))
-
-
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
     if not set(LONG).intersection(sys.argv[1:2]):
@@ -786,7 +764,9 @@ def main() -> None:
     atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
     with console.arriving():
         try:
-            code = _command()(standalone_mode=False)
+            if not {own.name for own in app.registered_commands}.intersection(sys.argv[1:2]):
+                _add_others()
+            code = app(standalone_mode=False)
             if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
                 console.fail("Interrupted.", INTERRUPTED)
             sys.exit(code)

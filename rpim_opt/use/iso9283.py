@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -20,65 +20,51 @@ from rpim_opt.data.tables.names import recognize
 CYCLES, POSES = 30, 5  # how often the standard has how many poses approached
 ANGLES = ("a", "b", "c")  # the standard's names of the rotations
 AXES = ("x", "y", "z")
-NONE = (None, None, None)
 ROTATIONS = (("rx", "ry", "rz"), ANGLES, ("w", "p", "r"))
 """What the three angles of a table may be called; each is judged by itself, whichever axis it turns about."""
 ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an orientation rx_deg, ry_deg, rz_deg"
-Triple = tuple[float, float, float]
-
-
-class PosePerformance(NamedTuple):
-    """Accuracy and repeatability at one pose, from ``cycles`` approaches.
-
-    AP and AP_axes are the distance [m] of the barycentre of the attained positions from the command, and along x, y, z;
-    None where no command is known. RP is the positioning repeatability [m]. AP_angles and RP_angles are of the
-    orientation, for each of three angles [rad]: mean less command, and 3 standard deviations; None where no orientation
-    was measured.
-    """
-
-    pose: str
-    cycles: int
-    AP: float | None
-    AP_axes: Triple | None
-    RP: float
-    AP_angles: Triple | None = None
-    RP_angles: Triple | None = None
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Performance(Tabled):
-    """Accuracy and repeatability at the poses of a table; ``names`` is what it calls the three angles."""
+    """Accuracy and repeatability at the poses of a table.
 
-    poses: tuple[PosePerformance, ...]
-    names: tuple[str, ...] = ANGLES
+    ``poses`` has a row a pose: its name ``pose``, its ``cycles`` (approaches), and by name [mm, mrad] the distance of
+    the barycentre of the attained positions from the command, ``AP_p_mm``, its parts ``AP_x_mm``, ..., None where no
+    command is known, and the positioning repeatability ``RP_l_mm``. Where orientations were measured, it has of each
+    angle, as the table calls it, mean less command and 3 standard deviations, ``AP_a_mrad`` and ``RP_a_mrad``.
+    """
+
+    poses: tuple[Mapping[str, Any], ...]
 
     @property
     def accuracy(self) -> float | None:
         """The largest positioning accuracy AP of all poses [m]; None where no command is known."""
-        return max((each.AP for each in self.poses if each.AP is not None), default=None)
+        known = [1e-3 * each["AP_p_mm"] for each in self.poses if each["AP_p_mm"] is not None]
+        return max(known, default=None)
 
     @property
     def repeatability(self) -> float:
         """The largest positioning repeatability RP of all poses [m]."""
-        return max(each.RP for each in self.poses)
+        return max(1e-3 * each["RP_l_mm"] for each in self.poses)
 
     def content(self) -> dict[str, Any]:
         """Return the figures [mm, mrad]."""
         return {
             "standard": "ISO 9283:1998, 7.2.1 and 7.2.2",
-            "accuracy_mm": _milli(self.accuracy),
+            "accuracy_mm": None if self.accuracy is None else 1e3 * self.accuracy,
             "repeatability_mm": 1e3 * self.repeatability,
-            "poses": self._frame_rows(),
+            "poses": self.poses,
             "notes": self._notes(),
         }
 
     def csv(self) -> str:
         """Return the rows as CSV."""
-        rows = self._frame_rows()
-        return csv_text(rows[0], [["" if value is None else value for value in row.values()] for row in rows])
+        cells = [["" if value is None else value for value in row.values()] for row in self.poses]
+        return csv_text(self.poses[0], cells)
 
     def __str__(self) -> str:
-        rows = self._frame_rows()
+        rows = self.poses
         parts = []
         for unit in ("_mm", "_mrad"):
             shown = [key for key in rows[0] if key.endswith(unit) and any(row[key] is not None for row in rows)]
@@ -95,7 +81,7 @@ class Performance(Tabled):
     def _notes(self) -> list[str]:
         """Say in what the table is not what the standard requires, and what is not known."""
         lines: list[str] = []
-        cycles = sorted({each.cycles for each in self.poses})
+        cycles = sorted({each["cycles"] for each in self.poses})
         if cycles[0] < CYCLES or len(self.poses) < POSES:
             times = " to ".join(str(count) for count in dict.fromkeys((cycles[0], cycles[-1])))
             verb = "are" if len(self.poses) > 1 else "is"
@@ -106,19 +92,7 @@ class Performance(Tabled):
         return lines
 
     def _frame_rows(self) -> list[dict[str, Any]]:
-        keys = ["AP_p_mm", *(f"AP_{axis}_mm" for axis in AXES), "RP_l_mm"]
-        if any(each.RP_angles is not None for each in self.poses):
-            keys += [f"{kind}_{name}_mrad" for kind in ("AP", "RP") for name in self.names]
-        rows = []
-        for each in self.poses:
-            positions = [each.AP, *(each.AP_axes or NONE), each.RP]
-            figures = zip(keys, [*positions, *(each.AP_angles or NONE), *(each.RP_angles or NONE)], strict=False)
-            rows.append({"pose": each.pose, "cycles": each.cycles, **{key: _milli(value) for key, value in figures}})
-        return rows
-
-
-def _milli(value: float | None) -> float | None:
-    return None if value is None else 1e3 * value
+        return [dict(each) for each in self.poses]
 
 
 def iso9283(
@@ -159,27 +133,29 @@ def iso9283(
     commanded = None if command is None else _rows(command, len(pose), "commanded positions")
     turned = None if angles is None else _rows(angles, len(pose), "angles")
     commanded_turns = None if command_angles is None else _rows(command_angles, len(pose), "commanded angles")
-    poses: list[PosePerformance] = []
+    poses = []
     for name in dict.fromkeys(pose):
         at = np.array([each == name for each in pose])
         if at.sum() < 2:
             raise InputError(f"pose '{name}'", "one approach", f"two or more, {CYCLES} by the standard")
         barycentre = attained[at].mean(axis=0)
         length = np.linalg.norm(attained[at] - barycentre, axis=1)
-        AP = AP_axes = AP_angles = RP_angles = start = None
+        row: dict[str, Any] = {"pose": name, "cycles": int(at.sum())}
+        row |= dict.fromkeys(["AP_p_mm", *(f"AP_{axis}_mm" for axis in AXES)])
         if commanded is not None:
             offset = barycentre - _one_command(commanded[at], name, "position")
-            AP, AP_axes = float(np.linalg.norm(offset)), tuple(offset.tolist())
-        if commanded_turns is not None:
-            start = _one_command(commanded_turns[at], name, "orientation")
+            row |= dict(zip(list(row)[2:], (1e3 * np.array([np.linalg.norm(offset), *offset])).tolist(), strict=True))
+        row["RP_l_mm"] = 1e3 * float(length.mean() + 3 * length.std(ddof=1))
         if turned is not None:
+            start = None if commanded_turns is None else _one_command(commanded_turns[at], name, "orientation")
             from_start = turned[at] - (turned[at][0] if start is None else start)
-            beside = (from_start + np.pi) % (2 * np.pi) - np.pi
-            RP_angles = tuple((3 * beside.std(axis=0, ddof=1)).tolist())
-            AP_angles = None if start is None else tuple(beside.mean(axis=0).tolist())
-        RP = float(length.mean() + 3 * length.std(ddof=1))
-        poses.append(PosePerformance(name, int(at.sum()), AP, AP_axes, RP, AP_angles, RP_angles))
-    return Performance(tuple(poses), names)
+            beside = 1e3 * ((from_start + np.pi) % (2 * np.pi) - np.pi)
+            means = beside.mean(axis=0).tolist() if start is not None else [None] * 3
+            row |= {f"AP_{angle}_mrad": mean for angle, mean in zip(names, means, strict=True)}
+            spreads = beside.std(axis=0, ddof=1).tolist()
+            row |= {f"RP_{angle}_mrad": 3 * spread for angle, spread in zip(names, spreads, strict=True)}
+        poses.append(row)
+    return Performance(tuple(poses))
 
 
 def _one_command(values: Array, name: str, what: str) -> Array:

@@ -18,10 +18,8 @@ CROSS = 1e-3 * np.array([[0.1, 0.0, 0.2], [-0.1, 0.0, 0.2], [0.0, 0.3, 0.2], [0.
 
 def test_a_cross_by_hand() -> None:
     found = ro.use.iso9283(["P1"] * 4, CROSS, np.zeros((4, 3))).poses[0]
-    assert pytest.approx(0.2) == 1e3 * found.AP
-    assert 1e3 * np.array(found.AP_axes) == pytest.approx([0.0, 0.0, 0.2])
-    assert pytest.approx(0.5464101615) == 1e3 * found.RP
-    assert found.cycles == 4
+    expected = {"AP_p_mm": 0.2, "AP_x_mm": 0.0, "AP_y_mm": 0.0, "AP_z_mm": 0.2, "RP_l_mm": 0.5464101615}
+    assert found == pytest.approx({"pose": "P1", "cycles": 4, **expected})
 
 
 def test_angles_by_hand_across_half_a_turn() -> None:
@@ -30,10 +28,10 @@ def test_angles_by_hand_across_half_a_turn() -> None:
     angles = np.column_stack([[0.001, 0.002, 0.003], np.zeros(3), c])
     commands = np.tile([0.0, 0.0, 3.141], (3, 1))
     found = ro.use.iso9283(["P"] * 3, np.zeros((3, 3)), None, angles, commands).poses[0]
-    assert 1e3 * np.array(found.RP_angles) == pytest.approx([3.0, 0.0, 3 * 4 / np.sqrt(3)], abs=1e-9)
-    assert 1e3 * np.array(found.AP_angles) == pytest.approx([2.0, 0.0, -1.0 + 8 / 3], abs=1e-9)
-    assert found.AP is None
-    assert found.RP == 0.0
+    for kind, expected in {"RP": [3.0, 0.0, 3 * 4 / np.sqrt(3)], "AP": [2.0, 0.0, -1.0 + 8 / 3]}.items():
+        assert [found[f"{kind}_{angle}_mrad"] for angle in "abc"] == pytest.approx(expected, abs=1e-9)
+    assert found["AP_p_mm"] is None
+    assert found["RP_l_mm"] == 0.0
 
 
 def test_a_moved_or_turned_frame_changes_no_repeatability() -> None:
@@ -55,7 +53,7 @@ def test_what_the_standard_asks_for_is_said_where_it_is_not_there() -> None:
         "No commanded poses are known: repeatability is computed, accuracy is not.",
     ]
     assert few.accuracy is None
-    assert whole.accuracy == max(each.AP for each in whole.poses)
+    assert 1e3 * whole.accuracy == pytest.approx(max(each["AP_p_mm"] for each in whole.poses))
 
 
 @pytest.mark.parametrize(
