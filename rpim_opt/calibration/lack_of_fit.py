@@ -20,6 +20,7 @@ from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.calibration.verdict import bent_upwards
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import UNITS, Repeatability
 from rpim_opt.problem.problem import CalibrationProblem
@@ -31,8 +32,6 @@ CORRELATED = 4.0  # z-score from which on residuals are said to be autocorrelate
 ROUGH, FINE = 2.0, 0.3  # repeatability over noise above which the robot is the limit, below which the instrument is
 GROSS = 300.0  # repeatability over measurement noise above which data are wrong
 NEGLIGIBLE = 0.1  # parts below this share of a larger one are not worth a word
-NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
-SURE = 3.0  # standard deviations by which a compliance is below zero before a joint is said to bend upwards
 RARE = 1e-3  # probability that residuals exceed the standard deviation of repeated readings by chance
 PERMUTATIONS = 300  # permutations that an autocorrelation is compared with
 FEWEST_NEIGHBOURS = 8  # configurations below which there is no autocorrelation
@@ -282,12 +281,9 @@ def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ..
     if "gravity" not in {*model.extensions, *present}:
         return ()
     z = model.point.z
-    sd = np.sqrt(np.diag(model.point.C))
     moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
     names = compared.names[compared.members(model.extensions)].tolist()
-    joint = {i: int(name[10:]) for i, name in enumerate(names) if kind_of(name) == "compliance"}
-    largest = max((moves[i] for i in joint), default=0.0)
-    return tuple(k for i, k in joint.items() if z[i] < -SURE * sd[i] and moves[i] > NOTABLE * largest)
+    return bent_upwards(names, z, np.sqrt(np.diag(model.point.C)), moves)
 
 
 def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:

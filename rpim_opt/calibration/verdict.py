@@ -21,6 +21,7 @@ from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import settled
+from rpim_opt.problem.row_functions import measured_torques
 from rpim_opt.robot.parameters import own_name
 
 BAD = "Larger than expected"
@@ -42,6 +43,7 @@ WORSE = 3.0  # standard errors by which squared errors on held-out rows are abov
 ROWS = 3  # held-out rows below which errors have no standard error, and only those twice the nominal ones count
 NOTICED = 2**0.5  # the same from which on an effect may explain half of the squares, and leave no less than the noise
 UPWARD = 5.0  # standard deviations by which a compliance is below zero, which gravity cannot cause
+NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
 HOPELESS = 20.0  # residuals over the stated noise from which something is said even if nothing explains them
 SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
@@ -337,7 +339,7 @@ def likely_causes(result: Outcome) -> list[str]:
         if not causes and noticed and len(problem.arms) == 1:
             causes = list(diagnosis.shown_by_residuals(_without_outliers(result, ordered), result.x))
     if noticed:
-        causes += _upward(result)
+        causes += _upward(result, problem)
     shared = _of_any_fit(result, problem)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
@@ -393,20 +395,28 @@ def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
     return sibling(problem)
 
 
-def _upward(result: Outcome) -> list[str]:
-    """Say which joints turn against gravity for sure: the mounting is another one, or a force is not gravity's."""
-    names = result.problem.parameters.free.names
-    bent = [i for i, name in enumerate(names) if name.startswith("compliance")]
-    measured = any(block.torque is not None for part in result.problem.rows() for block in part.data.blocks)
-    if not bent or measured or not result.linear_penalty:
+def bent_upwards(names: Sequence[str], x: Array, sd: Array, moves: Array) -> tuple[int, ...]:
+    """Return the joints that surely turn against gravity, of parameters x (n,) with standard deviations (n,).
+
+    Not those that move (n,) the points far less than another one.
+    """
+    joints = {i: int(name.removeprefix("compliance")) for i, name in enumerate(names) if name.startswith("compliance")}
+    largest = max((moves[i] for i in joints), default=0.0)
+    return tuple(k for i, k in joints.items() if x[i] < -UPWARD * sd[i] and moves[i] > NOTABLE * largest)
+
+
+def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
+    """Say which joints turn against gravity: the mounting is another one, or a force is not gravity's."""
+    if measured_torques(problem.data) or not result.linear_penalty:
         return []
-    spread = np.sqrt(np.diag(result.covariance))
-    joints = [names[i].removeprefix("compliance") for i in bent if result.x[i] < -UPWARD * spread[i]]
+    free, x = problem.parameters.free, result.x
+    moves = np.linalg.norm(problem.linearize(x).A * (x / free.scale), axis=0)
+    joints = bent_upwards(free.names, x, np.sqrt(np.diag(result.covariance)), moves)
     if not joints:
         return []
     return [
-        f"joint{'s' * (len(joints) > 1)} {joined(joints)} bend against gravity: check `mounting` and the payload, and "
-        "whether something else pulls the arm (a hose, a spring, a counterweight)."
+        f"joint{'s' * (len(joints) > 1)} {joined([str(joint) for joint in joints])} bend against gravity: check "
+        "`mounting` and the payload, and whether something else pulls the arm (a hose, a spring, a counterweight)."
     ]
 
 
