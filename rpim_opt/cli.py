@@ -265,7 +265,7 @@ def new(
 def inspect(problem: Problem, variant: Variant = None) -> Answer:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
-        from rpim_opt.calibration.lack_of_fit import foreseen
+        from rpim_opt.calibration.lack_of_fit import quick_lack_of_fit
 
         say("reading the problem")
         instance = ro.load(problem, variant)
@@ -276,7 +276,7 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         parts = {name: ro.problem.inspect(whole.alone(name), validation.get(name)) for name in whole.arms}
         together = ro.problem.observe(whole) if len(parts) > 1 else None
         say("analysing the residuals of a quick fit")
-        lacking, outliers = foreseen(whole)
+        lacking, outliers = quick_lack_of_fit(whole)
     document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
     text = "\n".join(filter(None, [instance.record.title, instance.record.source]))
     for name, part in parts.items():

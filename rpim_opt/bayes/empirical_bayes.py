@@ -9,20 +9,20 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.bayes.hyperparameters import Estimator, Fit, Learned, LeftOut, Trial, learned, sampled
+from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
 from rpim_opt.bayes.outliers import beyond_noise, error_vectors, outlier_candidates, unexplained
 from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import settled
+from rpim_opt.problem.registration.frames import frame_deviations
 
 ROUNDS = 6  # linearizations at which hyperparameters are estimated
-ASKED = 6.0
+REQUIRED_GAIN = 6.0
 """By how much -2 ln L must fall for an optional prior: a likelihood ratio of twenty, which by Markov's inequality one
 arm of another kind in twenty shows at most."""
-LOOKS = 4  # how often outliers are looked for again without those that were found: they mask each other
+OUTLIER_SEARCHES = 4  # how often outliers are looked for again without those that were found: they mask each other
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,16 +58,16 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         start = np.zeros(len(p.free))
         frames = p.placed & p.identified
         if frames.any():
-            start[p.placed[p.identified]] = settled(every.identifying(frames))
+            start[p.placed[p.identified]] = frame_deviations(every.identifying(frames))
     whole = estimator.fit(every, start, None, ROUNDS)
     notes: tuple[str, ...] = ()
     if estimator.prior.optional:  # left out where the marginal likelihood is against it
         plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, optional=False))
         without = plain.fit(every, start, None, ROUNDS)
         fall = without.point.value - whole.point.value
-        if fall < ASKED:
+        if fall < REQUIRED_GAIN:
             estimator, whole = plain, without
-            reason = f"it lowers -2 ln L by {fall:.1f}; {ASKED:g} are required."
+            reason = f"it lowers -2 ln L by {fall:.1f}; {REQUIRED_GAIN:g} are required."
             notes = (f"The population prior is not used: {reason}",)
     fit, trials, outliers = _without_outliers(every, estimator, whole, model)
     requested = p.free.names
@@ -81,12 +81,12 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
     laid = problem.with_parameters(fit.laid.parameters).with_repeatability(fit.laid.repeatability)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
         outliers = beyond_noise(laid, fit.x)
-    left_out: list[LeftOut] = []
+    left_out: list[ExcludedRow] = []
     if outliers:
         vectors = np.concatenate([error_vectors(part, fit.x) for part in laid.rows()])
         size = dict(zip(laid.labels, np.linalg.norm(vectors, axis=1).tolist(), strict=True))
         for label, ratio in sorted(outliers.items(), key=lambda item: -item[1]):
-            left_out.append(LeftOut(label, ratio, size[label] if np.isfinite(size[label]) else None))
+            left_out.append(ExcludedRow(label, ratio, size[label] if np.isfinite(size[label]) else None))
         laid = laid.without(outliers)
     hyperparameters = learned(
         fit,
@@ -113,7 +113,7 @@ def _without_outliers(
 
     outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials = explain(outliers)
-    for _ in range(LOOKS):  # what extensions explain, and the worst outliers, stood before the smaller ones
+    for _ in range(OUTLIER_SEARCHES):  # what extensions explain, and the worst outliers, stood before the smaller ones
         if not outliers and not (trials and trials[0].extensions):
             break
         more = outlier_candidates(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)

@@ -617,9 +617,9 @@ def extrapolation(point: Point, prior: Hierarchy, halves: Sequence[np.ndarray]) 
         Y = _half_solved(L, d, beyond.T)
         mean = _half_solved(L, d, inside.T @ y[half] + prior.rows.T @ prior.values[:, None])
         spread, V = np.linalg.eigh(Y @ Y.T)
-        told = spread > 1e-6
-        along = (V.T @ (Y @ (y[~half] - Y.T @ mean)))[told, 0]
-        variances = 1 + FACTORS[:, None] * spread[told]
-        value += np.sum(np.log(variances) + along**2 / spread[told] / variances, axis=1)
+        informative = spread > 1e-6
+        along = (V.T @ (Y @ (y[~half] - Y.T @ mean)))[informative, 0]
+        variances = 1 + FACTORS[:, None] * spread[informative]
+        value += np.sum(np.log(variances) + along**2 / spread[informative] / variances, axis=1)
     L, d = _factored(point.C, np.zeros(len(own)))
     return np.sqrt(FACTORS[np.argmin(value)] - 1) * L / d[:, None]

@@ -59,7 +59,7 @@ class Trial(NamedTuple):
     value: float
 
 
-class LeftOut(NamedTuple):
+class ExcludedRow(NamedTuple):
     """A row that was excluded as an outlier: its error over the median of all rows' errors, and the error [m]."""
 
     label: str
@@ -101,7 +101,7 @@ class Learned(Brief):
     trials: tuple[Trial, ...]
     value: float
     freedom: float
-    left_out: tuple[LeftOut, ...]
+    left_out: tuple[ExcludedRow, ...]
     covariance: Array
     stated: Array
     drift: Array
@@ -243,7 +243,7 @@ class Estimator:
         evidence = self.evidence(problem, x, prior)
         starts = [] if known is None else [known]
         if several:
-            starts += sides(problem, evidence)
+            starts += multistart(problem, evidence)
         point, *others = evidence.optima(starts)
         scale = p.scale.copy()
         scale[p.identified] *= prior.scale * np.sqrt(point.v)
@@ -269,7 +269,7 @@ def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
     return Spectrum(frequencies**2, unit[len(unit) - len(frequencies) :] ** 2 / np.concatenate(share))
 
 
-def sides(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
+def multistart(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
     """Return the starts of the search for the optimum; several if configurations are few."""
     few = len(np.unique(problem.data.configuration)) <= FEW
     return evidence.starts()[: None if few else 1]

@@ -12,7 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
-from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, sampled, sides
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, multistart, sampled
 from rpim_opt.bayes.outliers import clustered
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Result
@@ -183,7 +183,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
         point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
         if conditions and conditions == set(candidate):  # what they explain stood among the noise
             known[conditions] = _hyperparameters(evidence, point)
-        return Candidate(point.value + GAIN * questions(candidate), candidate, evidence, point)
+        return Candidate(point.value + GAIN * complexity(candidate), candidate, evidence, point)
 
     candidates = sorted(models.compared(price), key=lambda each: each.price)
     trials = tuple(Trial(each.extensions, each.point.value) for each in candidates)
@@ -193,7 +193,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
     return estimator.fit(whole, deviations(whole, deviation), candidates[0].point.logs, ROUNDS), trials
 
 
-def questions(extensions: Sequence[str]) -> int:
+def complexity(extensions: Sequence[str]) -> int:
     """Return the complexity of a model: one for all of `CANDIDATES` that it has, one for every other extension."""
     others = sum(extension in FURTHER or extension in CONDITIONS for extension in extensions)
     return others + (len(extensions) > others)
@@ -254,7 +254,7 @@ class Comparison(Models):
     def plain(self) -> Candidate:
         """The result's own model, without extensions."""
         evidence = self.columns.restricted(self.members(()))
-        starts = sides(self.problem, evidence)
+        starts = multistart(self.problem, evidence)
         if self.result.learned is not None:
             noise = {name: np.log(size.value) for name, size in self.result.learned.noise.items() if name in CENTRES}
             starts = [np.array([noise.get(n, c) for n, c in zip(evidence.names, evidence.centre, strict=True)])]

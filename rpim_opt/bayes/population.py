@@ -82,7 +82,7 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
     generic = default_widths(table)
     arms = []
     for label, result in named.items():
-        robot, rows, values = of_data(result)
+        robot, rows, values = data_likelihood(result)
         places = _places(names, robot)
         own = result.problem.parameters.take(_places(result.problem.parameters.names, robot))
         apart = own.nominal - table.nominal[places]
@@ -103,7 +103,7 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
     )
 
 
-def of_data(result: Result) -> tuple[tuple[str, ...], Array, Array]:
+def data_likelihood(result: Result) -> tuple[tuple[str, ...], Array, Array]:
     """Return names (p), rows (p, p) [1/SI] and values (p,) of the likelihood of a result's data alone.
 
     Frames have their default prior standard deviations and are integrated out.

@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
-from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, extended, named, questions
+from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, complexity, extended, named
 from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.problem.noise import Repeatability, Stack
 from rpim_opt.problem.problem import CalibrationProblem
@@ -85,7 +85,7 @@ def admitted(
     def price(extensions: tuple[str, ...]) -> Candidate:
         model = rest.restricted(models.members(extensions))
         best = model.optima(model.starts()[:1])[0]
-        price = EXTENSION_GAIN * questions(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
+        price = EXTENSION_GAIN * complexity(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
         if not kept.issubset(extensions):
             price = np.inf
         return Candidate(best.value + price, extensions, model, best)

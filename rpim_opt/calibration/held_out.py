@@ -161,7 +161,7 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     if not original.keeps_rows:
         raise InputError("refit_all", "data in blocks", "measurements in memory")
     whole = Dataset.together([original.data, apart], ["identification", "validation"])
-    refitted = result.asked(original.on(whole))
+    refitted = result.calibrate_again(original.on(whole))
     labels = whole.label[len(original.data) :]
     kept = np.flatnonzero(np.isin(labels, refitted.problem.labels))
     held = replace(compared(result, apart), label=labels, coverage=judged(result, apart.take(kept)).coverage)

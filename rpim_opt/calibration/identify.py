@@ -199,7 +199,7 @@ def calibrate(
         history=ended.state.history,
         program=ended.state.program,
         certificate=ended.certificate,
-        asked=mapped_as(mapping, again, notes),
+        calibrate_again=mapped_as(mapping, again, notes),
         learned=learned,
         mapping=mapping,
         excluded=excluded,
@@ -280,16 +280,16 @@ def _contradicted(prior: Prior, problem: Source, x: Array) -> list[str]:
 
 
 def mapped_as(
-    mapping: JointMapping | None, asked: Callable[[Source], Calibration], notes: Sequence[str] = ()
+    mapping: JointMapping | None, again: Callable[[Source], Calibration], notes: Sequence[str] = ()
 ) -> Callable[[Source], Calibration]:
     """Return a calibration of problems with estimated joint mappings or registered frames, with notes on them."""
-    return partial(_mapped, mapping, notes, asked) if mapping or notes else asked
+    return partial(_mapped, mapping, notes, again) if mapping or notes else again
 
 
 def _mapped(
-    mapping: JointMapping | None, notes: Sequence[str], asked: Callable[[Source], Calibration], problem: Source
+    mapping: JointMapping | None, notes: Sequence[str], again: Callable[[Source], Calibration], problem: Source
 ) -> Calibration:
-    result = asked(problem)
+    result = again(problem)
     return replace(result, mapping=mapping, message=" ".join([result.message, *notes]))
 
 

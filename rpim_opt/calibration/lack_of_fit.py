@@ -14,7 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.bayes.hyperparameters import LeftOut, sampled
+from rpim_opt.bayes.hyperparameters import ExcludedRow, sampled
 from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Candidate, Comparison
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
@@ -245,7 +245,7 @@ def judged(result: Outcome) -> LackOfFit | None:
         return None
 
 
-def foreseen(problem: Source) -> tuple[LackOfFit | None, list[LeftOut]]:
+def quick_lack_of_fit(problem: Source) -> tuple[LackOfFit | None, list[ExcludedRow]]:
     """Return the lack of fit of a quick fit to at most 60 configurations, None if it fails, and its outliers."""
     try:
         result = calibrate(sampled(problem, QUICK))

@@ -26,7 +26,7 @@ from rpim_opt.robot.parameters import of_joint, own_name
 TINY = 1e-300  # divisors are no smaller
 ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
 UNIDENTIFIABLE = 1e-9  # standard deviations below, in scales, are rounding: the data do not see the parameter
-WORTH = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing
+IMPROVED = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing
 BALANCED = 1e-4  # gradient of weighted equations and penalty at the solution, relative to that of the data at nominal
 
 
@@ -194,7 +194,7 @@ class Improvement:
     @property
     def improves(self) -> bool:
         """Whether the identified parameters are expected to be significantly better than the nominal ones."""
-        return self.after < WORTH * self.before
+        return self.after < IMPROVED * self.before
 
 
 def improvement(result: Outcome) -> Improvement | None:

@@ -27,7 +27,7 @@ DAMPING_GROWTH, DAMPING_SHRINK, DAMPING_FIRST, DAMPING_LEAST = 4.0, 0.5, 1.0, 1e
 CURVATURE, CURVATURE_STEP, CURVATURE_TURN = 0.1, 0.1, 0.75
 """Curvature over the step's effect from which a step follows it; share of the step at which it is measured; the most
 that it may turn the step."""
-STRAIGHT = 1e-3  # steps shorter than this share of the solution are straight: what bends them is rounding
+NEGLIGIBLE_STEP = 1e-3  # steps shorter than this share of the solution have an acceleration of rounding alone
 EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
 """Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
 VANISHING = 1e-12  # share of the first objective below which one has vanished: noise-free data end at rounding
@@ -47,7 +47,7 @@ SETTLED = 1e-3  # the weight is chosen anew while a step is longer than this sha
 SAME = 0.01  # two weights are the same when their logarithms differ by no more
 SAME_SEARCH = float(np.log(SAME_WEIGHT))  # the same of weights from a search
 SAME_ROBUST = 1e-6  # the same of a robust loss, whose weight does not depend on how the measurements are stored
-MOST_ANSWERS = 10  # how many different answers a rule may give in turn
+MOST_CHOICES = 10  # how many different weights a rule may choose in turn
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Options:
 class WeightChoice:
     """The weight of an iteration, and how it was chosen.
 
-    ``rule`` is None for a number; ``answers`` are all of its answers in turn, ``selection`` the last one.
+    ``rule`` is None for a number; ``weights`` are all that it chose in turn, ``selection`` the last one.
     ``settled``: the weight stays while the loop comes to rest; ``final``: for good. ``robust``: the loss is a sum over
     rows, but no square.
     """
@@ -97,13 +97,13 @@ class WeightChoice:
     rule: Selector | None
     weight: float = 0.0
     selection: Selection | None = None
-    answers: tuple[float, ...] = ()
+    weights: tuple[float, ...] = ()
     settled: bool = False
     final: bool = False
     note: str = ""
     robust: bool = False
 
-    def asked(self, program: Program) -> WeightChoice:
+    def updated(self, program: Program) -> WeightChoice:
         """Return the choice of the rule for a program, unless the weight is final."""
         if self.settled or self.rule is None:
             return self
@@ -116,7 +116,7 @@ class WeightChoice:
         weight = float(selection.weight)
         if not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"selector {selection.name}", f"weight {weight}", "a number, zero or more")
-        chosen = replace(self, weight=weight, selection=selection, answers=(*self.answers, weight))
+        chosen = replace(self, weight=weight, selection=selection, weights=(*self.weights, weight))
         if not program.closed_form:  # whose paths are dear: the next answer is asked for where this one leads
             chosen = replace(chosen, settled=True)
         return chosen._checked()
@@ -129,7 +129,7 @@ class WeightChoice:
         """Return the choice after applying the rule to the final program: final, or another weight."""
         if self.final:
             return self
-        again = replace(self, settled=False).asked(program)
+        again = replace(self, settled=False).updated(program)
         apart = SAME  # by how much logarithms of weights differ that a rule tells apart
         selection = again.selection
         if self.robust and program.closed_form:
@@ -139,20 +139,20 @@ class WeightChoice:
             place = int(np.searchsorted(order, selection.weight))
             if 0 < place < len(order) - 1 and order[place] == selection.weight and order[place - 1] > 0:
                 apart = float(np.clip(0.5 * np.log(order[place + 1] / order[place - 1]), SAME, SAME_SEARCH))
-        if self.answers and _same(again.weight, self.weight, apart):
+        if self.weights and _same(again.weight, self.weight, apart):
             return replace(self, settled=True, final=True, note=again.note)
         return again
 
     def _checked(self) -> WeightChoice:
-        """Settle a rule that alternates, or never comes to rest, on the safer of its answers."""
-        turns = [self.answers[0]]
-        turns += [b for a, b in zip(self.answers, self.answers[1:], strict=False) if not _same(a, b)]
-        ended = _alternate(turns, SAME) or len(turns) >= MOST_ANSWERS
+        """Settle a rule that alternates, or never comes to rest, on the safer of its choices."""
+        turns = [self.weights[0]]
+        turns += [b for a, b in zip(self.weights, self.weights[1:], strict=False) if not _same(a, b)]
+        ended = _alternate(turns, SAME) or len(turns) >= MOST_CHOICES
         if self.settled and len(turns) >= 3:  # leads where it led before
             ended = ended or _same(turns[-1], turns[-3], SAME_SEARCH)
         last: Sequence[float] = turns
         if not ended and self.robust:  # closer to each other than `SAME`
-            ended, last = _alternate(self.answers, SAME_ROBUST), self.answers
+            ended, last = _alternate(self.weights, SAME_ROBUST), self.weights
         if not ended:
             return self
         one, other = last[-2:]
@@ -168,10 +168,10 @@ class WeightChoice:
         return replace(self, weight=weight, settled=True, final=True, note=note)
 
 
-def _alternate(answers: Sequence[float], apart: float) -> bool:
-    if len(answers) < 4:
+def _alternate(weights: Sequence[float], apart: float) -> bool:
+    if len(weights) < 4:
         return False
-    a, b, c, d = answers[-4:]
+    a, b, c, d = weights[-4:]
     return _same(a, c, apart) and _same(b, d, apart) and not _same(c, d, apart)
 
 
@@ -268,7 +268,7 @@ class Loop:
 
     def run(self, weight: float | str | Selector, start: Array | None) -> State:
         """Return the state at the end, from deviations ``start`` (n,) [SI]."""
-        state = self.begun(weight_choice(weight, self.formulation.penalty is not None), start)
+        state = self.initial(weight_choice(weight, self.formulation.penalty is not None), start)
         while not state.outcome and state.evaluations <= self.options.max_iterations:
             iterations = len(state.history)
             state = self.confirmed(self.advanced(self.chosen(state)))
@@ -276,7 +276,7 @@ class Loop:
                 self.options.progress(state.history[-1])
         return self.answered(state)
 
-    def begun(self, choice: WeightChoice, start: Array | None) -> State:
+    def initial(self, choice: WeightChoice, start: Array | None) -> State:
         """Return the initial state, at a feasible point."""
         free = self.source.parameters.free
         x = np.zeros(len(free)) if start is None else require_start(start, len(free))
@@ -306,10 +306,10 @@ class Loop:
         choice = state.choice
         if choice.settled:
             return state
-        if choice.robust and not choice.answers and self.options.max_iterations > FEW_ITERATIONS:
+        if choice.robust and not choice.weights and self.options.max_iterations > FEW_ITERATIONS:
             # where weight 1 leads: at nominal the answer would be about outliers that no fit has shown yet
             return state.weighted(replace(choice, weight=1.0, settled=True))
-        return state.weighted(choice.asked(self._judged(state)))
+        return state.weighted(choice.updated(self._judged(state)))
 
     def confirmed(self, state: State) -> State:
         """Apply the rule once more at convergence: a weight is final if the rule selects it again."""
@@ -322,9 +322,9 @@ class Loop:
 
     def answered(self, state: State) -> State:
         """Apply a rule that was not applied yet."""
-        if state.choice.final or state.choice.answers:
+        if state.choice.final or state.choice.weights:
             return state
-        return state.weighted(replace(state.choice, settled=False).asked(self._judged(state)))
+        return state.weighted(replace(state.choice, settled=False).updated(self._judged(state)))
 
     def _judged(self, state: State) -> Program:
         """Return the program that a rule sees: of a robust loss the linear estimator that its fit amounts to."""
@@ -340,8 +340,8 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
-        straight, promised = self._promise(state)
-        choice, length = state.choice, state.relative(float(np.linalg.norm(straight - state.z)))
+        solution, promised = self._predicted(state)
+        choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, promised <= accuracy
         if state.damping > 0 and (short or nothing):
@@ -350,26 +350,26 @@ class Loop:
         at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.stalled(accuracy, np.isfinite(best))
         if choice.settled and at_rest:
             return replace(state, outcome="rest")
-        waiting = choice.settled and not choice.final and not choice.answers
+        waiting = choice.settled and not choice.final and not choice.weights
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
             return self.answered(replace(state, idle=0))
-        return self._stepped(state, straight, promised, short, nothing)
+        return self._stepped(state, solution, promised, short, nothing)
 
-    def _promise(self, state: State) -> tuple[Array, float]:
+    def _predicted(self, state: State) -> tuple[Array, float]:
         """Return the minimum (n,) of the convex program, and by how much the objective falls there if that holds."""
         # the first linearization is good for a rough minimum, unless that promises too little to judge by
         first = state.program.separable and not (state.history or state.refused or self.options.solver)
         rough = FIRST_ACCURACY if first else 0.0
-        straight = self._solved(state.program, state, rough)
-        promised = state.merit - state.program.objective(straight, state.choice.weight)
+        solution = self._solved(state.program, state, rough)
+        promised = state.merit - state.program.objective(solution, state.choice.weight)
         if rough and promised <= 10 * rough * abs(state.merit):
-            straight = self._solved(state.program, state)
-            promised = state.merit - state.program.objective(straight, state.choice.weight)
-        return straight, promised
+            solution = self._solved(state.program, state)
+            promised = state.merit - state.program.objective(solution, state.choice.weight)
+        return solution, promised
 
-    def _stepped(self, state: State, straight: Array, promised: float, short: bool, nothing: bool) -> State:
+    def _stepped(self, state: State, solution: Array, promised: float, short: bool, nothing: bool) -> State:
         """Step to a minimum if the nonlinear objective falls, else damp; ``nothing``: no fall is promised."""
-        z = self._curved(state, straight)
+        z = self._accelerated(state, solution)
         candidate = state.program.on(self.linearized(z, state.z))
         after = candidate.objective(z, state.choice.weight)
         rounding = ROUNDING * abs(state.merit) + state.floor
@@ -397,28 +397,28 @@ class Loop:
         how = {"solver": o.solver, "settings": o.settings, "verbose": o.verbose}
         return program.solve(state.choice.weight, damping=damping, accuracy=accuracy, **how).z
 
-    def _curved(self, state: State, straight: Array) -> Array:
+    def _accelerated(self, state: State, solution: Array) -> Array:
         """Let a step follow the curve of the residual: the convex program again, b moved by half the curvature.
 
         (Geodesic acceleration; Transtrum and Sethna 2012, arXiv:1201.5885. The curvature is that along the step, by a
         difference of residuals.)
         """
-        step = straight - state.z
+        step = solution - state.z
         source, model = self.source, state.program.model
-        if not isinstance(source, CalibrationProblem) or state.relative(float(np.linalg.norm(step))) <= STRAIGHT:
-            return straight
+        if not isinstance(source, CalibrationProblem) or state.relative(float(np.linalg.norm(step))) <= NEGLIGIBLE_STEP:
+            return solution
         along = model.A @ step
         ahead = source.whitened_residual(self.scale * (state.z + CURVATURE_STEP * step))
-        bend = (ahead - (model.b - model.A @ state.z) + CURVATURE_STEP * along) / CURVATURE_STEP**2
-        if not np.isfinite(bend).all() or np.linalg.norm(bend) <= CURVATURE * np.linalg.norm(along):
-            return straight
+        acceleration = (ahead - (model.b - model.A @ state.z) + CURVATURE_STEP * along) / CURVATURE_STEP**2
+        if not np.isfinite(acceleration).all() or np.linalg.norm(acceleration) <= CURVATURE * np.linalg.norm(along):
+            return solution
         try:
-            by = self._solved(state.program.on(model.with_values(model.b + bend)), state) - straight
+            by = self._solved(state.program.on(model.with_values(model.b + acceleration)), state) - solution
         except NoSolutionFound:
-            return straight
+            return solution
         if 2 * np.linalg.norm(state.size * by) > CURVATURE_TURN * np.linalg.norm(state.size * step):
-            return straight
-        return straight + by
+            return solution
+        return solution + by
 
     def _accepted(self, state: State, candidate: Program, z: Array, after: float, short: bool) -> State:
         """Return the state at a better point, angles within half a turn."""

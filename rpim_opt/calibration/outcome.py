@@ -81,7 +81,7 @@ class Prediction(NamedTuple):
         return self.coverage_factor * self.standard
 
 
-class Kept(NamedTuple):
+class StoredValues(NamedTuple):
     """Values of a script's functions, which a result file cannot hold.
 
     Active bounds; the equations that a robust loss keeps (None where there were none), the weight that it gives to
@@ -109,9 +109,9 @@ class Outcome:
     history: tuple[Iteration, ...]
     program: Program
     certificate: Certificate
-    asked: Callable[[Source], Self]
+    calibrate_again: Callable[[Source], Self]
     record: Record = field(default_factory=Record)
-    kept: Kept | None = None
+    kept: StoredValues | None = None
     learned: Learned | None = None
     mapping: JointMapping | None = None
     known_causes: tuple[str, ...] | None = None
@@ -496,7 +496,7 @@ class Outcome:
         rest = self.stated.without({flag.label for flag in out})
         reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in out}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
-        return replace(self.asked(rest), record=record)
+        return replace(self.calibrate_again(rest), record=record)
 
     @cached_property
     def active_bounds(self) -> tuple[ActiveBound, ...]:

@@ -10,10 +10,10 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.outcome import Iteration, Kept, Outcome, Prediction
+from rpim_opt.calibration.outcome import Iteration, Outcome, Prediction, StoredValues
 from rpim_opt.calibration.verdict import Verdict, judge, likely_causes, mistakes
 
-__all__ = ["Calibration", "Iteration", "Kept", "Prediction"]
+__all__ = ["Calibration", "Iteration", "Prediction", "StoredValues"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,7 @@ class Calibration(Outcome):
         The convex program at the last linearization.
     certificate
         Evidence that this is a solution, computed anew from the functions that define it.
-    asked
+    calibrate_again
         `calibrate` with all its arguments but the problem.
     record
         Origin of the data, for files and reports.

@@ -20,7 +20,7 @@ from rpim_opt.problem.diagnosis import decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import settled
+from rpim_opt.problem.registration.frames import frame_deviations
 from rpim_opt.problem.row_functions import measured_torques
 from rpim_opt.robot.parameters import own_name
 
@@ -449,7 +449,7 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
         if curves:  # they take up ratios and scales of all kinds
             p = problem.parameters
             alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
-            x = settled(alone)
+            x = frame_deviations(alone)
         causes = list(diagnosis.shown_by_residuals(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))

@@ -74,7 +74,7 @@ class Ready:
         return [self.maker, *self.arguments]
 
 
-def spoken(deviation: float, dimension: str) -> str:
+def as_text(deviation: float, dimension: str) -> str:
     """Return a deviation [SI] as text in mm, mrad, or the parameter's own unit."""
     unit, si = display(dimension)
     if dimension == "angle":
@@ -115,7 +115,7 @@ class Box:
         crossed = np.flatnonzero(lower > upper)
         if len(crossed):
             i = int(crossed[0])
-            low, high = (spoken(side[i] * parameters.scale[i], parameters.dimensions[i]) for side in (lower, upper))
+            low, high = (as_text(side[i] * parameters.scale[i], parameters.dimensions[i]) for side in (lower, upper))
             found = f"for {parameters.names[i]} a lower bound of {low} above the upper one of {high}"
             raise InputError(f"constraint '{self.name}'", found, "lower <= upper")
         if not (np.isfinite(lower).any() or np.isfinite(upper).any()):

@@ -117,7 +117,7 @@ def _huber(v: Any, threshold: Any) -> Any:
     return cp.sum(cp.huber(v, threshold))
 
 
-def lost(name: str) -> Callable[..., Any]:
+def unavailable(name: str) -> Callable[..., Any]:
     """Return a placeholder for functions that a file could not hold; calling it raises InputError."""
 
     def function(*_: Any) -> Any:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.exceptions import Conflict
-from rpim_opt.convex.constraints import Box, Parsed, spoken
+from rpim_opt.convex.constraints import Box, Parsed, as_text
 from rpim_opt.convex.expressions import cp, minimized, substituted
 from rpim_opt.convex.structure import Structure
 
@@ -84,7 +84,7 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
             more = boxes + np.zeros(structure.n)
             for sign, side in zip("><", function.bounds(parameters), strict=True):
                 for i in np.flatnonzero(np.isfinite(side)):
-                    bound = spoken(side[i] * parameters.scale[i], parameters.dimensions[i])
+                    bound = as_text(side[i] * parameters.scale[i], parameters.dimensions[i])
                     demand = z[i] >= side[i] - more[i] if sign == ">" else z[i] <= side[i] + more[i]
                     unit.append(Condition(f"{parameters.names[i]} {sign}= {bound} ({function.name})", (demand,)))
         elif isinstance(function, Parsed):
@@ -92,9 +92,8 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
             unit.append(Condition(function.name, tuple(function.loosened(z, parameters, by))))
             count += 1
         else:
-            demands = [
-                substituted(constraint, {id(structure.answers.z): z}) for constraint in structure.answers.constraints[k]
-            ]
+            own = structure.expressions
+            demands = [substituted(constraint, {id(own.z): z}) for constraint in own.constraints[k]]
             name = name_of(function, k)
             several = len(demands) > 1
             unit = [Condition(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]

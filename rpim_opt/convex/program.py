@@ -285,7 +285,7 @@ class Program(Brief):
         """
         if self.loss_form is not None:
             return None
-        return inliers_of(self.formulation, self.norms(z), self.model.members[1], self.structure.answers.loss)
+        return inliers_of(self.formulation, self.norms(z), self.model.members[1], self.structure.expressions.loss)
 
     def inlier_model(self, z: Array) -> LinearModel:
         """Return the equivalent squared-loss model of a robust fit: the rows kept at z (n,), downweighted.
@@ -311,15 +311,15 @@ class Program(Brief):
             cp.Parameter(b.shape, name="b", value=b),
             cp.Parameter(nonneg=True, name="weight", value=self._weight(weight)),
         )
-        return self._written(data, self.structure.answers.live, None)[0]
+        return self._written(data, self.structure.expressions.live, None)[0]
 
     def _written(self, data: tuple[Any, Any, Any], stated: tuple[Any, Any, Any], damping: Damping | None) -> Any:
         """Return a CVXPY problem, its variable z, and the formulation's constraints by function."""
-        shape, answers = self.structure, self.structure.answers
+        shape, expressions = self.structure, self.structure.expressions
         loss, penalty, groups = stated
         A, b, weight = data
         z, r = cp.Variable(shape.n, name="z"), cp.Variable(shape.equations, name="r")
-        instead = {id(answers.z): z, id(answers.r): r}
+        instead = {id(expressions.z): z, id(expressions.r): r}
         groups = [[substituted(constraint, instead) for constraint in group] for group in groups]
         every = [r == A @ z - b]
         every += [constraint for group in groups for constraint in group]
@@ -470,7 +470,7 @@ class Program(Brief):
                 price = price - duals[-1]
             return tuple(duals)
         values = canonical.duals(found.x, found.dual)
-        groups = self.structure.answers.constraints
+        groups = self.structure.expressions.constraints
         return self._by_function([[np.ravel(np.asarray(values[c.id], dtype=float)) for c in group] for group in groups])
 
     def _by_function(self, groups: Sequence[Sequence[Array]]) -> tuple[Array, ...]:
@@ -497,7 +497,7 @@ class Program(Brief):
         if not isinstance(solver, str) or solver.upper() not in cp.installed_solvers():
             installed = ", ".join(cp.installed_solvers())
             raise InputError("solver", f"{solver!r}", f"an installed solver: {installed}")
-        problem, z, groups = self._written((*self.rows, weight), self.structure.answers.stated, damping)
+        problem, z, groups = self._written((*self.rows, weight), self.structure.expressions.stated, damping)
         for variable in problem.variables():
             variable.save_value(None)
         with warnings.catch_warnings():

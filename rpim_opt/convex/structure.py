@@ -53,7 +53,7 @@ MOST_CANONICALIZED = 20_000
 """Equations up to which another loss is canonicalized to see whether it is one of those."""
 
 
-class Answers:
+class Expressions:
     """Expressions that a formulation's functions return, with private copies of the user's parameters and variables.
 
     ``loss`` and ``penalty`` are of what they get (residuals or norms, z or norms of groups), ``penalty_of_z`` and
@@ -155,7 +155,7 @@ class Structure:
         self.n, self.equations, self.groups = len(parameters), equations, groups
         self.constrained = bool(formulation.constraints) or not formulation.solvable
         self._lock = threading.RLock()
-        self._called: Answers | None = None
+        self._called: Expressions | None = None
         self._declared = declared(formulation) or not formulation.solvable
         if not formulation.solvable:
             self.box = None
@@ -163,20 +163,20 @@ class Structure:
         elif self._declared:
             self.box  # noqa: B018 - limits that do not fit the parameters are refused now
         else:  # a user's functions may return another thing later
-            self.answers  # noqa: B018
+            self.expressions  # noqa: B018
 
     @property
-    def answers(self) -> Answers:
+    def expressions(self) -> Expressions:
         """The expressions; the functions are called once, whichever thread needs them first."""
         with self._lock:
             if self._called is None:
-                self._called = Answers(self.formulation, self.parameters, self.equations, self.groups)
+                self._called = Expressions(self.formulation, self.parameters, self.equations, self.groups)
         return self._called
 
     @property
     def predicts(self) -> bool:
         """Whether constraints use positions, which are linear about some point."""
-        return not self._declared and self.answers.predicts
+        return not self._declared and self.expressions.predicts
 
     @property
     def over_norms(self) -> bool:
@@ -185,7 +185,7 @@ class Structure:
 
     def of_r(self, stated: Any) -> Any:
         """Return an expression of what the loss gets as one of r."""
-        seen, r = self.answers.loss.variable, self.answers.r
+        seen, r = self.expressions.loss.variable, self.expressions.r
         return stated if seen is r else substituted(stated, {id(seen): norms(r, self.groups)})
 
     def on_squares(self) -> Structure:
@@ -206,7 +206,7 @@ class Structure:
     @property
     def fingerprint(self) -> Any:
         """What the functions returned, hashable."""
-        a = self.answers
+        a = self.expressions
         stated = [a.z, a.loss.variable, a.loss.expression, a.penalty_of_z, a.constraints, a.differences, a.predicts]
         return fingerprint(stated, {})
 
@@ -217,7 +217,7 @@ class Structure:
         """The quadratic of r that the loss is."""
         which = self.groups if self.over_norms else np.arange(self.equations)
         form = declared_form(self.formulation.loss, int(which.max()) + 1)
-        form = form or quadratic(self.answers.loss.expression, self.answers.loss.variable)
+        form = form or quadratic(self.expressions.loss.expression, self.expressions.loss.variable)
         if form is None or not self.over_norms:
             return form
         if not form.diagonal or form.c.any():
@@ -230,13 +230,13 @@ class Structure:
         if self.formulation.penalty is None:
             return None
         groups = self.formulation.penalty_over is not None
-        form = declared_form(self.formulation.penalty, len(self.answers.differences) if groups else self.n)
-        form = form or quadratic(self.answers.penalty.expression, self.answers.penalty.variable)
+        form = declared_form(self.formulation.penalty, len(self.expressions.differences) if groups else self.n)
+        form = form or quadratic(self.expressions.penalty.expression, self.expressions.penalty.variable)
         if form is None or not groups:
             return form
         if not form.diagonal or form.c.any():
             return None
-        L = np.vstack([root * D for root, D in zip(form.L, self.answers.differences, strict=True)])
+        L = np.vstack([root * D for root, D in zip(form.L, self.expressions.differences, strict=True)])
         return Quadratic(L, np.zeros(len(L)), form.constant)
 
     @cached_property
@@ -258,10 +258,10 @@ class Structure:
         """Penalty and constraints of z in canonical form."""
         if self.box is not None and (self.formulation.penalty is None or self.penalty_form is not None):
             return Canonical.box(self.penalty_form, *self.box)
-        penalty = self.answers.penalty_of_z
+        penalty = self.expressions.penalty_of_z
         with self._lock:
             constant = cp.Constant(0.0) if penalty is None else penalty
-            return Canonical(constant, self.answers.flat, self.answers.z, self.joint)
+            return Canonical(constant, self.expressions.flat, self.expressions.z, self.joint)
 
     @cached_property
     def loss(self) -> Loss | None:
@@ -269,21 +269,24 @@ class Structure:
         if self.loss_form is not None:
             return None
         with self._lock:
-            return Loss(self.answers.loss.expression, self.answers.loss.variable, self.over_norms, self.joint)
+            return Loss(self.expressions.loss.expression, self.expressions.loss.variable, self.over_norms, self.joint)
 
     # --- values ------------------------------------------------------------------------------------------------
 
     @cached_property
     def inner(self) -> bool:
         """Whether loss or penalty have variables of their own: a value is a minimum over them."""
-        return not self._declared and bool(self.answers.owned(self.answers.loss.expression, self.answers.penalty_of_z))
+        if self._declared:
+            return False
+        a = self.expressions
+        return bool(a.owned(a.loss.expression, a.penalty_of_z))
 
     @cached_property
     def joint(self) -> list[cp.Variable]:
         """The variables of their own that the loss shares with penalty or constraints."""
         if self._declared:
             return []
-        a = self.answers
+        a = self.expressions
         shared = a.owned(a.loss.expression) & a.owned(a.penalty_of_z, *a.flat)
         return [v for v in a.loss.expression.variables() if v.id in shared]
 
@@ -291,7 +294,7 @@ class Structure:
         """Return loss and penalty at numbers; variables of the functions' own are at their best."""
         if not self.inner:
             return self.loss_of(r), self.penalty_of(z)
-        a, v, form = self.answers, self.seen(r), self.loss
+        a, v, form = self.expressions, self.seen(r), self.loss
         if form is not None and form.threshold is not None and not (self.joint or a.owned(a.penalty_of_z)):
             return form.best(v)[0], self.penalty_of(z)
         with self._lock:
@@ -308,7 +311,7 @@ class Structure:
     @cached_property
     def _over_own(self) -> tuple[cp.Problem, list[cp.Parameter]]:
         """The program of the functions' own variables, its parameters z, what the loss gets, and the weight."""
-        a = self.answers
+        a = self.expressions
         fixed = a.z, a.loss.variable
         at, weight = [cp.Parameter(variable.size) for variable in fixed], cp.Parameter(nonneg=True)
         total: Any = a.loss.expression if a.owned(a.loss.expression) else 0.0
@@ -322,16 +325,16 @@ class Structure:
         """Return the loss of a residual (m,)."""
         if self.formulation.loss == SQUARES:  # of residuals or of norms
             return float(r @ r)
-        return self.answers.loss(self.seen(r))
+        return self.expressions.loss(self.seen(r))
 
     def penalty_of(self, z: Array) -> float:
         """Return the penalty of z (n,)."""
         if self.formulation.penalty is None:
             return 0.0
         if self.formulation.penalty_over is not None:
-            z = np.array([float(np.linalg.norm(D @ z)) for D in self.answers.differences])
+            z = np.array([float(np.linalg.norm(D @ z)) for D in self.expressions.differences])
         form = declared_form(self.formulation.penalty, len(z))
-        return self.answers.penalty(z) if form is None else form.value(z)
+        return self.expressions.penalty(z) if form is None else form.value(z)
 
     def seen(self, r: Array) -> Array:
         """Return the argument of the loss for a residual: the residual, or the norms of the configurations."""
@@ -339,13 +342,13 @@ class Structure:
 
     def met(self, z: Array) -> bool:
         """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""
-        own = self.answers.z
+        own = self.expressions.z
         with self._lock:
-            if any(variable is not own for limit in self.answers.flat for variable in limit.variables()):
+            if any(variable is not own for limit in self.expressions.flat for variable in limit.variables()):
                 return False
             own.save_value(z)
             with np.errstate(all="ignore"):
-                return not any(np.any(limit.violation() > 0) for limit in self.answers.flat)
+                return not any(np.any(limit.violation() > 0) for limit in self.expressions.flat)
 
 
 def structure(

@@ -185,7 +185,7 @@ def in_parts(problem: Source) -> Source:
 
 def _beside(problem: RobotModel) -> dict[str, Any]:
     """Return what a problem knows besides robots, parameters and data."""
-    return {"asked": problem.asked, "repeatability": problem.repeatability}
+    return {"frozen_functions": problem.frozen_functions, "repeatability": problem.repeatability}
 
 
 def _on_part(

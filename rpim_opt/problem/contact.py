@@ -24,7 +24,7 @@ class Moved(NamedTuple):
 
 
 @dataclass(frozen=True, eq=False)
-class Thing:
+class Feature:
     """The point or plane of best fit to the positions p_i (K, 3) of its touches.
 
     A touch of a point shows where it is, p_i; of a plane how far it is along the normal n, s_i = n'(p_i - centre), its
@@ -48,7 +48,7 @@ class Thing:
     shown: Array
 
     @classmethod
-    def of(cls, positions: Array, planar: bool) -> Thing:
+    def of(cls, positions: Array, planar: bool) -> Feature:
         """Return the best-fitting point or plane of touches at (K, 3) [m]."""
         centre = positions.mean(axis=0)
         one = np.ones((len(positions), 1))
@@ -69,7 +69,7 @@ class Thing:
         return len(self.shown) == 1
 
     @property
-    def level(self) -> Thing:
+    def level(self) -> Feature:
         """The point or plane with its touches on it, and parallel planes made parallel: nominal errors are no noise."""
         return replace(self, height=np.zeros_like(self.height), axis=None)
 
@@ -126,7 +126,7 @@ class Thing:
 
 CLOSE = 0.05  # touches that spread by less [m] do not show how large a robot is, whatever else is known
 ROUNDING = 1e-12  # relative size of a covariance that is none
-Things = Sequence[Thing]
+Features = Sequence[Feature]
 
 
 class Tie(NamedTuple):
@@ -143,7 +143,7 @@ class Touches:
     """Assignment of equations to touched points and planes, and their elimination.
 
     Touches at p_i have the equations c - p_i ~ 0 with an unknown point c, or n'(p_i - c) ~ 0 with a plane.
-    Their best values follow from the touches (`Thing`), and what the equations say of the robot alone are contrasts,
+    Their best values follow from the touches (`Feature`), and what the equations say of the robot alone are contrasts,
     which do not depend on them: c is a fixed effect, exactly. What a drawing knows of two of them is an equation of
     these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for square ones,
     n_2 along two directions in the first for parallel ones.
@@ -184,9 +184,9 @@ class Touches:
         rows = tuple(np.array(first)[:, None] + np.arange(3) for first in at.values())
         return cls(rows, tuple(planar.values()), tuple(ties), sum(map(np.size, numbers)))
 
-    def located(self, residual: Array) -> Things:
+    def located(self, residual: Array) -> Features:
         """Return where points and planes are, of a residual (m,) that is -p_i for touches."""
-        return [Thing.of(-residual[index], flat) for index, flat in zip(self.rows, self.planar, strict=True)]
+        return [Feature.of(-residual[index], flat) for index, flat in zip(self.rows, self.planar, strict=True)]
 
     def size(self, residual: Array) -> float:
         """Return how far all touches spread (RMS distance from their mean) [m], of a residual as `located` has it."""
@@ -226,7 +226,7 @@ class Touches:
             slopes[tie.equations] = sum(G @ jacobian[index.ravel()] for index, G in self.through(tie, where))
         return left, slopes
 
-    def through(self, tie: Tie, where: Things) -> list[tuple[np.ndarray, Array]]:
+    def through(self, tie: Tie, where: Features) -> list[tuple[np.ndarray, Array]]:
         """Return equations (K, 3) of a tie's two things, and how what it compares follows their positions (e, 3K)."""
         first, second = (where[end] for end in tie.ends)
         rows = [self.rows[end] for end in tie.ends]
@@ -250,7 +250,7 @@ class Touches:
             slopes = [-u @ one.centre, u @ other.centre]
         return [(index, np.atleast_2d(G)) for index, G in zip(rows, slopes, strict=True)]
 
-    def kept(self, where: Things) -> np.ndarray:
+    def kept(self, where: Features) -> np.ndarray:
         """Return which of the equations' places contrasts have (m,)."""
         mask = np.ones(self.equations, dtype=bool)
         for thing, index in zip(where, self.rows, strict=True):
@@ -258,7 +258,7 @@ class Touches:
             mask[thing.kept(index)] = True
         return mask
 
-    def contrasts(self, values: Array, where: Things) -> Array:
+    def contrasts(self, values: Array, where: Features) -> Array:
         """Return what m equations' values (m, c), as of `centred`, say without points and planes, (k, c)."""
         contrasts = values.copy()
         for thing, index in zip(where, self.rows, strict=True):
@@ -266,7 +266,7 @@ class Touches:
             contrasts[thing.kept(index)] = np.tensordot(thing.aside.T, shown, axes=1)
         return contrasts[self.kept(where)]
 
-    def noise(self, where: Things) -> scipy.sparse.csr_matrix:
+    def noise(self, where: Features) -> scipy.sparse.csr_matrix:
         """Return by which noise of the m equations that of the contrasts is made, (k, m)."""
         transform = scipy.sparse.identity(self.equations, format="lil")
         for thing, index in zip(where, self.rows, strict=True):
@@ -277,7 +277,7 @@ class Touches:
         return transform.tocsr()[self.kept(where)]
 
 
-def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: np.ndarray) -> list[Stack]:
+def contrasted(touches: Touches, stacks: Sequence[Stack], where: Features, stop: np.ndarray) -> list[Stack]:
     """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops.
 
     Equations of a configuration whose noise is independent of each other's come in several.
@@ -317,7 +317,7 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Things, stop: n
     return [Stack(*map(np.stack, zip(*same, strict=True))) for same in by_size.values()]
 
 
-def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Things, reading: bool) -> list[Array]:
+def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Features, reading: bool) -> list[Array]:
     """Return the covariance of every row's residual, of those (N, k, k) or (1, k, k) [SI] of rows by themselves."""
     numbers = [index[:, 0] for index in equation_numbers(data)]
     touch = np.zeros((touches.equations, 3, 3))

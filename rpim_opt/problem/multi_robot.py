@@ -18,7 +18,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import met
+from rpim_opt.problem.registration.frames import shared_bases
 from rpim_opt.robot.parameters import concatenated, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
@@ -81,7 +81,7 @@ def together(
     robots = {name: part.robot for name, part in parts.items()}
     data = Dataset.of_robots({name: part.data for name, part in parts.items()}).grouped_by_points()
     whole = CalibrationProblem(robots, concatenated(tables), data)
-    met(whole)  # what is touched by several robots is in one place
+    shared_bases(whole)  # what is touched by several robots is in one place
     return whole
 
 

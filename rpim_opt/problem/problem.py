@@ -18,12 +18,12 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import READY
-from rpim_opt.problem.contact import Things, Touches, contrasted, of_rows
+from rpim_opt.problem.contact import Features, Touches, contrasted, of_rows
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.noise import Equations, Repeatability, Stack, equation_numbers
 from rpim_opt.problem.row_functions import (
     Functions,
-    Kept,
+    RowFunctions,
     Structure,
     loads_in,
     loads_of,
@@ -61,7 +61,7 @@ class RobotModel(Tabled):
     keeps_rows: ClassVar[bool] = True  # whether `linearize` returns the equations themselves, and not their QR factor
     robots: Robot | Mapping[str, Robot]
     parameters: Parameters
-    asked: Kept | None = field(default=None, repr=False, kw_only=True)
+    frozen_functions: RowFunctions | None = field(default=None, repr=False, kw_only=True)
     repeatability: Repeatability | None = field(default=None, kw_only=True)
 
     def sample(self) -> CalibrationProblem:
@@ -152,9 +152,9 @@ class RobotModel(Tabled):
         A measurement of a script may read a variable, an attribute, a file: `residual` and its like ask it anew at
         every call. Within a calibration one answer has to serve from the first iteration to the last.
         """
-        if self.asked is not None:
+        if self.frozen_functions is not None:
             return self
-        copy = replace(self, asked=Kept())
+        copy = replace(self, frozen_functions=RowFunctions())
         for block in copy.sample().data.blocks:
             copy.sample().functions(block)
         return copy
@@ -165,7 +165,7 @@ class CalibrationProblem(RobotModel):
     """What was measured on which robot (of several by name, as `together` has them), and which parameters explain it.
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand in the order
-    of the data's blocks. ``asked`` are the functions that `frozen` keeps, None where every call asks the measurement
+    of the data's blocks. ``frozen_functions`` are those that `frozen` keeps, None where every call asks the measurement
     models anew; ``repeatability`` is the robot's repeatability, None for the instrument's noise alone. InputError when
     nothing is identified, or the data do not fit the robot or the parameters.
 
@@ -318,7 +318,7 @@ class CalibrationProblem(RobotModel):
                 robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
                 tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
             )  # fmt: skip
-        return (self.asked or Kept())(self._structures[block], block.measurement)
+        return (self.frozen_functions or RowFunctions())(self._structures[block], block.measurement)
 
     @cached_property
     def _sessions(self) -> dict[str, tuple[str, ...]]:
@@ -469,7 +469,7 @@ class CalibrationProblem(RobotModel):
         return Touches.of(self.data)
 
     @cached_property
-    def touched(self) -> Things:
+    def touched(self) -> Features:
         """Touched points and planes in the base frame, located by the nominal robot."""
         if self.touches is None:
             return ()

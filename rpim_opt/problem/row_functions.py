@@ -54,25 +54,25 @@ class Structure(NamedTuple):
     sessions: tuple[str, ...] = ()
 
 
-class Kept:
-    """Functions of rows: of ready measurements built once, of a user's by the answer that it gave when first asked.
+class RowFunctions:
+    """Functions of rows: of ready measurements built once, of a user's by its first return value.
 
-    A calibration works with one from its first iteration to its last. It is sent to other processes with the answers,
-    expressions as text: there a user's function may be another one.
+    A calibration works with one from its first iteration to its last. It is sent to other processes with its
+    expressions as text (``serialized``): there a user's function may be another one.
     """
 
-    def __init__(self, answers: Mapping[tuple[Structure, Measurement], str] = MappingProxyType({})) -> None:
-        self.answers = dict(answers)
+    def __init__(self, serialized: Mapping[tuple[Structure, Measurement], str] = MappingProxyType({})) -> None:
+        self.serialized = dict(serialized)
 
     def __call__(self, structure: Structure, measurement: Measurement) -> Functions:
         """Return the functions as they were when they were first asked for."""
         if measurement in _READY and all(term.ready for term in structure.terms):  # they depend on nothing else
             return _ready(structure, measurement)
         with SYMBOLS:
-            if (structure, measurement) not in self.answers:
+            if (structure, measurement) not in self.serialized:
                 inputs, outputs = _expressions(structure, measurement)
-                self.answers[structure, measurement] = ca.Function("row", inputs, outputs).serialize()
-            return _built(self.answers[structure, measurement])
+                self.serialized[structure, measurement] = ca.Function("row", inputs, outputs).serialize()
+            return _built(self.serialized[structure, measurement])
 
 
 @lru_cache(maxsize=MANY)

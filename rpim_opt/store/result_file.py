@@ -24,10 +24,10 @@ from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import ActiveBound, ShadowPrice
 from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate, mapped_as
-from rpim_opt.calibration.result import Calibration, Iteration, Kept
+from rpim_opt.calibration.result import Calibration, Iteration, StoredValues
 from rpim_opt.convex import constraints
 from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
-from rpim_opt.convex.formulation import Formulation, huber, lost
+from rpim_opt.convex.formulation import Formulation, huber, unavailable
 from rpim_opt.convex.program import Program, pose
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.convex.robust_loss import kept_equations
@@ -344,7 +344,7 @@ def _name(function: Callable[..., Any] | None) -> str | list[Any] | None:
 
 def _function(stated: Any, name: str) -> Any:
     if stated is None:
-        return lost(name)
+        return unavailable(name)
     if stated == "none":
         return None
     if isinstance(stated, str):
@@ -373,13 +373,13 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
     if learned is None:
         weight = SELECTORS.get(file.selection.name, file.weight) if file.selection else file.weight
     extensions = "auto" if learned is not None and learned.trials else "geometry"
-    asked = partial(calibrate, formulation=formulation, weight=weight, model=extensions)
+    again = partial(calibrate, formulation=formulation, weight=weight, model=extensions)
     return Calibration(
         problem,
         formulation,
         **{name: getattr(file, name) for name in SHARED},
         program=program,
-        asked=mapped_as(file.mapping, asked),
+        calibrate_again=mapped_as(file.mapping, again),
         record=replace(file.record, validation=validation, digest=file.digest),
         kept=None if formulation.solvable else _kept(file, program),
         known_causes=file.causes,
@@ -420,15 +420,15 @@ def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: s
     return replace(data, blocks=tuple(blocks))
 
 
-def _kept(file: Stored, program: Program) -> Kept:
+def _kept(file: Stored, program: Program) -> StoredValues:
     """Return the values of a script's functions as they were saved; they cannot be called again."""
     if file.inliers is None:
-        return Kept(file.active_bounds, None, shadow_prices=file.shadow_prices)
+        return StoredValues(file.active_bounds, None, shadow_prices=file.shadow_prices)
     factor, left_out = file.inliers.factor**2, file.inliers.left_out
     keep = np.ones(len(program.model.b), dtype=bool)
     keep[left_out] = False
     equations = kept_equations(program.model, keep, factor)
-    return Kept(file.active_bounds, equations, factor, tuple(left_out), file.shadow_prices)
+    return StoredValues(file.active_bounds, equations, factor, tuple(left_out), file.shadow_prices)
 
 
 # --- dataclasses, named tuples, arrays and mappings as JSON and back, by annotations -----------------------------
@@ -457,11 +457,11 @@ def _converter() -> Any:
     made.register_unstructure_hook_factory(is_namedtuple, namedtuple_dict_unstructure_factory)
     made.register_structure_hook_func(_is_array, _array)
     made.register_unstructure_hook_func(_is_array, _listed)
-    elsewhere = override(omit=True)
+    omitted = override(omit=True)
     by_name = override(unstruct_hook=lambda kind: kind.name, struct_hook=lambda name, _: _scalar(name, str))
     fields: dict[type, dict[str, Any]] = {
-        Record: {"validation": elsewhere, "digest": elsewhere},  # among the data; of the file itself
-        Robot: {"model": elsewhere},  # functions of a script, who gives them again
+        Record: {"validation": omitted, "digest": omitted},  # among the data; of the file itself
+        Robot: {"model": omitted},  # functions of a script, who gives them again
         Block: {"measurement": by_name},
         Dataset: {"configuration": override(unstruct_hook=_listed, struct_hook=lambda v, _: _array(v, np.ndarray))},
     }

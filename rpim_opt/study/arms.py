@@ -44,7 +44,7 @@ class SimulatedArm(NamedTuple):
 
 
 def simulated_arm(
-    seed: int, count: int, noise: float = 3e-5, offset: float = 0.0, physics: float = 0.0
+    seed: int, count: int, noise: float = 3e-5, offset: float = 0.0, effects: float = 0.0
 ) -> SimulatedArm:
     """Return a simulated arm; the seeds 0, 1, 2, ... take turns between three robots.
 
@@ -54,7 +54,7 @@ def simulated_arm(
 
     The ``seed`` is that of the arm; ``count``, the number of configurations to identify from, changes neither its truth
     nor those it shares with a smaller one. ``noise`` is the standard deviation of a coordinate [m], declared as it is,
-    ``offset`` the angle [rad] by which one joint, neither the first nor the last, is off besides. ``physics`` is the
+    ``offset`` the angle [rad] by which one joint, neither the first nor the last, is off besides. ``effects`` is the
     angle [rad] of what no geometry holds: joints sag by up to so much under the weight of all that they carry, and
     their encoders are off by a third of it times the cosine of their angle. Links weigh what they please: each as much
     as the one behind it or more, by an unknown factor.
@@ -81,7 +81,7 @@ def simulated_arm(
     there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (VALIDATION_COUNT, robot.dof))
     q = np.random.default_rng([seed, 1]).uniform(limits[:, 0], limits[:, 1], (count, robot.dof))
 
-    moved = _moved(robot, physics, np.random.default_rng([seed, 5]))
+    moved = _moved(robot, effects, np.random.default_rng([seed, 5]))
 
     def measured(joints: Array, level: float, stream: int) -> Dataset:
         T = base @ frames(robot, moved(joints), errors)[-1]

@@ -334,7 +334,7 @@ def _recalibrated(
             local=np.append(learned.local, np.ones(len(more))),
             drift=np.zeros((len(updated.x), 0)),  # the prior holds what was not known of the scales
         )
-    return replace(updated, learned=learned, asked=partial(calibrate, formulation=formulation, weight=1.0))
+    return replace(updated, learned=learned, calibrate_again=partial(calibrate, formulation=formulation, weight=1.0))
 
 
 # --- every parameter, frame and reading as a cause of a misfit ----------------------------------------------

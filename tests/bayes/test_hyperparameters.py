@@ -84,7 +84,7 @@ def test_what_was_stated_comes_back() -> None:
 def test_refitting_learns_anew_from_the_stated_scales() -> None:
     instance = ro.load("blunders")
     result = ro.calibrate(instance.problem, noise="declared")
-    again = result.asked(result.stated)
+    again = result.calibrate_again(result.stated)
     assert np.allclose(again.x, result.x, rtol=1e-4, atol=1e-7)
 
 

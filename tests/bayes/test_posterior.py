@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
-from rpim_opt.bayes.population import of_data
+from rpim_opt.bayes.population import data_likelihood
 from rpim_opt.problem.linear import LinearModel
 
 PROBLEM = ro.load("position").problem
@@ -158,7 +158,7 @@ def test_two_campaigns_of_one_arm_end_where_one_with_all_rows_does() -> None:
 def test_the_data_alone_say_what_least_squares_says() -> None:
     linear = model(1, rows=60)
     result = result_of(ro.tikhonov, linear, 1e6)
-    names, rows, values = of_data(result)
+    names, rows, values = data_likelihood(result)
     robot = ~FREE.of_frames
     H = linear.A.T @ linear.A + np.diag(np.where(robot, 0.0, 0.01))  # frames are ten scales wide
     wanted = np.linalg.solve(H, linear.A.T @ linear.b) * FREE.scale

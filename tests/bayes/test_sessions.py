@@ -32,7 +32,7 @@ def turned(points: Array, shift: Array, turn: Array) -> Array:
 
 def in_sessions(seed: int, names: list[str], size: float = 1.0, physics: float = 0.0) -> ro.CalibrationProblem:
     """Return a simulated arm whose rows were measured in the sessions of these names, one a row."""
-    problem = ro.study.simulated_arm(seed, len(names), physics=physics).problem
+    problem = ro.study.simulated_arm(seed, len(names), effects=physics).problem
     rng = np.random.default_rng([seed, 99])
     y = problem.data.blocks[0].y.copy()
     for name in dict.fromkeys(names):

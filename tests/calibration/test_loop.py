@@ -52,7 +52,7 @@ def test_the_objective_follows_the_weight() -> None:
     assert first.merit == pytest.approx(before.program.objective(before.z, 2.0), rel=1e-12)
     passed = replace(first, history=(Iteration(1.0, 1.0, 2.0, 0.0),), merit=-1.0)
     same = loop().chosen(passed)
-    assert (same.merit, same.choice.answers) == (-1.0, (2.0, 2.0))
+    assert (same.merit, same.choice.weights) == (-1.0, (2.0, 2.0))
     other = loop().chosen(same)
     assert other.merit == pytest.approx(before.program.objective(before.z, 3.0), rel=1e-12)
     given = state(z=np.ones(N), merit=-1.0, history=passed.history)
@@ -71,7 +71,7 @@ def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, dampi
     before = state(formulation=ro.robust, z=z, program=there, choice=choice, damping=damping, idle=2)
     before = replace(before, merit=there.objective(z, 1.0))
     after = loop(formulation=ro.robust).advanced(before)
-    assert after.choice.answers == ((5.0,) if asks else ())
+    assert after.choice.weights == ((5.0,) if asks else ())
     if asks:
         assert np.array_equal(after.z, z)
         assert (after.choice.weight, after.outcome, after.idle) == (5.0, "", 0)
@@ -80,7 +80,7 @@ def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, dampi
 
 def test_at_rest_a_weight_is_asked_for_once_more() -> None:
     def resting(*weights: float, outcome: str = "rest") -> State:
-        choice = weight_choice(answering(2.0, *weights), True).asked(state().program).after(0.0)
+        choice = weight_choice(answering(2.0, *weights), True).updated(state().program).after(0.0)
         return state(choice=choice, z=np.ones(N), merit=-1.0, outcome=outcome, idle=2)
 
     same = loop().confirmed(resting(2.0))
@@ -111,7 +111,7 @@ def test_data_that_are_not_finite_are_refused(part: str) -> None:
     at = loop()
     broken = Broken(**vars(at))
     with pytest.raises(ro.InputError, match="non-finite residuals or derivatives"):
-        broken.begun(weight_choice(1.0, True), None)
+        broken.initial(weight_choice(1.0, True), None)
 
 
 def test_a_loop_begins_at_a_point_that_meets_the_constraints() -> None:
@@ -119,15 +119,15 @@ def test_a_loop_begins_at_a_point_that_meets_the_constraints() -> None:
     boxed = ro.Formulation("boxed", penalty=cp.sum_squares, constraints=(box,))
     scale = PROBLEM.parameters.free.scale
     start = np.linspace(-2, 2, N)
-    first = loop(formulation=boxed).begun(weight_choice(1.0, True), start * scale)
+    first = loop(formulation=boxed).initial(weight_choice(1.0, True), start * scale)
     assert first.z == pytest.approx(np.clip(start, -0.5, 0.5), abs=1e-12)
     there = PROBLEM.linearize(scale * first.z)
     assert pytest.approx(there.A, rel=1e-9, abs=1e-9) == first.program.model.A
     assert first.merit == pytest.approx(first.program.objective(first.z, 1.0), rel=1e-12)
     assert first.size == pytest.approx(np.linalg.norm(there.A, axis=0), rel=1e-9)
-    inside = loop(formulation=boxed).begun(weight_choice(1.0, True), 0.1 * scale)
+    inside = loop(formulation=boxed).initial(weight_choice(1.0, True), 0.1 * scale)
     assert inside.z == pytest.approx(np.full(N, 0.1), rel=1e-12)
-    assert (loop().begun(weight_choice(1.0, True), None).z == 0).all()
+    assert (loop().initial(weight_choice(1.0, True), None).z == 0).all()
 
 
 @pytest.mark.parametrize(("configurations", "enough"), [(11, False), (12, True)])
@@ -137,12 +137,12 @@ def test_equations_are_as_many_as_parameters_or_there_is_a_weight(configurations
     for formulation, weight in ((ro.least_squares, 0.0), (ro.tikhonov, 0.0)):
         at = loop(few, formulation)
         if enough:
-            assert at.begun(weight_choice(weight, True), None).evaluations == 1
+            assert at.initial(weight_choice(weight, True), None).evaluations == 1
         else:
             with pytest.raises(ro.InputError, match="33 equations for 34 parameters"):
-                at.begun(weight_choice(weight, True), None)
+                at.initial(weight_choice(weight, True), None)
     for weight in (1e-3, answering(1.0)):
-        assert loop(few).begun(weight_choice(weight, True), None).evaluations == 1
+        assert loop(few).initial(weight_choice(weight, True), None).evaluations == 1
 
 
 def test_passes_are_reported_as_they_come() -> None:
@@ -308,6 +308,6 @@ def test_a_start_outside_of_the_constraints_is_moved_inside_before_the_first_pas
     start = np.zeros(len(free))
     start[3] = 7 * free.tolerance[3]
     at = Loop.of(tight, ro.bounded, Options())
-    x = free.scale * at.begun(weight_choice(1.0, True), start).z
+    x = free.scale * at.initial(weight_choice(1.0, True), start).z
     assert (np.abs(x) <= free.tolerance * (1 + 1e-9)).all()
     assert x == pytest.approx(np.clip(start, -free.tolerance, free.tolerance))

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.hyperparameters import Learned, LeftOut, Size, Trial
+from rpim_opt.bayes.hyperparameters import ExcludedRow, Learned, Size, Trial
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, repeatability_bounds
 from rpim_opt.calibration.certificate import Certificate, certified
@@ -189,7 +189,7 @@ def test_extensions_are_compared_with_the_best_model_without_them() -> None:
 
 @pytest.mark.parametrize(("count", "more"), [(1, ""), (5, ""), (7, " and 2 more")])
 def test_blunders_are_named_and_the_others_counted(count: int, more: str) -> None:
-    (text,) = said(learned(left_out=tuple(LeftOut(f"r{k}", 9.0) for k in range(count))))
+    (text,) = said(learned(left_out=tuple(ExcludedRow(f"r{k}", 9.0) for k in range(count))))
     assert text.startswith("Excluded outliers: r0 (9 times the median error)")
     assert text.endswith(f"median error){more}.")
     assert text.count("times") == min(count, 5)

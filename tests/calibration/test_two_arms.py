@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.words import touch_errors
-from rpim_opt.problem.registration.frames import met
+from rpim_opt.problem.registration.frames import shared_bases
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 
 SIGMA = 3e-5
@@ -73,7 +73,7 @@ def base_of(problem: ro.CalibrationProblem) -> list[int]:
 def test_the_base_is_found_from_nothing(cell, result) -> None:
     """It stands a metre away and was stated nowhere: within the errors of nominal robots, and then of calibrated."""
     problem, _ = cell
-    assert np.abs(met(problem)["right"][:3] - STANDS[:3]).max() < 0.03
+    assert np.abs(shared_bases(problem)["right"][:3] - STANDS[:3]).max() < 0.03
     assert result.converged
     k = base_of(result.problem)
     found = numeric_frame(result.problem.parameters.free.nominal[k])
@@ -155,7 +155,7 @@ def test_points_on_a_line_place_no_base(line: list[str]) -> None:
     parts = {}
     for name, arm, base in (("left", arm_of(ALL), np.zeros(6)), ("right", arm_of([*ALL, "base_*"]), STANDS)):
         parts[name] = arm.on(touched(arm, np.zeros(len(arm.parameters.free)), base, some, 2, rng, sigma=0.0))
-    assert met(ro.together(**parts, shared=[])) == {}
+    assert shared_bases(ro.together(**parts, shared=[])) == {}
 
 
 def test_a_robot_that_an_instrument_sees_stands_where_that_says(cell) -> None:
@@ -170,7 +170,7 @@ def test_a_robot_that_an_instrument_sees_stands_where_that_says(cell) -> None:
     with pytest.raises(ro.InputError, match="from those of another robot"):
         ro.together(left=left, right=both_kinds, shared=[])
     stated = both_kinds.with_parameters(replace(p, nominal=nominal))
-    assert met(ro.together(left=left, right=stated, shared=[])) == {}
+    assert shared_bases(ro.together(left=left, right=stated, shared=[])) == {}
 
 
 @pytest.mark.slow

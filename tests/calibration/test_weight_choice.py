@@ -13,7 +13,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration import loop
-from rpim_opt.calibration.loop import MOST_ANSWERS, SETTLED, WeightChoice, weight_choice
+from rpim_opt.calibration.loop import MOST_CHOICES, SETTLED, WeightChoice, weight_choice
 
 PROGRAM: Any = SimpleNamespace(closed_form=True)
 DEAR: Any = SimpleNamespace(closed_form=False)
@@ -45,7 +45,7 @@ def ending(*answers: float) -> Callable[[Any], ro.select.Selection]:
 
 def followed(*answers: float) -> WeightChoice:
     """The choice after all answers about a program without a formula, or after the one that ended it."""
-    choice = weight_choice(ending(*answers), True).asked(DEAR)
+    choice = weight_choice(ending(*answers), True).updated(DEAR)
     for _ in answers[1:]:
         choice = choice.confirmed(DEAR)
     return choice
@@ -55,14 +55,14 @@ def asked(count: int, *answers: float) -> WeightChoice:
     """The choice after so many answers."""
     choice = weight_choice(rule(*answers), True)
     for _ in range(count):
-        choice = choice.asked(PROGRAM)
+        choice = choice.updated(PROGRAM)
     return choice
 
 
 def test_a_number_is_final_and_asks_nobody() -> None:
     choice = weight_choice(3, True)
     assert (choice.weight, choice.settled, choice.final, choice.note) == (3.0, True, True, "")
-    assert choice.asked(PROGRAM) is choice
+    assert choice.updated(PROGRAM) is choice
     assert choice.confirmed(PROGRAM) is choice
     assert weight_choice(np.float64(0.5), True).weight == 0.5
     assert weight_choice(0, True).weight == 0.0
@@ -70,19 +70,19 @@ def test_a_number_is_final_and_asks_nobody() -> None:
 
 def test_a_rule_is_asked_until_it_settles() -> None:
     first = asked(1, 2.0)
-    assert (first.weight, first.answers, first.settled, first.final) == (2.0, (2.0,), False, False)
+    assert (first.weight, first.weights, first.settled, first.final) == (2.0, (2.0,), False, False)
     assert first.selection is not None
     second = asked(2, 2.0, 5.0)
-    assert (second.weight, second.answers) == (5.0, (2.0, 5.0))
+    assert (second.weight, second.weights) == (5.0, (2.0, 5.0))
     settled = second.after(0.0)
     assert settled.settled
-    assert settled.asked(PROGRAM) is settled
+    assert settled.updated(PROGRAM) is settled
 
 
 def test_of_a_program_without_formula_every_answer_is_followed_to_its_end() -> None:
-    first = weight_choice(rule(2.0, 5.0, 5.0), True).asked(DEAR)
+    first = weight_choice(rule(2.0, 5.0, 5.0), True).updated(DEAR)
     assert (first.weight, first.settled, first.final) == (2.0, True, False)
-    assert first.asked(DEAR) is first
+    assert first.updated(DEAR) is first
     second = first.confirmed(DEAR)
     assert (second.weight, second.settled, second.final) == (5.0, True, False)
     third = second.confirmed(DEAR)
@@ -92,7 +92,7 @@ def test_of_a_program_without_formula_every_answer_is_followed_to_its_end() -> N
 def test_without_a_penalty_a_rule_is_not_asked() -> None:
     choice = weight_choice(rule(), False)
     assert (choice.settled, choice.final, choice.weight) == (True, True, 0.0)
-    assert choice.asked(PROGRAM) is choice
+    assert choice.updated(PROGRAM) is choice
 
 
 def test_a_ready_rule_goes_by_its_name() -> None:
@@ -120,7 +120,7 @@ def test_what_a_search_tells_apart_is_no_more_than_its_weights_are_apart() -> No
         """The choice after an answer of 2 and another one, of a grid of that ratio, refined by that factor."""
         grid = weight / refined * np.array([1 / ratio, 1.0, ratio])
         answers = [rule(2.0)(None), ro.select.Selection(weight, "mine", grid, np.ones(3), interior=True)]
-        return weight_choice(lambda _: answers.pop(0), True).asked(DEAR).confirmed(DEAR)
+        return weight_choice(lambda _: answers.pop(0), True).updated(DEAR).confirmed(DEAR)
 
     assert near(2.0 * 1.029, 1.0, 1.03).final
     assert not near(2.0 * 1.031, 1.0, 1.03).final
@@ -204,12 +204,12 @@ def test_an_alternation_counts_from_the_last_answers() -> None:
 
 
 def test_a_rule_that_never_comes_to_rest_is_ended() -> None:
-    answers = [2.0**k for k in range(MOST_ANSWERS)]
-    assert not asked(MOST_ANSWERS - 1, *answers).final
-    end = asked(MOST_ANSWERS, *answers)
+    answers = [2.0**k for k in range(MOST_CHOICES)]
+    assert not asked(MOST_CHOICES - 1, *answers).final
+    end = asked(MOST_CHOICES, *answers)
     assert end.final
     assert end.weight == pytest.approx(np.sqrt(answers[-2] * answers[-1]), rel=1e-12)
-    assert MOST_ANSWERS == 10
+    assert MOST_CHOICES == 10
 
 
 @pytest.mark.parametrize("weight", [True, None, [1.0], -1.0, float("inf"), float("nan"), "lcurve"])
@@ -232,7 +232,7 @@ def test_of_a_robust_loss_a_rule_is_first_asked_where_weight_one_leads() -> None
     seen: Any = SimpleNamespace(closed_form=False)
     begun = {"robust": True, "weight": 1.0, "settled": True}
     first = replace(weight_choice(rule(5.0), True), **begun).confirmed(seen)
-    assert (first.weight, first.final, first.answers) == (5.0, False, (5.0,))
+    assert (first.weight, first.final, first.weights) == (5.0, False, (5.0,))
     same = replace(weight_choice(rule(1.0), True), **begun).confirmed(seen)  # its own answer, to be shown
     assert (same.weight, same.final) == (1.0, False)
     assert same.selection is not None

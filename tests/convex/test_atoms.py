@@ -13,7 +13,7 @@ from rpim_opt.convex import expressions as atoms
 from rpim_opt.convex.expressions import ATOMS, SQUARES, named
 from rpim_opt.convex.formulation import FORMULATIONS, Formulation
 from rpim_opt.convex.quadratic import quadratic
-from rpim_opt.convex.structure import Answers, declared
+from rpim_opt.convex.structure import Expressions, declared
 
 DECLARED = {name: each for name, each in FORMULATIONS.items() if declared(each)}
 
@@ -64,7 +64,7 @@ def test_what_is_declared_is_what_the_canonicalization_shows(stated: Formulation
     model = problem.linearize(np.zeros(len(problem.parameters.free)))
     program = ro.convex.pose(stated, model)
     equations, n = model.A.shape
-    asked = Answers(stated, model.parameters, equations, model.group)
+    asked = Expressions(stated, model.parameters, equations, model.group)
     rng = np.random.default_rng(0)
     r, z = rng.normal(size=equations), rng.normal(size=n)
     loss = quadratic(asked.loss.expression, asked.loss.variable)

@@ -12,6 +12,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.convex.constraints import (
     Box,
+    as_text,
     at_nominal,
     by_kind,
     by_link,
@@ -19,9 +20,8 @@ from rpim_opt.convex.constraints import (
     equal,
     matching,
     signed,
-    spoken,
 )
-from rpim_opt.convex.formulation import lost
+from rpim_opt.convex.formulation import unavailable
 from rpim_opt.robot.parameters import Parameters
 
 NAMES = ("alpha1", "a1", "alpha2", "a2", "base_x", "base_rz", "tool_x", "d12")
@@ -166,8 +166,8 @@ def test_differences_of_neighbours_and_the_rest_alone() -> None:
 
 
 def test_what_a_person_reads() -> None:
-    assert spoken(1.25e-3, "length") == "1.25 mm"
-    assert spoken(-2e-3, "angle") == "-2 mrad"
+    assert as_text(1.25e-3, "length") == "1.25 mm"
+    assert as_text(-2e-3, "angle") == "-2 mrad"
 
 
 def test_what_a_file_holds() -> None:
@@ -215,4 +215,4 @@ def test_a_loss_is_over_equations_or_configurations() -> None:
 
 def test_what_a_file_could_not_hold_says_so() -> None:
     with pytest.raises(ro.InputError, match="formulation 'mine': found functions that a result file cannot hold"):
-        lost("mine")(1, 2, 3)
+        unavailable("mine")(1, 2, 3)

@@ -67,7 +67,7 @@ def test_a_result_with_a_prior_is_loaded_and_solved_again(tmp_path: Path, formul
     assert again.formulation == result.formulation
     assert np.array_equal(again.x, result.x)
     assert str(again) == str(result)
-    anew = again.asked(again.problem)
+    anew = again.calibrate_again(again.problem)
     assert anew.x == pytest.approx(result.x, abs=1e-6 * np.abs(result.x).max())
 
 

@@ -182,7 +182,7 @@ def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None
     assert last.released == ("theta4",)
     assert f"(digest {last.digest[:12]})" in second.weight_sentence()
     assert "without theta4" in second.weight_sentence()
-    again = second.asked(second.problem)  # a file holds the prior: it can be solved again
+    again = second.calibrate_again(second.problem)  # a file holds the prior: it can be solved again
     np.testing.assert_allclose(again.x, second.x, atol=1e-8)
     third = ro.use.update(second, crashed.now.take(np.arange(6)))
     assert len(third.result.record.earlier) == 2

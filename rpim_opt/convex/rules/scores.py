@@ -107,7 +107,7 @@ def gcv(program: Program) -> Selection:
     return linear_rule(program, "gcv", score, "smallest generalized cross-validation error")
 
 
-ROOM = 1.1
+DISCREPANCY = 1.1
 """Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
 
 
@@ -126,10 +126,10 @@ def discrepancy(program: Program) -> Selection:
 
     def score(weights: Array) -> Array:  # ln(rho / (tau^2 (m - dof)))
         rho, freedom = program.ridge.misfits(weights)
-        left = ROOM**2 * np.maximum(program.squared.equations - freedom, 1e-9)
+        left = DISCREPANCY**2 * np.maximum(program.squared.equations - freedom, 1e-9)
         return np.log(np.maximum(rho, np.finfo(float).tiny) / left)
 
-    note = f"residual norm {ROOM:g} times that of the declared noise"
+    note = f"residual norm {DISCREPANCY:g} times that of the declared noise"
     chosen = linear_rule(program, "discrepancy", score, note)
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights

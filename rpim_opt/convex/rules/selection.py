@@ -180,8 +180,8 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     if slope is None or none != 0 or abs(twice - 2 * once) > HOMOGENEOUS * once:
         return weights
     # of a positively homogeneous penalty the largest is max { -g'z : penalty(z) <= 1 }, g the loss's slope at nominal
-    answers = program.structure.answers
-    problem = cp.Problem(cp.Minimize(slope @ answers.z), [answers.penalty_of_z <= 1])
+    expressions = program.structure.expressions
+    problem = cp.Problem(cp.Minimize(slope @ expressions.z), [expressions.penalty_of_z <= 1])
     value: Any = problem.value if minimized(problem) else 0.0
     if problem.status != cp.OPTIMAL or not value < 0:
         return weights

@@ -161,10 +161,10 @@ class Newton:
         unit = r / self.rows.spread(np.sqrt(np.maximum(inner, 1e-300)))
         wide = self.rows.spread(across)
         H = gram(U, wide)
-        bent = np.flatnonzero(np.abs(along - across) > 1e-9 * across.max(initial=0.0))
-        if len(bent):
-            turned = np.add.reduceat(U * unit[:, None], starts)[bent]
-            H += (turned * (along - across)[bent, None]).T @ turned
+        curved = np.flatnonzero(np.abs(along - across) > 1e-9 * across.max(initial=0.0))
+        if len(curved):
+            turned = np.add.reduceat(U * unit[:, None], starts)[curved]
+            H += (turned * (along - across)[curved, None]).T @ turned
         return U.T @ (wide * r), H
 
     def _residual(self, z: Array) -> Array:
@@ -325,9 +325,9 @@ class Newton:
             if promised <= 1e-9 * max(abs(value), 1e-9):
                 self.x, self.point = x, best
                 return z
-            bent = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.kink
+            curved = np.abs(self.loss.slope(v_ahead) - self.loss.slope(v)) > 0.1 * self.kink
             beside = self._near(self.rows.entries(self._residual(z)), h)
-            near = np.union1d(near, np.union1d(np.flatnonzero(bent), beside))
+            near = np.union1d(near, np.union1d(np.flatnonzero(curved), beside))
         return None
 
 

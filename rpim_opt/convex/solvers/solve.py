@@ -212,6 +212,6 @@ class Tangent:
         far = np.full(len(self.v), np.inf)
         for h in np.abs(self.v).max() * np.geomspace(2, 1e-8, 20):
             low = np.maximum(self.v - h, 0.0) if self._positive else self.v - h
-            bent = np.abs(self._entries(self.v + h)[1] - self._entries(low)[1]) * np.ones(len(far))
-            far[bent > INACTIVE * bent.max(initial=0.0)] = h
+            curved = np.abs(self._entries(self.v + h)[1] - self._entries(low)[1]) * np.ones(len(far))
+            far[curved > INACTIVE * curved.max(initial=0.0)] = h
         return np.argsort(far, kind="stable")

@@ -137,7 +137,7 @@ def certified_hand_eye(
         f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
         f"another start, up to {radius:.2g} rad away, may fit as well: measure more or other poses to decide": radius
         > FAR,
-        "the weights of the loss did not converge": not solved.settled,
+        "the weights of the loss did not converge": not solved.converged,
         f"{full} of {N} measurements agree, and as many others may agree with another start": several,
     }
     cause = next((text for text, true in causes.items() if true), "")
@@ -222,7 +222,7 @@ class _Solved(NamedTuple):
     smallest: Smallest  # of the measurements that agree
     squares: Array  # (N,) squared residuals
     agreeing: np.ndarray  # (N,) which of them count
-    settled: bool  # whether it is the solution of those
+    converged: bool  # whether it is the solution of those
     cost: float  # the loss, summed, and what is expected of translations
 
 

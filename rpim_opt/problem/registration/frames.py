@@ -108,7 +108,7 @@ APART = 0.1
 """How far nominal robots may be from each other at a point that both have touched [m], until it is another point."""
 
 
-def met(problem: CalibrationProblem) -> dict[str, Array]:
+def shared_bases(problem: CalibrationProblem) -> dict[str, Array]:
     """Return bases (6,) by robot, of nominal robots that touched the same points as robots before them.
 
     The first robot that touched something stands where it is stated, as does one whose base is not identified, and one
@@ -284,7 +284,7 @@ def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: 
     x = np.zeros(len(free.free))
     for _ in range(TRIMMED):
         try:
-            x = settled(problem, STEPS)
+            x = frame_deviations(problem, STEPS)
             error = np.nan_to_num(whole.errors(x))
             kept = np.flatnonzero(error <= GROSS * np.median(error))
             if len(kept) == len(problem.data):
@@ -318,7 +318,7 @@ def relocated(problem: Source) -> Source | None:
             if alone is not None:
                 k = p.places_of(name)
                 nominal[k] = np.where(nominal[k] == p.nominal[k], alone.parameters.nominal, nominal[k])
-        for name, place in met(problem.sample()).items():
+        for name, place in shared_bases(problem.sample()).items():
             own = p.of_robot(name)
             base = _frame_of(own, "base_")
             if _misplaced(own, base, place):
@@ -382,10 +382,10 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
         return problem, np.zeros(len(p.free))
     alone = problem.identifying(frames)
     alone = relocated(alone) or alone
-    return alone, settled(alone)
+    return alone, frame_deviations(alone)
 
 
-def settled(alone: Source, steps: int = 200) -> Array:
+def frame_deviations(alone: Source, steps: int = 200) -> Array:
     """Return the deviations (f,) [SI] of a problem that identifies frames alone, from their stated values.
 
     Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.

@@ -51,7 +51,7 @@ GROSS = 6.0  # rows farther off than so many medians of the best fit's errors do
 FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
 MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
-ELSEWHERE = 200  # configurations at which mappings are compared
+COMPARED = 200  # configurations at which mappings are compared
 RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
 
 
@@ -62,7 +62,7 @@ class Alternative:
     sign: Array
     zero: Array
     apart: float  # RMS distance of their predictions at other configurations [m]
-    told_by: Array  # (dof,) joint values of the controller at which these are farthest apart [rad or m]
+    deciding: Array  # (dof,) joint values of the controller at which these are farthest apart [rad or m]
     mirror: bool = False  # whether it is the mirror image of the first one, so that lengths are the same everywhere
 
 
@@ -132,7 +132,7 @@ class JointMapping:
                     "positions would decide, or write what the set-up confirms as sign and theta_deg in robot.toml."
                 )
                 continue
-            values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.told_by, strict=True))
+            values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))
             sentences.append(
                 f"{what} fits as well, and differs by {three_digits(1e3 * other.apart)} mm at other "
                 f"configurations: measure at ({values}) to decide."
@@ -316,7 +316,7 @@ def _judged(
     near = [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
     measured = points.q.reshape(-1, robot.dof)
     low, high = np.where(_turning(robot), [[-np.pi], [np.pi]], [measured.min(axis=0), measured.max(axis=0)])
-    elsewhere = rng.uniform(low, high, (ELSEWHERE, robot.dof))
+    elsewhere = rng.uniform(low, high, (COMPARED, robot.dof))
     zeros = [_gauged(robot, zero) for zero in fits.zero]
     plain = [_plain(*each) for each in zip(sign, zeros, strict=True)]
     same = 0.5 * max(least, LEAST_NOISE)
@@ -344,9 +344,9 @@ def _judged(
     for k, i in enumerate(plainest):
         if k != first:
             far = np.linalg.norm(predictions[k] - predictions[first], axis=-1).max(axis=-1)
-            told_by = elsewhere[int(np.argmax(far))]
+            deciding = elsewhere[int(np.argmax(far))]
             apart = _apart(predictions[k], predictions[first], points.lengths)
-            others.append(Alternative(sign[i], zeros[i], apart, told_by, mirror[k]))
+            others.append(Alternative(sign[i], zeros[i], apart, deciding, mirror[k]))
     nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
     left_handed = False
     if not points.lengths:

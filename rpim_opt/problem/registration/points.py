@@ -345,7 +345,7 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
     state = at(weights, candidates.zero, candidates.tools)
     size = candidates.tools[0].size
     columns = size + zeros * candidates.zero.shape[1]
-    quiet = 0
+    stalled = 0
     for k in range(steps):
         if robust and k % 2 == 0:
             error = np.linalg.norm(state.residual, axis=0)
@@ -363,8 +363,8 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
         before = state.cost
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
         state = candidate if better.all() else state.where(better, candidate)
-        quiet = 0 if (before - state.cost > 1e-9 * before).any() else quiet + 1
-        if quiet == 5:
+        stalled = 0 if (before - state.cost > 1e-9 * before).any() else stalled + 1
+        if stalled == 5:
             break
     if coordinates == 1:
         modelled = candidates.y + np.moveaxis(state.residual, 0, -1)
