@@ -479,11 +479,12 @@ def monitor(
     Exit code 1 if the robot drifts.
     """
     with _loaded(result) as (loaded, _):
-        from rpim_opt.report.page import written_checks
-
         read = ro.use.read_measurements(loaded, checks, measurement, tables.options)
         monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
-        written = written_checks(monitoring, out, loaded.record.title)
+        if out is not None:
+            with refused(out):
+                ro.report.write_checks(monitoring, out, loaded.record.title)
+    written = [] if out is None else [out]
     return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read.left_out, read.notes)
 
 

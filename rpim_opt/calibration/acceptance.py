@@ -124,6 +124,15 @@ class Workspace:
         """Median expanded uncertainty of the sampled configurations [m]."""
         return float(np.median(self.expanded[:-1]))
 
+    @property
+    def summary(self) -> str:
+        """Maximum and median in words."""
+        return (
+            f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
+            f"{1e3 * self.largest:.3f} mm (largest of {self.count} configurations, refined by a search), median "
+            f"{1e3 * self.typical:.3f} mm"
+        )
+
 
 def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: Array) -> Workspace:
     """Return the expanded uncertainty at configurations (N, dof) of a region and at the maximum found by a search.
@@ -245,12 +254,8 @@ class Acceptance:
         ]
         workspace = self.workspace
         if workspace is not None and np.isfinite(workspace.largest):
-            lines += [
-                f"Expanded uncertainty of the position reached (U, {percent(requirement.confidence)}): at most "
-                f"{1e3 * workspace.largest:.3f} mm (largest of {workspace.count} configurations, refined by a search), "
-                f"median {1e3 * workspace.typical:.3f} mm.",
-                "It is the uncertainty of the reflector; `compensate --tool` states that of another point.",
-            ]
+            another = "It is the uncertainty of the reflector; `compensate --tool` states that of another point."
+            lines += [f"{workspace.summary}.", another]
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
         return [*lines, *self.reasons]

@@ -142,19 +142,13 @@ def influence(result: Outcome) -> Influence:
 
 def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:
     """Return the last linearization, sorted by configuration, and the label of every configuration's first row."""
-    model = result.program.model
-    if model.stands_for is None and isinstance(result.problem, CalibrationProblem):
-        models = [result.program.squared if result.squared_loss else model]
-        data = [result.problem.data]
-    else:
-        parts = list(in_parts(result.problem).rows())
-        models = [part.linearize(result.x) for part in parts]
-        data = [part.data for part in parts]
+    parts = list(in_parts(result.problem).rows())
+    models = [part.linearize(result.x) for part in parts]
     A, b, group = (np.concatenate([getattr(each, name) for each in models]) for name in ("A", "b", "group"))
     order = np.argsort(group, kind="stable")
     labels: dict[int, str] = {}
-    for each in data:
-        labels |= dict(zip(each.configuration[::-1], each.label[::-1], strict=True))
+    for part in parts:
+        labels |= dict(zip(part.data.configuration[::-1], part.data.label[::-1], strict=True))
     return replace(models[0], A=A[order], b=b[order], group=group[order]), labels
 
 
@@ -216,11 +210,9 @@ def improvement(result: Outcome) -> Improvement | None:
     >>> found.improves, found.before > 10 * found.after
     (True, True)
     """
-    if not result.linear_penalty:
-        return None
     try:
-        D, directions = _slopes(result)
         noise, prior = result.spread.noise, result.spread.prior
+        D, directions = _slopes(result)
         change = influence(result).change
     except InputError:
         return None
@@ -254,8 +246,7 @@ def _slopes(result: Outcome) -> tuple[Array, Array]:
     own = [name for name in joints if own_name(name) != name]
     if own:
         raise InputError("improvement", f"several robots: '{own[0]}' belongs to one only", "one robot")
-    places = parameters.places_of(robot)
-    columns = (np.cumsum(parameters.identified) - 1)[places[parameters.identified[places]]]
+    columns = parameters.free.places_of(robot)
     of_robot = parameters.of_robot(robot)
     tools = np.array([name.startswith("tool_") for name in of_robot.names])
     nominal = np.where(tools, 0.0, of_robot.nominal)

@@ -81,20 +81,6 @@ class Prediction(NamedTuple):
         return self.coverage_factor * self.standard
 
 
-class StoredValues(NamedTuple):
-    """Values of a script's functions, which a result file cannot hold.
-
-    Active bounds; the equations that a robust loss keeps (None where there were none), the weight that it gives to
-    them, and the numbers of those that it left out; what statements of a drawing cost.
-    """
-
-    active_bounds: tuple[ActiveBound, ...]
-    linear: LinearModel | None
-    factor: float = 1.0
-    left_out: tuple[int, ...] = ()
-    shadow_prices: tuple[ShadowPrice, ...] = ()
-
-
 @dataclass(frozen=True, eq=False)
 class Outcome:
     """The numerical part of a `Calibration`, which documents the fields."""
@@ -111,11 +97,13 @@ class Outcome:
     certificate: Certificate
     calibrate_again: Callable[[Source], Self]
     record: Record = field(default_factory=Record)
-    kept: StoredValues | None = None
     learned: Learned | None = None
     mapping: JointMapping | None = None
-    known_causes: tuple[str, ...] | None = None
     excluded: Dataset | None = None
+    known: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        vars(self).update(self.known)  # where `cached_property` looks before it computes
 
     @property
     def z(self) -> Array:
@@ -194,7 +182,7 @@ class Outcome:
         Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u, or U = k u with
         Student's factor of a ``confidence``: with ``of`` ``"mean"`` of what the model says, J C J'; ``"reached"`` of
         the position that the robot will reach, with its repeatability; ``"reading"`` of what the instrument will read
-        there. A penalty without covariance (lasso) is refused.
+        there. InputError for a penalty without covariance (lasso), for which `forward` gives the positions.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -205,13 +193,11 @@ class Outcome:
         """
         if of not in get_args(Interval):
             raise InputError("of", f"'{of}'", choices(of, get_args(Interval)))
-        if not self.linear_penalty:
-            accepted = "a squared penalty or none; `forward` gives the positions alone"
-            raise InputError("uncertainty", f"formulation '{self.formulation.name}'", accepted)
+        spread = self.spread  # refuses a penalty without covariance before anything is computed
         noise = position_noise(self.problem)
         problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
         J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
-        covariance = self.spread.of_positions(J)
+        covariance = spread.of_positions(J)
         added = noise_covariances(problem, self.variance_factor)
         if of == "reached":
             covariance = covariance + added.robot[0]
@@ -333,10 +319,8 @@ class Outcome:
         return self.program.linear_penalty
 
     @cached_property
-    def _squares(self) -> tuple[LinearModel, float]:
+    def squares(self) -> tuple[LinearModel, float]:
         """The equations whose squares the fit amounts to, and the weight that the loss gives to them."""
-        if self.kept is not None and self.kept.linear is not None:
-            return self.kept.linear, self.kept.factor
         program = self.program
         source = in_parts(self.problem)
         if source.keeps_rows or program.formulation is self.formulation:
@@ -351,11 +335,6 @@ class Outcome:
         return source.linearize(self.x, inliers), inliers.factor
 
     @cached_property
-    def linear(self) -> LinearModel:
-        """The final linearization, of the rows that a robust loss keeps (`Program.inlier_model`)."""
-        return self._squares[0]
-
-    @cached_property
     def spread(self) -> Spread:
         """The basis of the uncertainty: the equations that the fit keeps, and its penalty.
 
@@ -364,9 +343,9 @@ class Outcome:
         if not self.linear_penalty:
             found = f"formulation '{self.formulation.name}'"
             raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
-        linear, factor = self._squares
+        linear, factor = self.squares
         form = ridge(linear, self.program.penalty_form)
-        moves = None if self.kept is not None else self.program.tangent(self.z, self.penalty_weight)
+        moves = self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
         if moves is not None:  # conditional on the active constraints
             form = ridge_within(linear, self.program.penalty_form, moves, self.z)
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
@@ -386,7 +365,7 @@ class Outcome:
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
         'Residuals agree with the stated measurement noise (ratio 1.02).'
         """
-        linear, factor = self._squares
+        linear, factor = self.squares
         repeatability = self.problem.repeatability
         if repeatability is None:
             squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / factor
@@ -461,7 +440,7 @@ class Outcome:
         p = problem.parameters
         width = (default_widths(p) / p.scale)[p.identified]
         try:
-            weight = self.penalty_weight / self._squares[1]
+            weight = self.penalty_weight / self.squares[1]
         except InputError:  # a loss with own variables has no quadratic model by which a row could be contradicted
             return flags
         sure = contradicted(model, self.program.penalty_form, weight, width, groups)
@@ -506,8 +485,6 @@ class Outcome:
         the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong data, or a
         drawing that does not describe this robot.
         """
-        if self.kept is not None:
-            return self.kept.active_bounds
         program, z = self.program, self.z
         if program.box is None or not program.formulation.constraints:
             return ()
@@ -528,8 +505,6 @@ class Outcome:
     @cached_property
     def shadow_prices(self) -> tuple[ShadowPrice, ...]:
         """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none."""
-        if self.kept is not None:
-            return self.kept.shadow_prices
         program, z = self.program, self.z
         constraints, parameters = program.formulation.constraints, program.model.parameters
         texts = [(i, parsed) for i, parsed in enumerate(constraints) if isinstance(parsed, Parsed)]

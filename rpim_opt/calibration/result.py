@@ -10,10 +10,10 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.outcome import Iteration, Outcome, Prediction, StoredValues
+from rpim_opt.calibration.outcome import Iteration, Outcome, Prediction
 from rpim_opt.calibration.verdict import Verdict, judge, likely_causes, mistakes
 
-__all__ = ["Calibration", "Iteration", "Prediction", "StoredValues"]
+__all__ = ["Calibration", "Iteration", "Prediction"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,12 +50,11 @@ class Calibration(Outcome):
         Estimated hyperparameters: scales and noise, model extensions, excluded rows; None with a weight.
     mapping
         Signs and zeros of the joints estimated from the data; None where the nominal ones explain them.
-    kept
-        Values of a script's functions, of a result that was read from a file; None otherwise.
-    known_causes
-        Likely causes of a bad fit that were computed before; None where `causes` computes them.
     excluded
         The rows that were excluded as outliers; None without any, of data in blocks and of a result that was read.
+    known
+        Values of properties by their names, which then do not compute them: of a result that was read from a file its
+        causes, and what a script's functions gave, which a file cannot hold.
 
     Examples
     --------
@@ -78,8 +77,6 @@ class Calibration(Outcome):
     @cached_property
     def causes(self) -> tuple[str, ...]:
         """Likely causes of a poor fit, one sentence each (`likely_causes`)."""
-        if self.known_causes is not None:
-            return self.known_causes
         return tuple(likely_causes(self))
 
     def weight_sentence(self) -> str:

@@ -8,7 +8,6 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
@@ -55,10 +54,7 @@ class Uncertainty(Tabled):
     confidence: float = 0.95
 
     def __post_init__(self) -> None:
-        coverage_factor(np.inf, self.confidence)
-        if not self.result.linear_penalty:
-            found = f"formulation '{self.result.formulation.name}'"
-            raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
+        coverage_factor(self.result.spread.spare, self.confidence)  # which refuse what has no covariance, or interval
 
     @property
     def coverage_factor(self) -> float:

@@ -14,7 +14,7 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import refused, write_text
+from rpim_opt.basics.files import write_text
 from rpim_opt.report import plot
 from rpim_opt.report.summary import mm
 from rpim_opt.use.monitoring import Monitoring
@@ -95,15 +95,21 @@ def render(
 
 
 def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
-    """Write checks over time, as `use.monitor` returns them, as one HTML page that works offline.
+    """Write checks over time, as `use.monitor` returns them: as HTML page that works offline, or as table (``.csv``).
 
     The page has the verdict, two charts and every check; ``title`` names the robot or cell. The file is written whole
-    or not at all.
+    or not at all. InputError for a name that ends in neither ``.html`` nor ``.csv``.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
     >>> ro.report.write_checks(ro.use.monitor(ro.calibrate(instance.problem), instance.validation), "checks.html")
     """
+    path = Path(path)
+    if path.suffix.lower() not in (".html", ".csv"):
+        raise InputError("--out", f"'{path.name}'", "a name that ends in .html or .csv")
+    if path.suffix.lower() == ".csv":
+        write_text(path, found.csv())
+        return
     verdict, *details = str(found).splitlines()
     sigmas = [f"{value:.1f}" for value in found.sigmas]
     for i in found.beyond:
@@ -126,18 +132,4 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
         ("Every check", [("table", table)]),
     ]
     heading = title or "Checks"
-    write_text(Path(path), render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections))
-
-
-def written_checks(found: Monitoring, out: Path | None, title: str) -> list[Path]:
-    """Write checks as a page (``.html``) or as a table (``.csv``), and return the files written."""
-    if out is None:
-        return []
-    if out.suffix.lower() not in (".html", ".csv"):
-        raise InputError("--out", f"'{out.name}'", "a name that ends in .html or .csv")
-    with refused(out):
-        if out.suffix.lower() == ".csv":
-            write_text(out, found.csv())
-        else:
-            write_checks(found, out, title)
-    return [out]
+    write_text(path, render(f"Checks: {heading}", "Checks of a calibrated robot", heading, [], sections))

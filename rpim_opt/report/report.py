@@ -29,13 +29,11 @@ from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import Earlier
 from rpim_opt.problem.design import combination, observe
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import plot, summary
 from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
-from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
 
@@ -202,7 +200,7 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     ]
     required = result.record.requirement is not None
     limit = 1e3 * map_.requirement.limit if required else None
-    yield "text", notes if required else [summary.workspace_sentence(map_), *notes]
+    yield "text", notes if required else [f"{map_.summary}; region: {map_.requirement.where}.", *notes]
     box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.problem, map_.q, map_.region.marker)
     frame = "" if box is None else " The frame is the box of the requirement."
@@ -383,10 +381,14 @@ def _convergence(result: Calibration) -> Iterator[Block]:
 def _provenance(content: Content) -> Iterator[Block]:
     result = content.result
     record = result.record
+    robots = []
+    for name, robot in result.problem.arms.items():
+        named = f"{name}: {robot.name}" if name else robot.name
+        robots.append(" - ".join(filter(None, [named, f"{robot.dof} joints", robot.source])))
     facts = {
         "Source": record.source or "not stated",
         "Measurements": "simulated" if record.simulated else "as stated in the source; not marked as simulated",
-        "Robot": "; ".join(_robot(name, robot) for name, robot in result.problem.arms.items()),
+        "Robot": "; ".join(robots),
         "Formulation": f"{result.formulation.name}: {_formulation(result)}",
         "Made": record.made,
         "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
@@ -403,22 +405,16 @@ def _provenance(content: Content) -> Iterator[Block]:
     if record.files:
         yield "table", Table("Input files", ["file", "SHA-256"], list(record.files.items()), prose=True)
     if record.earlier:
-        earlier = [[each.title, each.made, str(each.rows), _changes(each), each.digest] for each in record.earlier]
+        earlier = []
+        for each in record.earlier:
+            changes = ", ".join(each.released) or "no detectable change"
+            if each.prior_inflation != 1:
+                changes += f"; standard deviations times {each.prior_inflation:g}"
+            earlier.append([each.title, each.made, str(each.rows), changes, each.digest])
         head = ["calibration", "made", "rows", "changed since", "digest"]
         yield "table", Table("Earlier calibrations used as prior", head, earlier, prose=True)
     yield "text", ["All figures on this page were computed from the calibration's measurements and parameters."]
     yield "facts", [(who, f"{'_' * 30} date {'_' * 12}") for who in ("Calibrated by", "Approved by")]
-
-
-def _changes(each: Earlier) -> str:
-    changes = ", ".join(each.released) or "no detectable change"
-    widened = f"; standard deviations times {each.prior_inflation:g}" if each.prior_inflation != 1 else ""
-    return changes + widened
-
-
-def _robot(name: str, robot: Robot) -> str:
-    named = f"{name}: {robot.name}" if name else robot.name
-    return " - ".join(filter(None, [named, f"{robot.dof} joints", robot.source]))
 
 
 def _formulation(result: Calibration) -> str:

@@ -8,9 +8,9 @@ from typing import Any, Literal
 import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.text import counted, joined, listed, percent, table
+from rpim_opt.basics.text import counted, joined, listed, table
 from rpim_opt.calibration import words
-from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
@@ -102,15 +102,6 @@ def cells(rows: Sequence[Mapping[str, Any]], unit: Unit = "mm") -> list[list[str
         [row["what"], str(row.get("count", "")), *("" if row.get(key) is None else f"{row[key]:.4f}" for key in keys)]
         for row in rows
     ]
-
-
-def workspace_sentence(found: Workspace) -> str:
-    """Return maximum and median of an expanded uncertainty in a sentence."""
-    return (
-        f"Expanded uncertainty of the position reached (U, {percent(found.requirement.confidence)}): at most "
-        f"{mm(1e3 * found.largest)} mm (largest of {found.count} configurations, refined by a search), "
-        f"median {mm(1e3 * found.typical)} mm; region: {found.requirement.where}."
-    )
 
 
 def headline(result: Calibration) -> str:
@@ -207,7 +198,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
     remarks = [
         *filter(None, [inconclusive(result, uncertainty)]),
-        *([] if uncertainty is None else [workspace_sentence(uncertainty)]),
+        *([] if uncertainty is None else [f"{uncertainty.summary}; region: {uncertainty.requirement.where}."]),
         *words.weight_lines(result),
         identifiability(result),
         *words.noise_sentence(result),

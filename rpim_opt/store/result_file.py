@@ -24,7 +24,7 @@ from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import ActiveBound, ShadowPrice
 from rpim_opt.calibration.held_out import sets
 from rpim_opt.calibration.identify import calibrate, mapped_as
-from rpim_opt.calibration.result import Calibration, Iteration, StoredValues
+from rpim_opt.calibration.result import Calibration, Iteration
 from rpim_opt.convex import constraints
 from rpim_opt.convex.expressions import LARGEST, NORM1, NORM2, SQUARES, SUM
 from rpim_opt.convex.formulation import Formulation, huber, unavailable
@@ -217,7 +217,7 @@ def content(result: Calibration) -> dict[str, Any]:
     """Return the content of a result file: figures [mm, deg], the data they follow from [SI], and a digest."""
     from rpim_opt.calibration.acceptance import accept  # few robots have to be accepted
 
-    result = replace(result, record=result.record.dated(), known_causes=result.causes)
+    result = replace(result, record=result.record.dated(), known={**result.known, "causes": result.causes})
     functions = definition(result.formulation)
     solvable = formulation_of("", functions).solvable
     arms = dict(result.problem.arms)
@@ -295,10 +295,8 @@ def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
 
 def _inliers(result: Calibration) -> StoredInliers | None:
     """Return the equations that a script's loss kept; a ready loss recomputes them."""
-    if result.kept is not None:  # an earlier file said it
-        if result.kept.linear is None:
-            return None
-        return StoredInliers(float(np.sqrt(result.kept.factor)), list(result.kept.left_out))
+    if "inliers" in result.known:  # an earlier file said it
+        return result.known["inliers"]
     inliers = None
     with suppress(InputError):  # a loss that no squared one stands for
         inliers = result.program.inliers(result.z)
@@ -381,8 +379,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
         program=program,
         calibrate_again=mapped_as(file.mapping, again),
         record=replace(file.record, validation=validation, digest=file.digest),
-        kept=None if formulation.solvable else _kept(file, program),
-        known_causes=file.causes,
+        known=_known(file, program),
     )
 
 
@@ -420,15 +417,18 @@ def _with_measurements(data: Dataset, known: Mapping[str, Measurement], where: s
     return replace(data, blocks=tuple(blocks))
 
 
-def _kept(file: Stored, program: Program) -> StoredValues:
-    """Return the values of a script's functions as they were saved; they cannot be called again."""
-    if file.inliers is None:
-        return StoredValues(file.active_bounds, None, shadow_prices=file.shadow_prices)
-    factor, left_out = file.inliers.factor**2, file.inliers.left_out
-    keep = np.ones(len(program.model.b), dtype=bool)
-    keep[left_out] = False
-    equations = kept_equations(program.model, keep, factor)
-    return StoredValues(file.active_bounds, equations, factor, tuple(left_out), file.shadow_prices)
+def _known(file: Stored, program: Program) -> dict[str, Any]:
+    """Return what a file states in place of what the calibration would compute; a script's functions cannot be."""
+    known: dict[str, Any] = {"causes": file.causes}
+    if program.formulation.solvable:
+        return known
+    known |= {name: getattr(file, name) for name in ("active_bounds", "shadow_prices", "inliers")}
+    if file.inliers is not None:
+        factor = file.inliers.factor**2
+        keep = np.ones(len(program.model.b), dtype=bool)
+        keep[file.inliers.left_out] = False
+        known["squares"] = kept_equations(program.model, keep, factor), factor
+    return known
 
 
 # --- dataclasses, named tuples, arrays and mappings as JSON and back, by annotations -----------------------------

@@ -151,9 +151,13 @@ class Compensation:
 
     def content(self) -> dict[str, Any]:
         """Return the errors [mm, mrad], and a row for every target as in `csv`."""
+        of = {
+            "nominal": (self.position_before, self.orientation_before),
+            "corrected": (self.position_error, self.orientation_error),
+        }
+        errors = {k: {"position": statistics(p), "orientation": statistics(o, "mrad")} for k, (p, o) in of.items()}
         return {
-            "nominal": _errors(self.position_before, self.orientation_before),
-            "corrected": _errors(self.position_error, self.orientation_error),
+            **errors,
             "largest_corrections": self._largest_corrections(),
             "missed": self.missed,
             "outside": [self.label[i] for i in self.outside.rows],
@@ -165,10 +169,6 @@ class Compensation:
     def csv(self) -> str:
         """Return labels, corrected commands, remaining errors and status as CSV text."""
         return noted(columns_csv(self._columns(), joint_columns(self.robot.joint_dimensions)), ".csv", self.note)
-
-
-def _errors(position: Array, orientation: Array) -> dict[str, Any]:
-    return {"position": statistics(position), "orientation": statistics(orientation, "mrad")}
 
 
 @one_blas_thread
@@ -343,7 +343,7 @@ def _tooled(
     x = every[places]
     C = result.known_covariance
     if C is not None:
-        own = (np.cumsum(whole.identified) - 1)[places[whole.identified[places]]]
+        own = whole.free.places_of(robot)
         C = C[np.ix_(own, own)]
     known = reflectors(p.names)
     if tool is not None:

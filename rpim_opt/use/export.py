@@ -220,7 +220,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         penalty = prior_penalty(None, none, none, form.matrix[:, geometry], form.c, None)
         problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[geometry]))
         alone = calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
-    alone = replace(alone, record=result.record, known_causes=result.causes)  # the extension is no mistake
+    alone = replace(alone, record=result.record, known={"causes": result.causes})  # the extension is no mistake
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))

@@ -24,7 +24,7 @@ SCALE = PROBLEM.parameters.free.scale
 
 
 def test_covariances_are_their_formulas() -> None:
-    m = RESULT.linear
+    m = RESULT.spread.linear
     inverse = np.linalg.inv(m.A.T @ m.A + WEIGHT * np.eye(len(SCALE)))
     freedom = len(m.b) - np.trace(m.A @ inverse @ m.A.T)
     variance = np.sum((m.A @ RESULT.z - m.b) ** 2) / freedom
@@ -50,7 +50,7 @@ def test_intervals_are_students() -> None:
 
 def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     result: Any = SimpleNamespace(
-        linear_penalty=True,
+        spread=SimpleNamespace(spare=equations - dof),
         freedom=max(equations - dof, 0.0),
         noise_test=lambda: noise_test(variance * (equations - dof), equations - dof),
     )
@@ -96,7 +96,7 @@ def test_what_few_equations_tell(left: float, tells: bool) -> None:
 def test_without_equations_left_over_the_noise_is_the_declared() -> None:
     few, _ = simulated(("a2", "theta1", "d5"), noise=5e-5, configurations=1)
     exact = ro.calibrate(few, ro.least_squares)
-    assert exact.linear.equations == 3
+    assert exact.spread.linear.equations == 3
     assert exact.spread.noise_variance == 1.0
 
 

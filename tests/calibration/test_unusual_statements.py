@@ -97,7 +97,7 @@ def test_a_weighted_squared_loss_tells_the_noise_of_what_it_sums(problem: Any, k
     }[kind]
     result = ro.calibrate(problem, ro.Formulation(kind, lambda r: cp.sum_squares(W @ r), cp.sum_squares), 2.0)
     dof, variance = noise_of(result, W)
-    assert result.linear.equations == len(W)
+    assert result.spread.linear.equations == len(W)
     assert result.spread.degrees_of_freedom == pytest.approx(dof, rel=1e-8)
     assert result.spread.noise_variance * np.mean(np.sum(W**2, axis=1)) == pytest.approx(variance, rel=1e-8)
 

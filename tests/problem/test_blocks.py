@@ -185,7 +185,7 @@ def test_robust_losses_take_few_passes_more(name: str, variant: str | None, form
 @pytest.mark.usefixtures("too_many")
 def test_inliers_of_a_robust_loss_are_the_same_in_blocks(whole: ro.CalibrationProblem) -> None:
     there, here = ro.calibrate(whole, ro.robust, 1.0), ro.calibrate(apart(whole), ro.robust, 1.0)
-    assert here.linear.equations == there.linear.equations
+    assert here.spread.linear.equations == there.spread.linear.equations
     assert here.spread.noise_variance == pytest.approx(there.spread.noise_variance, rel=1e-5)
     np.testing.assert_allclose(here.covariance, there.covariance, rtol=0, atol=1e-5 * np.abs(there.covariance).max())
     chosen = ro.calibrate(apart(whole), ro.robust, ro.reml)

@@ -107,7 +107,7 @@ def test_parts_give_the_answer_of_the_rows(whole: CalibrationProblem, parts: lis
     again = ro.calibrate(partitioned(whole, parts), ro.tikhonov, there.weight)
     fixed = ro.calibrate(whole, ro.tikhonov, there.weight)
     np.testing.assert_allclose(again.x, fixed.x, rtol=0, atol=1e-13)
-    assert again.linear.equations == fixed.linear.equations == 3 * PARTS * ROWS
+    assert again.spread.linear.equations == fixed.spread.linear.equations == 3 * PARTS * ROWS
     assert again.spread.noise_variance == pytest.approx(fixed.spread.noise_variance, rel=1e-9)
     assert 0.9 < again.spread.noise_variance < 1.1  # as simulated
     np.testing.assert_allclose(again.covariance, fixed.covariance, rtol=0, atol=1e-9 * np.abs(fixed.covariance).max())
@@ -163,7 +163,7 @@ def test_large_problems_are_solved_in_parts_of_whole_configurations(whole, monke
     monkeypatch.undo()
     np.testing.assert_allclose(result.x, ro.calibrate(whole, ro.tikhonov, 1.0).x, rtol=0, atol=1e-13)
     assert result.problem is whole  # parts are how it is solved, not what was asked
-    assert result.linear.equations == 3 * len(whole.data)
+    assert result.spread.linear.equations == 3 * len(whole.data)
 
 
 def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Dataset]) -> None:

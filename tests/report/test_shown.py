@@ -22,7 +22,7 @@ OBJECTS = {
     "robot": INSTANCE.problem.robot,
     "parameters": INSTANCE.problem.parameters,
     "result": RESULT,
-    "linear": RESULT.linear,
+    "linear": RESULT.spread.linear,
     "identified": RESULT.program.model.parameters,
     "selection": RESULT.selection,
     "program": RESULT.program,
