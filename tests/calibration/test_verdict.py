@@ -84,7 +84,7 @@ def test_a_robot_worse_than_the_nominal_one_is_not_delivered() -> None:
 
 def test_files_hold_the_verdict(tmp_path: Path) -> None:
     result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0, max_iterations=1)
-    result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))
+    result = replace(result, known={"causes": ("Likely: joints 2 and 3 exchanged.",)})
     save_result(result, tmp_path / "result.json")
     again = load_result(tmp_path)
     assert again.verdict == result.verdict
@@ -98,7 +98,7 @@ def test_files_hold_the_verdict(tmp_path: Path) -> None:
 
 def test_python_follows_it(tmp_path: Path) -> None:
     result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0)
-    result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))
+    result = replace(result, known={"causes": ("Likely: joints 2 and 3 exchanged.",)})
     with pytest.raises(ro.basics.NotDelivered, match="joints 2 and 3 exchanged"):
         ro.use.compensate(result, np.zeros((1, 6)))
     forced = ro.use.compensate(result, np.zeros((1, 6)), orientation=False, despite_verdict=True)
@@ -133,7 +133,7 @@ def test_export_follows_the_acceptance_test(monkeypatch, capsys, tmp_path: Path,
 @pytest.mark.usefixtures("undrawn")
 def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
     result = ro.calibrate(simulated_arm("ur5e"), "tikhonov", 1.0)
-    result = replace(result, known_causes=("Likely: joints 2 and 3 exchanged.",))
+    result = replace(result, known={"causes": ("Likely: joints 2 and 3 exchanged.",)})
     folder = str(tmp_path)
     save_result(result, tmp_path / "result.json")
     (tmp_path / "targets.csv").write_text("q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg\n10,-80,60,20,30,0\n")
