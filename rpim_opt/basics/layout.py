@@ -38,6 +38,8 @@ BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
 """A name with its number and unit, in a header whose names and cells are separated by single blanks."""
 GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:[.,]\d{3})+")
 """What may be a whole number with its thousands apart, or one with three decimals."""
+PARTS = re.compile(r"x y z|(j|a|q|joint_?|axis_?)1 (?:\1\d )+\1\d")
+"""What tables with a row a coordinate, or a joint, name in that row, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
 """What the column is called that holds the coordinates of a table with a row a coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
@@ -294,7 +296,8 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
         if not any(map(str.isalpha, "".join(row))):
             continue  # a line of dashes
         wide = len(filled) >= width / 2 or (filled[-1] > width / 2 and filled[-1] > 1)
-        wide = wide or (len(filled) > 1 and any(split(cell)[1] for cell in row))  # merged: Pose, Joint values [deg]
+        # merged, above names: Pose, Joint values [deg]
+        wide = wide or (headers and len(filled) > 1 and any(split(cell)[1] for cell in row))
         if not wide or len(row) > width + 1:
             break
         headers.insert(0, i)
@@ -447,11 +450,15 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 
 def _one_row_each(table: RawTable) -> RawTable:
-    """Return a table whose rows hold one coordinate of a point, ``P1, X, 1.5``, with a row a point; others as is."""
-    axis = next((name for name, cells in table.columns.items() if {str(c).lower() for c in cells} == set("xyz")), "")
+    """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint with a row a point; others as is."""
+    named = {name: {str(cell).strip().lower() for cell in cells} for name, cells in table.columns.items()}
+    axis = next(
+        (name for name, some in named.items() if len(some) < 10 and PARTS.fullmatch(" ".join(sorted(some)))), ""
+    )
     if not axis:
         return table
     letters = [str(cell).strip().lower() for cell in table.columns[axis]]
+    parts = sorted(named[axis])
     texts = {
         name: _without_letters([str(cell).strip() for cell in cells], letters)
         for name, cells in table.columns.items()
@@ -459,7 +466,7 @@ def _one_row_each(table: RawTable) -> RawTable:
     }
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
-        accepted = "a column naming the point; x, y, z once each"
+        accepted = f"a column naming the point; {', '.join(parts)} once each"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
     columns: dict[str, Sequence[Any]] = {}
     for name, cells in texts.items():
@@ -468,7 +475,7 @@ def _one_row_each(table: RawTable) -> RawTable:
             columns[name] = [each.pop() for each in own]
     value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
     unit = _unit_beside(value, columns)
-    for letter in "xyz":
+    for letter in parts:
         cells = [texts[value][rows[letter]] if letter in rows else "" for rows in points]
         columns[_with_unit(letter, unit)] = cells
     note = f"one row per coordinate: column '{value}' by '{axis}'."

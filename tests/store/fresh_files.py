@@ -147,6 +147,9 @@ ARRAYS = {
     "joint_angles_deg": np.asarray(JOINTS, float).tolist(),
     "measured_mm": np.asarray(POINTS, float).tolist(),
 }
+JOINT_ROWS = [
+    [label, f"J{j}", value] for label, row in zip(LABELS, JOINTS, strict=True) for j, value in enumerate(row, 1)
+]
 COMMENTED = [line + " # reflector cleaned" * (i == 5) for i, line in enumerate(text([HEAD], ROWS).splitlines())]
 FORTRAN = [[f"{float(v) / 1e3:.9f}D+03" for v in row[1:]] for row in ROWS]
 
@@ -172,6 +175,8 @@ FRESH: dict[str, Shape] = {
     "Kawasaki AS": many(("calib.as", kawasaki()), ("points.csv", text([["point", "x [mm]", "y [mm]", "z [mm]"]], beside([[label.lower()] for label in LABELS], POINTS)))),
     "YAML, a list of samples": one(samples(), "raw.yaml", **IN_SI),
     "Excel, a row a quantity": excel({"quer": TURNED}),
+    "a row a joint": many(("axes.csv", text([["pose", "joint", "angle [deg]"]], JOINT_ROWS)), ("points.csv", text([["pose", *HEAD[7:]]], beside(NAMED, POINTS)))),
+    "rows counted from 0 and from 1": many(("joints.csv", text([HEAD[:7]], beside([[str(i)] for i in range(COUNT)], JOINTS))), ("points.csv", text([[HEAD[0], *HEAD[7:]]], beside([[str(i + 1)] for i in range(COUNT)], POINTS)))),
     "LabVIEW": one(labview(), "raw.lvm", **BOTH),
     "TUM trajectory, joints by time": many(("trajectory.txt", trajectory()), ("joints.csv", clocked_joints()), kind="pose", **IN_SI),
     "KUKA trace beside a tracker": one(trace(), **BOTH),

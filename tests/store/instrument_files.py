@@ -152,7 +152,7 @@ REFUSED_THOUGH_RIGHT: dict[str, Shape] = {
         text([[*HEAD[:7], "Azimuth [deg]", "Elevation [deg]", "Distance [mm]"]], beside(NAMED, JOINTS, POLAR))
     ),
     "azimuth, zenith, slope distance": one(
-        text([[*HEAD[:7], "Az [deg]", "Zenith angle [deg]", "Slope distance [mm]"]], beside(NAMED, JOINTS, ZENITH))
+        text([[*HEAD[:7], "Az [deg]", "Zenith angle [deg]", "D [mm]"]], beside(NAMED, JOINTS, ZENITH))
     ),
     "one row a coordinate": one(text([LONG_HEAD], LONG)),
     "one row a coordinate, joints in a file of their own": many(

@@ -110,6 +110,7 @@ def test_turns_in_another_convention_are_asked_for_and_what_they_are_is_printed(
          {}, "(label of the row) in deg, accepted: one of no unit"),
         (text([["Axis", *HEAD[1:7], "Value [mm]"]], [["XYZ"[i % 3], *ROWS[0][1:7], "1"] for i in range(9)]), {},
          "a column naming the point"),
+        (text([["// export", "units: mm"]], ROWS), {}, "no header above 'P1, "),
         (text([["Point", *HEAD[1:]]], ROWS), {"rotation": "intrinsic xxy"}, "'extrinsic xyz', 'intrinsic zyx'"),
     ],
 )  # fmt: skip

@@ -121,6 +121,9 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
 def _by_key(joints: Understood, values: Understood, key: str) -> Match:
     """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
+    count = len(chosen.left)
+    if sorted([chosen.left, chosen.right]) == [[str(i) for i in range(k, k + count)] for k in (0, 1)]:
+        chosen = _row_numbers(joints, values, None)  # one file counts from 0
     place = {name: i for i, name in enumerate(chosen.left)}
     if len(place) < len(chosen.left):
         twice = Counter(chosen.left).most_common(1)[0][0]

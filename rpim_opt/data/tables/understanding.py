@@ -179,6 +179,8 @@ def _readings(
             _rename(read, dict(zip(letters, new, strict=True)), why)
             rotation = turns
             break
+    if stems & {"elevation", "zenith"}:
+        _rename(read, {"d": "distance"}, "beside two angles")
     numbered(read, table, dof, options.quaternion or "wxyz")
     _put_in_robots_order(read, table, dof, joints)
     _count_from_one(read, dof)

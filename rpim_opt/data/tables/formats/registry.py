@@ -17,7 +17,8 @@ from rpim_opt.basics.tables import EXCEL, TEXTS, decoded
 Rows = Sequence[Mapping[str, Any]]
 """Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
-BINARY = (".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl")
+NO_TABLES = (".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl",
+             ".html", ".htm", ".m", ".py", ".ipynb")  # fmt: skip
 """Endings of files that are no tables as text; any other unknown ending may be one of an instrument's table."""
 
 
@@ -40,7 +41,7 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     modules = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.name != "registry"]
     every: list[TableFormat] = [each for name in modules for each in import_module(f"{__package__}.{name}").FORMATS]
     fitting = [each for each in every if ending in each.endings]
-    if not fitting and ending in BINARY:
+    if not fitting and ending in NO_TABLES:
         plain = {*TEXTS, *EXCEL, ".parquet", ".mat", ".npz"}
         accepted = ", ".join(sorted(plain.union(*(each.endings for each in every))))
         raise InputError("the file's name", f"'{path.name}'", f"a name ending in {accepted}", path)
