@@ -77,9 +77,18 @@ def test_a_robot_worse_than_the_nominal_one_is_not_delivered() -> None:
     assert result.verdict.delivered
     off = replace(result, x=result.x + 20 * instance.problem.parameters.free.scale)
     assert any("larger than those of the nominal robot" in text for text in off.verdict.reasons)
+
+
+@pytest.mark.parametrize("rows", [3, 5, 8, 11, 12, 20])
+def test_few_rows_tell_a_worse_robot_from_chance(rows: int) -> None:
+    """Errors that are the nominal robot's but for a tenth are not larger; four times larger ones are."""
     rng = np.random.default_rng(3)
-    noise = np.abs(rng.normal(size=(2, 400, 20)))
-    assert sum(worse_than_nominal(a, b) for a, b in noise.transpose(1, 0, 2)) <= 4
+    nominal = rng.normal(size=(400, rows, 3))
+    near = np.linalg.norm(nominal + 0.1 * rng.normal(size=nominal.shape), axis=2)
+    far = 4 * np.linalg.norm(rng.normal(size=nominal.shape), axis=2)
+    nominal = np.linalg.norm(nominal, axis=2)
+    assert sum(worse_than_nominal(a, b) for a, b in zip(nominal, near, strict=True)) <= 6
+    assert sum(worse_than_nominal(a, b) for a, b in zip(nominal, far, strict=True)) >= 350
 
 
 def test_files_hold_the_verdict(tmp_path: Path) -> None:
