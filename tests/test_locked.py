@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import re
+import sys
 import tomllib
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 
+import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 from packaging.version import Version
@@ -71,6 +74,8 @@ def test_the_build_backend_has_a_bound() -> None:
 
 
 def test_what_runs_here_is_what_is_locked() -> None:
+    if not Path(sys.prefix, "requirements.sha256").is_file():
+        pytest.skip("dev.py did not make this environment, so it has other versions than the locked ones")
     for name, (wanted, _) in locked("requirements.txt").items():
         try:
             assert version(name) == wanted, name

@@ -18,6 +18,7 @@ DECREASE = 1e-6  # what the program at a solution may still promise of the objec
 DIRECTIONS = 2  # random directions in which the model's derivative is compared
 APART = 1e-4  # half the distance of a difference, in scales
 INEXACT = 1e-4  # relative difference, beyond rounding, from which the model's derivative is not the residual's
+RESTING = 1e-12  # step, relative to 1 + |z|, below which it is rounding, whatever it promises of an objective near zero
 TINY = 1e-300  # where numbers end that something may be divided by
 
 
@@ -41,7 +42,9 @@ class Certificate(NamedTuple):
 
     def holds(self, z: Array) -> bool:
         """Whether the conditions hold at z (n,), to the accuracy of an interior-point solver."""
-        return self.decrease is not None and self.decrease <= DECREASE and self.violation <= feasibility_tolerance(z)
+        if self.decrease is None or self.violation > feasibility_tolerance(z):
+            return False
+        return self.decrease <= DECREASE or self.step <= RESTING
 
 
 def certified(

@@ -19,7 +19,6 @@ from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import display, joint_columns, quantities
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import on_board
-from rpim_opt.data.measurements.contact import touches
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.design import random_candidates
@@ -323,10 +322,11 @@ class _Table:
         if len(markers) > 1:
             table["marker"] = [markers[k] for k in turn.tolist()]
         q = np.zeros((len(names), robot.dof))
-        declared = self._read({**table, **self._joints(q[:, None], 0)}).blocks[0].covariance[0]
+        touching = self._read({**table, **self._joints(q[:, None], 0)})
+        declared = touching.blocks[0].covariance[0]
         errors = self.rng.normal(size=(len(names), 3)) @ np.linalg.cholesky(declared).T
         targets = np.concatenate(list(things.values())) + self.noisy * errors
-        problem = CalibrationProblem(robot, self.parameters, touches(q[:1], ["any"], 1.0))
+        problem = CalibrationProblem(robot, self.parameters, touching)
         for k, marker in enumerate(markers):
             mine = turn == k
             q[mine] = configurations_at(problem, targets[mine], self.rng, self.x, plan.joint_share, marker)

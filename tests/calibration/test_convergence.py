@@ -13,7 +13,7 @@ import pytest
 
 import rpim_opt as ro
 from tests.convex.plain import objective_at, plain, violation
-from tests.simulate import simulated
+from tests.simulate import ARM, simulated
 
 SHIPPED = ("blunders", "constrained", "distance", "far_frames", "pose", "rank_deficient", "scara")
 """Of each kind one: the others run through the same code."""
@@ -86,6 +86,16 @@ def test_a_certificate_is_what_converged_rests_on() -> None:
     assert early.certificate.decrease > 1e-6 > late.certificate.decrease >= 0
     assert late.certificate.step < 1e-4
     assert late.certificate.violation == 0
+
+
+def test_exact_poses_of_the_nominal_robot_converge_where_they_begin() -> None:
+    """What is left is rounding, of which a step of 1e-14 takes a share."""
+    q = np.random.default_rng(0).uniform(-2.0, 2.0, (36, 6))
+    data = ro.Dataset.of(q, ro.robot.forward_kinematics(ARM, q), 1e-4, measurement="pose")
+    parameters = ro.robot.model_parameters(ARM).identify(["theta?"])
+    result = ro.calibrate(ro.CalibrationProblem(ARM, parameters, data), weight=1.0)
+    assert result.converged, result.message
+    assert np.abs(result.x).max() < 1e-12
 
 
 @pytest.mark.parametrize("weight", [1e-3, 1e-2, 1.0])

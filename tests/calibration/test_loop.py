@@ -159,7 +159,7 @@ def test_passes_are_reported_as_they_come() -> None:
 def test_converged_is_at_rest_and_certified(
     most: int, decrease: float, converged: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    evidence = Certificate(0.0, 0.0, decrease)
+    evidence = Certificate(1.0, 0.0, decrease)
     monkeypatch.setattr("rpim_opt.calibration.loop.certified", lambda *_: evidence)
     result = ro.calibrate(PROBLEM, ro.tikhonov, 1.0, max_iterations=most)
     assert result.converged == converged
@@ -256,8 +256,8 @@ def test_why_a_loop_at_rest_has_not_converged() -> None:
     [(1e-7, 0.0, True), (1.1e-6, 0.0, False), (None, 0.0, False), (0.0, 0.9e-7, True), (0.0, 1.1e-7, False)],
 )
 def test_a_certificate_holds_to_an_interior_points_accuracy(decrease: Any, violation: float, holds: bool) -> None:
-    assert Certificate(0.0, violation, decrease).holds(np.full(3, 0.5)) == holds
-    assert Certificate(0.0, 10 * violation, decrease).holds(np.full(3, -10.0)) == holds  # of the largest entry
+    assert Certificate(1.0, violation, decrease).holds(np.full(3, 0.5)) == holds
+    assert Certificate(1.0, 10 * violation, decrease).holds(np.full(3, -10.0)) == holds  # of the largest entry
 
 
 def test_a_certificate_measures_what_is_left() -> None:

@@ -73,6 +73,11 @@ def test_the_noise_is_judged_by_its_distribution(variance: float, said: str) -> 
     assert said in test.verdict
 
 
+def test_a_noise_stated_too_large_names_the_option_that_estimates_it() -> None:
+    assert "--noise free" in noise_test(12.0, 40, learned=True).verdict
+    assert "--noise free" not in noise_test(12.0, 40, learned=True, factor=0.5).verdict  # it is estimated already
+
+
 def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
     for tail in (0.005, 0.995):
         edge = chi2.ppf(tail, 40) / 40

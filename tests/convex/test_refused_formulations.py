@@ -95,6 +95,8 @@ def test_a_statement_without_a_unit_is_in_si() -> None:
     bare = ro.constraints.parse("a3 = a4")
     assert bare.unit == ("SI", 1.0)
     assert bare.step == pytest.approx(0.01)
+    equal = ro.constraints.parse("a3 = a4 + 2 mm")
+    assert equal.step == pytest.approx(1e-5)  # a hundredth of a millimetre
     near = ro.constraints.parse("|a3 - a4| <= 2 mm")
     assert near.unit == ("mm", 1e-3)
     assert near.step == pytest.approx(2e-4)

@@ -11,10 +11,12 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.robot.extensions import _draws, moment_slopes
 from rpim_opt.robot.kinematics import numeric_frame
-from rpim_opt.robot.mdh import MOUNTINGS, STANDARD
+from rpim_opt.robot.mdh import MOUNTINGS
 from tests.robot.test_exchange import urdf_kinematics
 from tests.simulate import ARM
 
+G = 9.80665
+"""Standard acceleration of free fall [m/s^2]."""
 TYPES = ("revolute", "revolute", "prismatic", "revolute", "revolute")
 
 
@@ -55,7 +57,7 @@ def energy(robot: ro.robot.Robot, model: np.ndarray, payload: float | None = Non
         loads = [(T[-1], (0, 0, 0), 5.0), (T[3], (0, 0, 0), 10.0)]
     loads.append((T[-1], gravity.payload_centre, payload))
     places = [(T[:, :3, :3] @ np.array(centre) + T[:, :3, 3], mass) for T, centre, mass in loads]
-    return -STANDARD * sum(mass * place @ np.array(gravity.direction) for place, mass in places)
+    return -G * sum(mass * place @ np.array(gravity.direction) for place, mass in places)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -92,7 +94,7 @@ def test_an_arm_that_states_no_masses_has_five_kilograms_at_the_wrist_and_ten_at
         assert np.abs(torques[:, i] + slope).max() < 1e-6
     short = ro.robot.Robot("two links", np.array([[np.pi / 2, 0, 0, 0, 0], [0, 0.4, 0, 0, 0]]))
     # both at the last frame, 0.4 m out
-    assert ro.robot.gravity_torques(short, np.zeros((1, 2)))[0] == pytest.approx([-15 * STANDARD * 0.4, 0])
+    assert ro.robot.gravity_torques(short, np.zeros((1, 2)))[0] == pytest.approx([-15 * G * 0.4, 0])
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -185,7 +187,7 @@ def test_mountings_are_words_or_a_vector() -> None:
     # stretched upwards, along x: nothing pulls at the first joint
     up = ro.robot.Robot("boom", np.array([[0, 0, 0, 0, 0], [0, 1.0, 0, 0, 0]]), gravity=gravity.mounted("wall"))
     sideways = ro.robot.gravity_torques(up, np.array([[0.0, 0.0], [np.pi / 2, 0.0], [0.1, 0.0]]))[:, 0]
-    assert sideways[:2] == pytest.approx([0.0, 15 * STANDARD])
+    assert sideways[:2] == pytest.approx([0.0, 15 * G])
     assert sideways[2] > 0  # and it falls further the way it leans
 
 
@@ -300,7 +302,7 @@ def test_the_masses_of_a_urdf_are_where_the_file_has_them(tmp_path: Path, drawn:
             (mass, (world @ urdf_kinematics(path, link, q))[:, :3] @ np.array([*centre, 1.0]))
             for link, (mass, centre) in {**BODIES, **GRIPPER}.items()
         ]
-        return STANDARD * sum(mass * place[:, 2] for mass, place in places)
+        return G * sum(mass * place[:, 2] for mass, place in places)
 
     h = 1e-6
     torques = ro.robot.gravity_torques(arm.robot, q)
@@ -372,4 +374,4 @@ def test_slopes_by_first_moments_are_differences_of_torques(link: int) -> None:
 
     for axis in range(3):
         moved = torques(np.eye(3)[axis]) - torques(np.zeros(3))
-        assert moved == pytest.approx(STANDARD * 2.0 * slopes[:, :, link - 1, axis], abs=1e-12)
+        assert moved == pytest.approx(G * 2.0 * slopes[:, :, link - 1, axis], abs=1e-12)

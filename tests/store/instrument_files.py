@@ -53,6 +53,10 @@ TRIPLES = [[f"[{', '.join(row)}]"] for row in POINTS]
 POINT_TABLE = text([["Point", *HEAD[7:]]], beside(NAMED, POINTS))
 
 
+def lists(values: np.ndarray) -> list[list[str]]:
+    return [[f"[{', '.join(row)}]"] for row in cells(values.reshape(len(values), -1))]
+
+
 def many(*files: tuple[str, str], kind: str = "position", **options: str) -> Shape:
     """Return a shape of several files, name and content each."""
     return lambda folder: [write(folder, name, content) for name, content in files], options, kind
@@ -165,6 +169,12 @@ REFUSED_THOUGH_RIGHT: dict[str, Shape] = {
     "joints and position in one cell each": one(
         text([["id", "joints [deg]", "position [mm]"]],
              beside(NAMED, [[f"({' '.join(row)})"] for row in JOINTS], [[f"({' '.join(row)})"] for row in POINTS]))
+    ),
+    "a rotation matrix in one cell": one(
+        text([[*HEAD, "rotation"]], beside(ROWS, lists(T[:, :3, :3])), ";"), kind="pose"
+    ),
+    "a transform in one cell": one(
+        text([[*HEAD[:7], "pose"]], beside(NAMED, JOINTS, lists(T)), ";"), kind="pose", units="mm"
     ),
     "JSON lines": one(json_lines(), "raw.jsonl"),
     "KRL .dat": program("calib.dat", krl()),

@@ -14,7 +14,23 @@ from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 from tests.store.fresh_files import FRESH
 from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl
-from tests.store.raw_files import HEAD, JOINTS, LABELS, NAMED, POINTS, ROWS, P, Q, Rows, T, beside, book, cells, text
+from tests.store.raw_files import (
+    HEAD,
+    JOINTS,
+    LABELS,
+    NAMED,
+    POINTS,
+    RAW,
+    ROWS,
+    P,
+    Q,
+    Rows,
+    T,
+    beside,
+    book,
+    cells,
+    text,
+)
 from tests.test_cli import run
 
 NOT_READ = {"DMIS output"}
@@ -46,9 +62,13 @@ def test_a_file_as_it_is_exported_is_the_clean_table(monkeypatch, capsys, empty,
     files = write(empty)
     paths = [path.name for path in (files if isinstance(files, list) else [files])]
     assert new(monkeypatch, *paths, **options) == 0, capsys.readouterr().err
-    (block,) = ro.load("cell").problem.data.blocks
-    labels = ro.load("cell").problem.data.label
-    labels = [label.upper() for label in labels]
+    assert_clean(ro.load("cell").problem.data, kind)
+
+
+def assert_clean(data: ro.Dataset, kind: str) -> None:
+    """Compare with the clean table: rows in any order, numbers to the last digit that a file has of them."""
+    (block,) = data.blocks
+    labels = [label.upper() for label in data.label]
     order = [LABELS.index(label) for label in labels] if set(labels) <= set(LABELS) else list(range(len(Q)))
     assert block.measurement.name == kind
     assert len(order) == len(Q)
@@ -57,6 +77,33 @@ def test_a_file_as_it_is_exported_is_the_clean_table(monkeypatch, capsys, empty,
     if kind == "pose":
         turned = Rotation.from_quat(block.y[:, [4, 5, 6, 3]]).as_matrix()
         assert np.abs(turned - T[order][:, :3, :3]).max() < 1e-8
+
+
+@pytest.fixture(scope="module")
+def calibrated() -> dict[str, ro.Calibration]:
+    """Calibrations of the arm with positions and with poses, which read further ones."""
+    parameters = ro.robot.model_parameters(ARM).identify(["theta?"])
+    poses = ro.robot.forward_kinematics(ARM, np.radians(Q))
+    results = {}
+    for kind, y in (("position", poses[:, :3, 3]), ("pose", poses)):
+        data = ro.Dataset.of(np.radians(Q), y, 1e-4, measurement=kind)
+        results[kind] = ro.calibrate(ro.CalibrationProblem(ARM, parameters, data), weight=1.0)
+    return results
+
+
+@pytest.mark.parametrize("name", [*RAW, *FILES])
+def test_new_measurements_are_read_as_the_clean_table(tmp_path, calibrated, name) -> None:
+    write, stated, kind = RAW.get(name) or FILES[name]
+    options = {"within" if key == "time-tolerance" else key: text for key, text in stated.items()}
+    stated = ro.data.TableOptions.stated(options)
+    assert_clean(ro.use.read_measurements(calibrated[kind], write(tmp_path), options=stated).data, kind)
+
+
+@pytest.mark.parametrize(("unit", "si"), [("s", 1.0), ("ms", 1e-3), ("us", 1e-6), ("µs", 1e-6), ("ns", 1e-9)])
+def test_times_of_new_measurements_are_in_seconds(calibrated, unit, si) -> None:
+    table = {f"time [{unit}]": [3.0, 8.0], **{f"q{i}_deg": [0.0, 10.0] for i in range(1, 7)}}
+    table |= {f"{axis}_mm": [800.0, 810.0] for axis in "xyz"}
+    assert np.diff(ro.use.read_measurements(calibrated["position"], table).when) == pytest.approx(5 * si)
 
 
 def test_units_above_the_header_are_not_said_to_be_stated(monkeypatch, capsys, empty) -> None:

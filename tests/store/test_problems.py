@@ -145,6 +145,18 @@ def test_a_surface_out_of_reach_is_refused(tmp_path: Path) -> None:
         simulate(folder)
 
 
+def test_tools_touch_by_turns(tmp_path: Path) -> None:
+    folder = shutil.copytree(problems_folder() / "contact", tmp_path / "contact")
+    file = folder / "problem.toml"
+    text = file.read_text().replace("[tool]\nz_mm = 120", "[tool.A]\nz_mm = 120\n[tool.B]\nz_mm = 150")
+    file.write_text(
+        text.replace("configurations = 6", "configurations = 1").replace("validation = 6", "validation = 1")
+    )
+    made = simulate(folder).tables["identification.csv"]
+    assert made["marker"] == [*"AB"] * 5
+    assert len(set(made["point"])) == 10
+
+
 def test_another_seed_is_another_truth(tmp_path: Path) -> None:
     a, b = simulate("position"), simulate("position", seed=99)
     assert a.deviations["a2"][1] != b.deviations["a2"][1]
