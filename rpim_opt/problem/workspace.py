@@ -290,7 +290,7 @@ def visible_configurations(
         sight = there.mean(axis=1)
         leaning = np.einsum("nij,j,ni->n", T[:, :3, :3], normal, sight)
         there[~before] = [0.0, 0.0, 1.0]
-        uv = np.stack(pixels(*np.moveaxis(there, 2, 0), **camera), axis=2)
+        uv = np.stack(pixels(np.moveaxis(there, 2, 0), camera), axis=2)
         inside = ((uv > MARGIN * size) & (uv < (1 - MARGIN) * size)).all(axis=(1, 2))
         large = np.ptp(uv, axis=1).max(axis=1) > LARGE * size[0]
         upright = leaning > UPRIGHT * np.linalg.norm(sight, axis=1)

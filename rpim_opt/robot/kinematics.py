@@ -18,7 +18,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.threads import on_all_cores
 from rpim_opt.robot.mdh import MDH, Robot
-from rpim_opt.robot.terms import SYMBOLS, Configuration, Place, Symbol, Term, motion, terms_of
+from rpim_opt.robot.terms import SYMBOLS, Configuration, Joint, Place, Symbol, Term, term_motion, terms_of
 
 FRAME = ("x", "y", "z", "rx", "ry", "rz")
 """A frame's six numbers: origin [m], and roll, pitch, yaw [rad] about fixed axes, R = Rz Ry Rx."""
@@ -144,8 +144,15 @@ def _by_joint(
     dof = len(joint_types)
     every = (*terms_of(dof), *terms)
 
+    def motion(at: Place, i: int) -> ca.SX | None:
+        """Return the sum of the motions of all terms of joint or link i; None without any."""
+        own = [term for term in every if term.at == at and i in term.places(joint_types)]
+        motions = [term_motion(term, Joint(i, configuration), value) for term in own]
+        parts = [part for part in motions if part is not None]
+        return sum(parts[1:], parts[0]) if parts else None
+
     def displaced(at: Place, i: int) -> list[ca.SX]:
-        by = motion(at, joint_types, i, configuration, value, terms)
+        by = motion(at, i)
         return [] if by is None else placed((0,) * 6, ca.vertsplit(by))
 
     steps = []
@@ -153,7 +160,7 @@ def _by_joint(
     for i, kind in enumerate(joint_types, start=1):
         alpha, a, theta, d, beta = (value(f"{column}{i}") for column in MDH)
         q = configuration.q[i - 1]
-        more = motion("joint", joint_types, i, configuration, value, every)
+        more = motion("joint", i)
         moved = q if more is None else q + more
         if kind == "revolute":
             theta = theta + moved

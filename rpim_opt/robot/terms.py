@@ -430,18 +430,3 @@ def terms_of(dof: int) -> tuple[Term, ...]:
         for axis in "xyz"
     ]
     return (*JOINT_TERMS, *bends)
-
-
-def motion(
-    at: Place,
-    joint_types: Sequence[str],
-    i: int,
-    configuration: Configuration,
-    value: Callable[[str], Symbol],
-    terms: Sequence[Term],
-) -> ca.SX | None:
-    """Return the sum of the motions of all terms of joint or link i; None without any; parameters by ``value``."""
-    own = [term for term in terms if term.at == at and i in term.places(joint_types)]
-    parts = [term_motion(term, Joint(i, configuration), value) for term in own]
-    parts = [part for part in parts if part is not None]
-    return sum(parts[1:], parts[0]) if parts else None

@@ -132,7 +132,7 @@ def test_distortion_is_taken_back() -> None:
     from rpim_opt.data.measurements.camera import pixels
 
     x, y = np.meshgrid(np.linspace(-0.6, 0.6, 9), np.linspace(-0.5, 0.5, 7))
-    uv = np.column_stack([part.ravel() for part in pixels(x, y, 1.0, **LENS)])
+    uv = np.column_stack([part.ravel() for part in pixels((x, y, 1.0), LENS)])
     assert normalized(uv, LENS) == pytest.approx(np.column_stack([x.ravel(), y.ravel()]), abs=1e-6)
 
 

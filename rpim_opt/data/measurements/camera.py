@@ -5,7 +5,7 @@ The pinhole has radial and tangential distortion; a board's points come from a t
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from typing import Any
@@ -37,27 +37,16 @@ MOST = 300
 """Points along either side of a pattern: beyond the larger number none has them, and they are listed one by one."""
 
 
-def pixels(
-    X: Any,
-    Y: Any,
-    Z: Any,
-    fx: Any,
-    fy: Any,
-    cx: Any,
-    cy: Any,
-    k1: Any = 0.0,
-    k2: Any = 0.0,
-    p1: Any = 0.0,
-    p2: Any = 0.0,
-    k3: Any = 0.0,
-) -> tuple[Any, Any]:
+def pixels(point: Iterable[Any], camera: Mapping[str, Any]) -> tuple[Any, Any]:
     """Return u and v [px] of a point in the camera's frame, x right, y down, z forwards; symbols, numbers or arrays.
 
-    With x = X / Z, y = Y / Z and r^2 = x^2 + y^2 (Brown and Conrady)::
+    With the camera's `INTRINSICS`, (X, Y, Z) the point, x = X / Z, y = Y / Z and r^2 = x^2 + y^2 (Brown and Conrady)::
 
         u = fx [x (1 + k1 r^2 + k2 r^4 + k3 r^6) + 2 p1 x y + p2 (r^2 + 2 x^2)] + cx
         v = fy [y (1 + k1 r^2 + k2 r^4 + k3 r^6) + p1 (r^2 + 2 y^2) + 2 p2 x y] + cy
     """
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (camera[name] for name in INTRINSICS)
+    X, Y, Z = point
     x = X / Z
     y = Y / Z
     r2 = x**2 + y**2
@@ -77,7 +66,7 @@ def _in_camera(carried: bool, T: Any, values: Mapping[str, Any]) -> Any:
 
 def _pixels_of(carried: bool, T: Any, **values: Any) -> Any:
     intrinsics = {name: values[f"camera_{name}"] for name in INTRINSICS}
-    return ca.vertcat(*pixels(*ca.vertsplit(_in_camera(carried, T, values)), **intrinsics))
+    return ca.vertcat(*pixels(ca.vertsplit(_in_camera(carried, T, values)), intrinsics))
 
 
 def _metres_of(carried: bool, T: Any, **values: Any) -> Any:
