@@ -474,7 +474,8 @@ def _one_row_each(table: RawTable) -> RawTable:
         if all(len(each) == 1 for each in own):
             columns[name] = [each.pop() for each in own]
     value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
-    unit = _unit_beside(value, columns)
+    units = {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
+    unit = split(value)[1] or (units.pop() if len(units) == 1 else "")
     for letter in parts:
         cells = [texts[value][rows[letter]] if letter in rows else "" for rows in points]
         columns[_with_unit(letter, unit)] = cells
@@ -497,12 +498,6 @@ def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
         found = f"one row per coordinate, value columns: {', '.join(measured) or 'none'}"
         raise InputError("the header", found, "one column called value or measured, or a table with columns x, y, z")
     return measured[0]
-
-
-def _unit_beside(value: str, columns: Mapping[str, Sequence[str]]) -> str:
-    """Return the unit of a column of values: in its name, or that which another column has in every row."""
-    units = {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
-    return split(value)[1] or (units.pop() if len(units) == 1 else "")
 
 
 def _points(names: Sequence[str], letters: Sequence[str]) -> list[dict[str, int]]:

@@ -17,7 +17,6 @@ from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
-from rpim_opt.data.measurements.registry import READY
 from rpim_opt.problem.contact import Features, Touches, contrasted, of_rows
 from rpim_opt.problem.linear import LinearModel, Reweigh
 from rpim_opt.problem.noise import Equations, Repeatability, Stack, equation_numbers
@@ -46,11 +45,6 @@ from rpim_opt.robot.parameters import (
 )
 from rpim_opt.robot.terms import Curve, Model, transmission
 
-GEOMETRY = re.compile(r"(alpha|a|d|theta)\d+")
-BASE = re.compile(r"base_.*")
-PLACES = re.compile(r"(tool|anchor|length|plane|sphere|camera)_.*")
-POINTS = re.compile(r"(anchor|length|plane|sphere)_.*|tool_(.*_)?[xyz]")
-"""Parameters that ``identify = "auto"`` names: places, or of those what a measurement without orientations sees."""
 SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move all of a robot alike
 
 
@@ -637,14 +631,16 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     if patterns != "auto":
         return [patterns] if isinstance(patterns, str) else patterns
     kinds = [block.measurement for block in data.blocks]
-    allowed = [GEOMETRY]
+    own = {
+        of_fixture(name, block.fixture)
+        for block in data.blocks
+        for name in block.measurement.parameters
+        if not (block.measurement.by_camera and name.startswith("board_"))  # a board is as large as its file says
+    }
+    geometry = re.compile(f"{ORIGIN}.*" if carried_by(robot.model.terms) else r"(alpha|a|d|theta)\d+")
+    tools = re.compile(r"tool_.*" if any(kind.turning for kind in kinds) else r"tool_(.*_)?[xyz]")
+    names = [name for name in parameters.names if geometry.fullmatch(name)]
+    names += near_parallel(robot)
     if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
-        allowed.append(BASE)
-    allowed.append(PLACES if any(kind.turning for kind in kinds) else POINTS)
-    if carried_by(robot.model.terms):  # in the place of the table's
-        allowed[0] = re.compile(f"{ORIGIN}.*")
-    geometry, *places = ([name for name in parameters.names if kind.fullmatch(name)] for kind in allowed)
-    others = [block for block in data.blocks if block.measurement not in READY.values()]
-    own = {of_fixture(name, block.fixture) for block in others for name in block.measurement.parameters}
-    places.append([name for name in parameters.names if name in own and not PLACES.fullmatch(name)])
-    return [*geometry, *near_parallel(robot), *(name for names in places for name in names)]
+        names += [name for name in parameters.names if name.startswith("base_")]
+    return names + [name for name in parameters.names if tools.fullmatch(name) or name in own]

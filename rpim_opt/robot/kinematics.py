@@ -122,11 +122,9 @@ def frame_numbers(T: Array) -> Array:
     return np.concatenate([T[:3, 3], roll_pitch_yaw(T[:3, :3])])
 
 
-def transforms(
-    joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol], terms: Sequence[Term] = ()
-) -> list[ca.SX]:
+def transforms(joint_types: Sequence[str], configuration: Configuration, value: Callable[[str], Symbol]) -> list[ca.SX]:
     """Return the transforms from the robot's base to the frame after every joint; the last is the flange's."""
-    products = [product(factors) for factors in _by_joint(joint_types, configuration, value, terms)[:-1]]
+    products = [product(factors) for factors in _by_joint(joint_types, configuration, value, ())[:-1]]
     return list(itertools.accumulate(products, operator.matmul))
 
 

@@ -452,20 +452,13 @@ class _Urdf:
                 raise InputError(f"link '{link_name}'", "nothing", choices(link_name, self.links))
         if base is None:
             roots = [link for link in self.links if link not in self.above]
-            if len(roots) > 1:
-                accepted = "one of them: --urdf-base, urdf_base in problem.toml, or the argument base"
-                raise InputError("links without a parent", ", ".join(roots), accepted)
-            base = roots[0]
+            base = _only(roots, "links without a parent", "one of them", "base")
         if tip is None:
             parents = {joint.parent for joint in self.above.values()}
             leaves = [link for link in self.links if link not in parents and link != base] or [base]
             below = [link for link in leaves if any(joint.parent == base for joint in self._to_root(link))] or leaves
-            if len(below) > 1:
-                accepted = (
-                    "one of them or a link before it (tool0): --urdf-tip, urdf_tip in problem.toml, or the argument tip"
-                )
-                raise InputError(f"links at the end of chains from '{base}'", ", ".join(below), accepted)
-            tip = below[0]
+            ends = f"links at the end of chains from '{base}'"
+            tip = _only(below, ends, "one of them or a link before it (tool0)", "tip")
         up, down = self._to_root(base), self._to_root(tip)
         while up and down and up[-1] is down[-1]:
             up.pop()
@@ -528,6 +521,14 @@ class _Urdf:
                 raise seen[-1].error("mimic", f"joint '{name}'", "a joint that moves, and does not follow this one")
             seen.append(self.joints[name])
         return seen[-1].name, factor, offset
+
+
+def _only(links: Sequence[str], where: str, accepted: str, which: str) -> str:
+    """Return the only one of links; of several one has to be named."""
+    if len(links) > 1:
+        accepted = f"{accepted}: --urdf-{which}, urdf_{which} in problem.toml, or the argument {which}"
+        raise InputError(where, ", ".join(links), accepted)
+    return links[0]
 
 
 def _read(path: Path) -> _Urdf:
