@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -26,24 +25,15 @@ GROSS = 6.0  # factor on the median distance from which on a row does not count 
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
-class Judged(NamedTuple):
-    """Residuals (N,) in standard deviations of a reading, their limits, and the coverage of the intervals."""
-
-    sigmas: Array
-    allowed: Array
-    coverage: float | None
-
-
-def judged(result: Calibration, data: Dataset) -> Judged:
-    """Compare N measurements with their prediction intervals; NaN where there is no prediction.
-
-    A row is allowed the norm that one of N rows exceeds with probability 0.01.
-    """
+def compared(result: Calibration, data: Dataset) -> HeldOut:
+    """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals."""
     N = len(data)
     sigmas, allowed = np.full((2, N), np.nan)
+    errors = result.nominal_errors(data), result.errors(data)
+    held = HeldOut(data.label, len(result.problem.labels), *errors, sigmas, allowed)
     C = result.known_covariance
     if C is None:
-        return Judged(sigmas, allowed, None)
+        return held
     inside: list[np.ndarray] = []
     problem = result.problem.on(data)
     parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
@@ -65,16 +55,10 @@ def judged(result: Calibration, data: Dataset) -> Judged:
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
         inside.append(within[predicted][:, lengths].ravel())
     covered = np.concatenate(inside)
-    return Judged(sigmas, allowed, float(covered.mean()) if len(covered) else None)
+    return replace(held, coverage=float(covered.mean()) if len(covered) else None)
 
 
-def compared(result: Calibration, data: Dataset) -> HeldOut:
-    """Return the errors of a calibration on measurements that it did not use."""
-    errors = result.nominal_errors(data), result.errors(data)
-    return HeldOut(data.label, len(result.problem.labels), *errors, *judged(result, data))
-
-
-def displaced(result: Calibration, data: Dataset, intervals: Judged | HeldOut) -> str:
+def displaced(result: Calibration, data: Dataset, held: HeldOut) -> str:
     """Say that measurements are displaced together, by the motion that registers them; empty where they are not.
 
     It is said where rows are outside their prediction intervals and the motion takes more than half of the RMS error,
@@ -82,7 +66,7 @@ def displaced(result: Calibration, data: Dataset, intervals: Judged | HeldOut) -
     """
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
-    if len(rows) < FEWEST or not (intervals.sigmas > intervals.allowed)[rows].any():
+    if len(rows) < FEWEST or not (held.sigmas > held.allowed)[rows].any():
         return ""
     try:
         again, motion = registered(result, data)
@@ -164,7 +148,7 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     refitted = result.calibrate_again(original.on(whole))
     labels = whole.label[len(original.data) :]
     kept = np.flatnonzero(np.isin(labels, refitted.problem.labels))
-    held = replace(compared(result, apart), label=labels, coverage=judged(result, apart.take(kept)).coverage)
+    held = replace(compared(result, apart), label=labels, coverage=compared(result, apart.take(kept)).coverage)
     record = replace(result.record, validation=None, held_out=held)
     if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)

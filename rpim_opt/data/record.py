@@ -8,8 +8,6 @@ from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from typing import NamedTuple
 
-import numpy as np
-
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import version_of
@@ -68,14 +66,17 @@ class Requirement:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Errors on held-out rows, kept when a final fit uses these rows.
+    """Errors of a calibration on N rows that it did not see.
 
-    They validate the procedure; the parameters that are delivered come from all rows.
+    A record keeps them when a final fit uses these rows: they validate the procedure, and the parameters that are
+    delivered come from all rows.
 
-    ``label`` are N held-out rows, ``used`` is how many rows the parameters that were judged came from; ``nominal`` and
-    ``error`` (N,) are errors before and after [m], NaN for rows that measure no length. ``sigmas`` and ``allowed`` (N,)
-    are as of `Validation`; ``coverage`` is the share of the lengths in the 95 % interval of a reading, without rows
-    that the final fit excludes; None without covariance.
+    ``used`` is how many rows the parameters came from; ``nominal`` and ``error`` (N,) are errors before and after [m],
+    NaN for rows that measure no length. ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the
+    covariance of a reading (the instrument's as the row states it, and the repeatability) and C the calibration's;
+    ``allowed`` (N,) their limit by Fisher's F, which one of all N exceeds with probability 0.01. Both are NaN where the
+    calibration has no covariance, or none in a direction that the row depends on. ``coverage`` is the share of lengths
+    in the 95 % interval of a reading, without rows that a final fit excludes; None without covariance.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibration.refit_all(ro.load("position").calibrate())
@@ -90,11 +91,6 @@ class HeldOut:
     sigmas: Array
     allowed: Array
     coverage: float | None = None
-
-    def sentence(self, rows: int) -> str:
-        """Return a sentence on the validation, and the rows that the parameters are identified from."""
-        mean = f"with parameters from the {self.used} others their mean error is {1e3 * np.nanmean(self.error):.4f} mm"
-        return f"Validated on {len(self.label)} held-out rows: {mean}. The delivered parameters are from all {rows}."
 
 
 class Earlier(NamedTuple):

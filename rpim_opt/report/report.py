@@ -20,13 +20,12 @@ from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import headline_errors
-from rpim_opt.calibration.held_out import judged as predicted
+from rpim_opt.calibration.held_out import compared, headline_errors
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
+from rpim_opt.convex import select
 from rpim_opt.convex.rules.selection import Selection
-from rpim_opt.convex.select import compare
 from rpim_opt.data.dataset import Block as Rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import combination, observe
@@ -150,7 +149,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
     notes = [summary.nominal_note(result), used]
     covered = record.held_out and record.held_out.coverage
     if record.held_out is None and record.validation is not None:
-        covered = predicted(result, record.validation).coverage
+        covered = compared(result, record.validation).coverage
     if covered is not None and content.accepted is None:  # whose section says it
         share = percent(round(covered, 2))
         notes.append(f"{share} of the held-out coordinates lie in their 95 % prediction intervals.")
@@ -457,7 +456,7 @@ def _regularization(content: Content) -> Iterator[Block]:
     if not has_path or not result.weight > 0:
         return
     by_user = Selection(result.weight, "given", np.array([]), np.array([]), True)
-    chosen = {**compare(result.program), result.selector: result.selection or by_user}
+    chosen = {**select.compare(result.program), result.selector: result.selection or by_user}
     chosen = dict(sorted(chosen.items(), key=lambda item: item[1].weight))
     marked = {rule: choice for rule, choice in chosen.items() if choice.weight > 0}
     draw = partial(plot.l_curve, result, marked)

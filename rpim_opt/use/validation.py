@@ -12,41 +12,28 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import displaced, judged, registered
+from rpim_opt.calibration.held_out import compared, displaced, registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import REACH, arm_length, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import shared_rows
 
 
-@dataclass(frozen=True, eq=False)
-class Validation:
-    """Errors of a calibration on N new measurements.
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Validation(HeldOut):
+    """Errors of a calibration on N new measurements, as `HeldOut` has them, and what else they show.
 
-    ``nominal`` and ``error`` (N,) are the position errors before and after calibration [m], ``vectors`` (N, 3) measured
-    minus predicted position [m], NaN where no position was measured, and ``angle`` (N,) the orientation errors [rad],
-    NaN for rows that are no poses.
-
-    ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the
-    instrument's as the row states it, and the repeatability) and C the calibration's; ``allowed`` (N,) their limit by
-    Fisher's F, which one of all N rows exceeds with probability 0.01. Both are NaN where the calibration has no
-    covariance, or none in a direction that the row depends on. ``coverage`` is the share of the lengths that lie in the
-    95 % interval of a new reading; None without covariance.
-
-    ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` says how far touches are
-    from their points and planes, the worst first [mm], ``remarks`` what a reader of the errors has to know, and
-    ``mistake`` names another reading of the measurements that fits far better, if there is one.
+    ``vectors`` (N, 3) are measured minus predicted position [m], NaN where no position was measured, and ``angle`` (N,)
+    the orientation errors [rad], NaN for rows that are no poses. ``outside`` are rows beyond the joint ranges that the
+    calibration measured, ``touched`` says how far touches are from their points and planes, the worst first [mm],
+    ``remarks`` what a reader of the errors has to know, and ``mistake`` names another reading of the measurements that
+    fits far better, if there is one.
     """
 
-    label: tuple[str, ...]
-    nominal: Array
-    error: Array
     vectors: Array
     angle: Array
-    sigmas: Array
-    allowed: Array
-    coverage: float | None = None
     outside: Outside = field(default_factory=Outside)
     touched: tuple[Mapping[str, Any], ...] = ()
     remarks: tuple[str, ...] = ()
@@ -148,20 +135,22 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         data, motion = registered(result, data)
         remarks.append(f"Registered again, which takes 6 degrees of freedom: the measurements were {motion}.")
     problem = result.problem.sample()
-    nominal = result.nominal_errors(data)
-    error = result.errors(data)
-    touched = touch_errors(data, nominal, error)
+    held = compared(result, data)
+    touched = touch_errors(data, held.nominal, held.error)
     remarks += shared_rows(problem.data, data)
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
         remarks += [*contact_remarks(problem), *known_points(problem, data)]
-    intervals = judged(result, data)
     return Validation(
-        data.label, nominal, error, result.error_vectors(data), result.errors(data, "angle"), *intervals,
-        outside=result.outside(data), touched=touched, remarks=tuple(remarks),
-        mistake=misread(result, data) or displaced(result, data, intervals) or _elsewhere(result, error),
-    )  # fmt: skip
+        **vars(held),
+        vectors=result.error_vectors(data),
+        angle=result.errors(data, "angle"),
+        outside=result.outside(data),
+        touched=touched,
+        remarks=tuple(remarks),
+        mistake=misread(result, data) or displaced(result, data, held) or _elsewhere(result, held.error),
+    )
 
 
 def _elsewhere(result: Calibration, error: Array) -> str:
