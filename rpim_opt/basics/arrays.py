@@ -11,9 +11,9 @@ Array = NDArray[np.float64]
 
 
 def statistics(errors: Array, unit: Literal["mm", "mrad"] = "mm") -> dict[str, Any]:
-    """Return mean, RMS, maximum [mm or mrad] and count of errors [m or rad]; None if all are NaN."""
+    """Return mean, RMS, 95th percentile, maximum [mm or mrad] and count of errors [m or rad]; None if all are NaN."""
     of = 1e3 * errors[np.isfinite(errors)]
-    if not len(of):
-        return {f"mean_{unit}": None, f"rms_{unit}": None, f"max_{unit}": None, "count": 0}
-    rms = float((of**2).mean() ** 0.5)
-    return {f"mean_{unit}": float(of.mean()), f"rms_{unit}": rms, f"max_{unit}": float(of.max()), "count": len(of)}
+    figures: dict[str, float | None] = dict.fromkeys(("mean", "rms", "p95", "max"))
+    if len(of):
+        figures = {"mean": of.mean(), "rms": (of**2).mean() ** 0.5, "p95": np.percentile(of, 95), "max": of.max()}
+    return {f"{name}_{unit}": v if v is None else float(v) for name, v in figures.items()} | {"count": len(of)}

@@ -83,9 +83,7 @@ def _both_models(
 
 
 def _figures(what: str, errors: Array, unit: Unit = "mm") -> dict[str, Any]:
-    finite = 1e3 * errors[np.isfinite(errors)]
-    high = float(np.percentile(finite, 95)) if len(finite) else None
-    return {"what": what, **statistics(errors, unit), f"p95_{unit}": high}
+    return {"what": what, **statistics(errors, unit)}
 
 
 def _kinds(data: Dataset) -> dict[str, list[int]]:

@@ -124,6 +124,8 @@ def new_problem(
     counts = {name: len(next(iter(each.values()), ())) for name, each in tables.items()}
     tables = {name: each for name, each in tables.items() if counts[name]}
     noise = usual_noise(kind)
+    supplied = [*paths, *later]
+    alike = len({file.name for file in supplied}) < len(supplied)  # then their paths are noted
     with in_file(understanding.file):
         text, guessed = _problem_text(
             arm, kind, rows.take(np.flatnonzero(~held)), chain, noise=noise, first=not before, source=source,
@@ -131,7 +133,7 @@ def new_problem(
             identification=identified, columns=how, data=paths[0].name, validation=validated, held_out=held.any(),
             seed=seed, validated_by=next((file.name for file in later), ""),
             assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
-            raw=_digests([*paths, *later]),
+            raw={str(file) if alike else file.name: files.sha256_of(file) for file in supplied},
             reading=replace(understanding.options, joints=arm.names).texts(),
         )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
@@ -145,12 +147,6 @@ def new_problem(
         of_chain = [added] if chain else []
     notes = (f"Measurement {kind.name}: {how}.", guessed, *_remarks(arm, source, understanding, noise), *of_chain)
     return Started(folder, {name: counts[name] for name in tables}, notes, replace(understanding, kind=kind))
-
-
-def _digests(supplied: Sequence[Path]) -> dict[str, str]:
-    """Return the SHA-256 of files by their names, or by their paths where two have one name."""
-    several = len({file.name for file in supplied}) < len(supplied)
-    return {str(file) if several else file.name: files.sha256_of(file) for file in supplied}
 
 
 def _remarks(arm: Described, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:

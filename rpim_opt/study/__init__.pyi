@@ -4,7 +4,7 @@ from .comparison import Comparison as Comparison
 from .comparison import Standing as Standing
 from .comparison import Summary as Summary
 from .comparison import compare as compare
-from .figures import distributions as distributions
+from .comparison import distributions as distributions
 from .methods import Fitted as Fitted
 from .studies import Metric as Metric
 from .studies import Report as Report

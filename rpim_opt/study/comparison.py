@@ -15,10 +15,12 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
+from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import csv_text, frame_of
 from rpim_opt.basics.text import counted, html_table, listed, markdown, progress_bar, table
+from rpim_opt.report.plot import logarithmic
 from rpim_opt.store.instances import Instance
 from rpim_opt.study import studies
 from rpim_opt.study.methods import (
@@ -27,7 +29,6 @@ from rpim_opt.study.methods import (
     UNCONVERGED,
     USUAL,
     WITH_FIGURES,
-    Problem,
     Row,
     methods_of,
     metrics_of,
@@ -42,6 +43,8 @@ TIE = 0.01  # errors that differ by no more than this part are a tie
 ENOUGH = 5  # problems from which on an interval speaks of problems like them; with fewer, of these
 BOOTSTRAP_DRAWS = 4000
 CONFIDENCE = 0.95
+ROW_INCHES = 0.25  # height of a method in a figure
+LARGEST_RATIO = 30.0  # ratios beyond are drawn at the edge, with an arrow
 SAME_DATA = ("problem", "split", "fold", "count", "noise_factor", "seed")
 """Columns in which two replicates of a pair agree: then they saw the same data."""
 Pair = tuple[Any, ...]
@@ -128,7 +131,9 @@ def compare(
     drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}
     cases: list[Row] = []
     for (label, problem), (split, size), count, factor in product(asked.items(), ways.items(), sizes, factors):
-        seeded = split != FOLDER or factor > 1 or _varies(problem, count)
+        every = np.inf if callable(problem) else len(np.unique(problem.problem.data.configuration))
+        # what a seed changes: what is generated or held out, the noise, which configurations are drawn
+        seeded = callable(problem) or split != FOLDER or factor > 1 or (count is not None and count < every)
         folds = range(1, max(int(size), 1) + 1)
         for seed, fold, (name, method) in product(numbered if seeded else numbered[:1], folds, compared.items()):
             case = {"problem": label, "method": name, "formulation": method.formulation, "selector": method.selector}
@@ -163,13 +168,6 @@ def _seeds(stated: int | Iterable[int]) -> list[int]:
             raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
         stated = range(max(int(stated), 0))
     return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
-
-
-def _varies(problem: Problem, count: int | None) -> bool:
-    """Whether a seed changes the data: a generated problem's, or which configurations are drawn."""
-    if not isinstance(problem, Instance):
-        return True
-    return count is not None and count < len(np.unique(problem.problem.data.configuration))
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
@@ -245,8 +243,6 @@ class Comparison:
 
         Arguments and errors as for `summary`.
         """
-        from rpim_opt.study.figures import comparison_figure
-
         summary = self.summary(metric, against)
         of = figures(self.rows, summary.metric)
         other = of[summary.reference]
@@ -255,7 +251,7 @@ class Comparison:
             own = of[each.method]
             ratios[each.method] = np.array([own[pair] / other[pair] for pair in own if other.get(pair)])
             means[each.method] = each.ratio, each.low, each.high
-        return comparison_figure(ratios, means, f"{summary.metric} over that of {summary.reference}, same replicate")
+        return _ratios(ratios, means, f"{summary.metric} over that of {summary.reference}, same replicate")
 
     def report(self, folder: str | Path, metric: str | None = None, against: str | None = None) -> Path:
         """Write ``README.md`` with the summary and the medians by problem, the figure, and ``replicates.csv``.
@@ -522,3 +518,69 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         where = f" ({listed(list(dict.fromkeys(missing)), 4)})" if len(missing) < every[method] else ""
         count = f"{len(missing)} of {every[method]} replicates{where}"
         yield f"{method}: {status}, {count}. {reason[:1].upper()}{reason[1:]}"
+
+
+# --- figures ---------------------------------------------------------------------------------------------------------
+
+
+def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
+    """Return a logarithmic dot plot with one line per name, from top to bottom, and marked medians.
+
+    ``values`` are positive figures by name; ``label`` says what they are, with their unit.
+
+    >>> import rpim_opt as ro
+    >>> figure = ro.study.distributions({"reml": [0.1, 0.2, 0.4], "l_curve": [0.2, 0.3, 0.9]}, "mean error [mm]")
+    >>> len(figure.axes)
+    1
+    """
+    ax = _axes(0.32 * len(values) + 0.9)
+    for y, known in enumerate(values.values()):
+        dots = ax.plot(known, [y] * len(known), "o", ms=3, alpha=min(1.0, 5 / len(known) ** 0.5), color="C0", mew=0)
+        dots[0].set_rasterized(len(known) > 50)  # thousands of dots would make megabytes of SVG
+        middle = sorted(known)[len(known) // 2]
+        ax.plot([middle], [y], "|", ms=11, mew=2, color="C3")
+        ax.annotate(f"{middle:.3g}", (1.01, y), xycoords=("axes fraction", "data"), va="center", fontsize=8)
+    return _finished(ax, list(values), label)
+
+
+def _ratios(ratios: Mapping[str, Array], means: Mapping[str, Sequence[float | None]], label: str) -> Any:
+    """Return the figure: methods from top to bottom, their ratios as dots, the mean with the ends of its interval."""
+    ax = _axes(max(ROW_INCHES * len(ratios) + 1.5, 3.5), dpi=150)
+    ax.axvline(1, color="0.4", lw=1, zorder=1)
+    for y, (method, values) in enumerate(ratios.items()):
+        alpha = min(0.5, 3 / max(len(values), 1) ** 0.5)
+        ax.plot(_inside(values), np.full(len(values), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
+        if (values > LARGEST_RATIO).any():
+            ax.plot([LARGEST_RATIO], [y], ">", ms=6, color="C0", zorder=2)
+        if (values < 1 / LARGEST_RATIO).any():
+            ax.plot([1 / LARGEST_RATIO], [y], "<", ms=6, color="C0", zorder=2)
+        mean, low, high = means[method]
+        colour = "0.3"
+        if low is not None and high is not None:
+            if high < 1 or low > 1:
+                colour = "C2" if high < 1 else "C3"
+            ax.plot(_inside([low, high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
+        if mean is not None:
+            ax.plot(_inside([mean]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
+    ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
+    return _finished(ax, list(ratios), label)
+
+
+def _axes(height: float, **options: Any) -> Any:
+    from matplotlib.figure import Figure  # which nothing but a figure needs
+
+    return Figure(figsize=(7, height), layout="constrained", **options).add_subplot()
+
+
+def _inside(ratios: Any) -> Any:
+    return np.clip(ratios, 1 / LARGEST_RATIO, LARGEST_RATIO)
+
+
+def _finished(ax: Any, names: Sequence[str], label: str) -> Any:
+    """Return the figure of axes with named rows from top to bottom, logarithmic along x."""
+    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.set_ylim(len(names) - 0.3, -0.7)
+    ax.set_xlabel(label)
+    ax.grid(axis="x", alpha=0.25)
+    logarithmic(ax, "x")
+    return ax.figure

@@ -130,15 +130,6 @@ def _instance(given: Any, label: str) -> Instance | None:
     return None
 
 
-def _drawn(problem: Problem, label: str, seed: int) -> Instance:
-    if isinstance(problem, Instance):
-        return problem
-    instance = _instance(problem(seed), label)
-    if instance is None:
-        raise InputError(f"problem {label}", f"a function of a seed that returns no problem ({seed})", RETURNS)
-    return instance
-
-
 # --- what is held out ------------------------------------------------------------------------------------------------
 
 
@@ -348,10 +339,8 @@ class Fitted:
         return self.errors_of(self.problem.data, "length")
 
 
-def _p95(fitted: Fitted) -> float | None:
-    errors = fitted.errors()
-    known = errors[np.isfinite(errors)]
-    return 1e3 * float(np.percentile(known, 95)) if len(known) else None
+def _statistic(name: str, fitted: Fitted) -> float | None:
+    return statistics(fitted.errors())[name]
 
 
 def _coverage(fitted: Fitted) -> float | None:
@@ -360,10 +349,7 @@ def _coverage(fitted: Fitted) -> float | None:
 
 
 METRICS: dict[str, Callable[[Fitted], float | None]] = {
-    "rms_mm": lambda fitted: statistics(fitted.errors())["rms_mm"],
-    "mean_mm": lambda fitted: statistics(fitted.errors())["mean_mm"],
-    "p95_mm": _p95,
-    "max_mm": lambda fitted: statistics(fitted.errors())["max_mm"],
+    **{name: partial(_statistic, name) for name in ("rms_mm", "mean_mm", "p95_mm", "max_mm")},
     "rms_mrad": lambda fitted: statistics(fitted.errors("angle"), "mrad")["rms_mrad"],
     "fit_rms_mm": lambda fitted: statistics(fitted.fit_errors())["rms_mm"],
     "covered_percent": _coverage,
@@ -389,7 +375,11 @@ def replicate(
     """
     row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
     try:
-        instance, held_out = _divided(_drawn(problem, case["problem"], case["seed"]), split, case)
+        label, seed = case["problem"], case["seed"]
+        drawn = _instance(problem if isinstance(problem, Instance) else problem(seed), label)
+        if drawn is None:
+            raise InputError(f"problem {label}", f"a function of a seed that returns no problem ({seed})", RETURNS)
+        instance, held_out = _divided(drawn, split, case)
         begun = time.perf_counter()
         returned = method.function(instance.problem) if method.function else instance.calibrate(**method.settings)
         seconds = time.perf_counter() - begun

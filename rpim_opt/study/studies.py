@@ -268,11 +268,13 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
         "README.md": (text + "\n").encode(),
         "metrics.json": json_text(dict(report.metrics)).encode(),
     }
-    if report.figures:
-        from rpim_opt.study.figures import picture
+    for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
+        from matplotlib import rc_context  # which nothing but a figure needs
 
-        for (title, figure), kind in product(report.figures.items(), ("svg", "png")):
-            files[f"{title}.{kind}"] = picture(figure, title, kind)
+        stream = io.BytesIO()
+        with rc_context({"svg.hashsalt": title}):  # the same file for the same figure
+            figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else None)
+        files[f"{title}.{kind}"] = stream.getvalue()
     with refused(folder):
         write_files({folder / name: content for name, content in files.items()})
 

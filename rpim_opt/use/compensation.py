@@ -107,7 +107,10 @@ class Compensation:
             f"Largest corrections: {', '.join(changes)}.",
         ]
         for status, where in {"limited": "", "near singular": "", **AT_FAULT}.items():
-            rows = [self._missed(i) for i, each in enumerate(self.status) if each == status]
+            rows = []
+            for i in [i for i, each in enumerate(self.status) if each == status]:
+                expanded = f", U {1e3 * EXPANDED * self.std[i]:.3f} mm" if status == ABOVE else ""
+                rows.append(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded})")
             if rows:
                 lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
         if self.missed:
@@ -131,10 +134,6 @@ class Compensation:
         if not np.isfinite(self.limit):
             far |= self.position_error > EXPANDED * self.std
         return [self.label[i] for i in np.flatnonzero(far)]
-
-    def _missed(self, i: int) -> str:
-        expanded = f", U {1e3 * EXPANDED * self.std[i]:.3f} mm" if self.status[i] == ABOVE else ""
-        return f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded})"
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
