@@ -12,7 +12,6 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
 from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
@@ -405,16 +404,10 @@ class Outcome:
         ``std`` is None where the formulation has no covariance, or an infinite one.
         """
         free = self.problem.parameters.free
-        values = free.values(self.x)
         C = self.known_covariance
         std = np.full(len(self.x), np.inf) if C is None else np.sqrt(np.diag(C))
-        rows: list[dict[str, Any]] = []
-        for i, name in enumerate(free.names):
-            unit, si = display(free.dimensions[i])
-            row: dict[str, Any] = {"name": name, "unit": unit, "nominal": float(free.nominal[i] / si)}
-            row |= {"identified": float(values[i] / si), "deviation": float(self.x[i] / si)}
-            rows.append({**row, "std": float(std[i] / si) if np.isfinite(std[i]) else None})
-        return rows
+        columns = {"nominal": free.nominal, "identified": free.values(self.x), "deviation": self.x, "std": std}
+        return free.rows(columns, key="name")
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:

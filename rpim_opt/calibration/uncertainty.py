@@ -9,7 +9,6 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.text import Tabled
-from rpim_opt.basics.units import display
 from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, position_noise
 from rpim_opt.calibration.outcome import Outcome
@@ -76,13 +75,9 @@ class Uncertainty(Tabled):
         noise, prior, both = (np.sqrt(np.diag(C)) for C in (spread.noise, spread.prior, spread.covariance))
         columns = {"value": free.values(self.result.x), "u_noise": noise, "u_prior": prior, "u": both}
         columns["U"] = self.coverage_factor * both
-        rows: list[dict[str, Any]] = []
-        for i, name in enumerate(free.names):
-            unit, si = display(free.dimensions[i])
-            figures = {key: float(values[i] / si) for key, values in columns.items()}
-            held = bool(both[i] == 0) or name in self.result.actively_constrained
-            rows.append({"parameter": name, "unit": unit, **figures, "actively_constrained": held})
-        return rows
+        constrained = (both == 0) | np.isin(free.names, self.result.actively_constrained)
+        rows = free.rows(columns)
+        return [{**row, "actively_constrained": bool(held)} for row, held in zip(rows, constrained, strict=True)]
 
     def _notes(self) -> list[str]:
         lines = [

@@ -17,7 +17,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
-from rpim_opt.basics.units import display, joint_columns
+from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import compared, headline_errors
@@ -252,17 +252,17 @@ def _parameters(content: Content) -> Iterator[Block]:
     at_bound = {each.name for each in result.active_bounds}
     columns = len(head) - (not np.isfinite(tolerance).any())
     rows = []
+    bounds = free.rows({"U": half, "tolerance": tolerance})
     for i, row in enumerate(result.parameter_rows()):
         if free.of_curves[i]:
             continue
-        _, si = display(free.dimensions[i])
         name = f"{row['name']} [{row['unit']}]"
         if row["name"] in at_bound:
             name += ", at its bound"
         if words.rotated(row):
             name += " *"
-        expanded = f"±{half[i] / si:.4f}" if np.isfinite(half[i]) else ""
-        bound = f"±{tolerance[i] / si:.4g}" if np.isfinite(tolerance[i]) else ""
+        expanded = "" if bounds[i]["U"] is None else f"±{bounds[i]['U']:.4f}"
+        bound = "" if bounds[i]["tolerance"] is None else f"±{bounds[i]['tolerance']:.4g}"
         figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
         rows.append([name, *figures, expanded, bound][:columns])
     yield "text", words.weight_lines(result)

@@ -162,16 +162,19 @@ class Parameters(Tabled):
         shown = ", ".join([*self.names[:SHOWN], "..."] if len(self) > SHOWN else self.names)
         return f"{shown}: {np.count_nonzero(self.identified)} of {len(self)} identified"
 
-    def _frame_rows(self) -> list[dict[str, Any]]:
+    def rows(self, columns: Mapping[str, Array], key: str = "parameter") -> list[dict[str, Any]]:
+        """Return name (by a key), unit, and in it the figures (P,) [SI] of every parameter; None for infinite ones."""
         rows: list[dict[str, Any]] = []
-        for i, name in enumerate(self.names):
-            unit, si = display(self.dimensions[i])
-            row: dict[str, Any] = {"parameter": name, "unit": unit}
-            for key in ("nominal", "scale", "tolerance"):
-                value = float(getattr(self, key)[i] / si)
-                row[key] = value if np.isfinite(value) else None
-            rows.append(row | {"identified": bool(self.identified[i])})
+        for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
+            unit, si = display(dimension)
+            figures = {column: float(values[i] / si) for column, values in columns.items()}
+            known = {column: value if np.isfinite(value) else None for column, value in figures.items()}
+            rows.append({key: name, "unit": unit, **known})
         return rows
+
+    def _frame_rows(self) -> list[dict[str, Any]]:
+        rows = self.rows({key: getattr(self, key) for key in ("nominal", "scale", "tolerance")})
+        return [{**row, "identified": bool(own)} for row, own in zip(rows, self.identified, strict=True)]
 
     def __len__(self) -> int:
         return len(self.names)
