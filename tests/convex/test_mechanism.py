@@ -147,6 +147,20 @@ def test_a_quantile_of_redundant_parameters_is_not_wrong_in_silence() -> None:
         checked("quantile", "squares", "none", "rank_deficient", weight)
 
 
+@pytest.mark.parametrize(
+    ("loss", "penalty", "constraints", "weight"),
+    [
+        ("fourth power", "norm1", "own slacks", 1e-8),
+        ("pseudo-huber", "groups", "none", 1e-8),
+        ("weighed squares", "groups", "tolerance", 1e-3),
+    ],
+)
+def test_hardly_identified_parameters_do_not_end_an_iteration_too_early(
+    loss: str, penalty: str, constraints: str, weight: float
+) -> None:
+    checked(loss, penalty, constraints, "rank_deficient", weight)
+
+
 @pytest.mark.parametrize("seed", range(8))
 def test_a_box_is_that_of_an_active_set_method(seed: int) -> None:
     """Against scipy.optimize.lsq_linear (bvls): well posed, few equations, and redundant columns."""

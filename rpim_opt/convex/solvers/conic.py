@@ -422,7 +422,7 @@ class ReducedProgram:
             dense.append(-A.ravel())
         cost = np.concatenate(q)
         # tolerances are absolute below one; a loss, which is no smaller, takes fewer iterations as it is
-        largest = max(np.abs(cost).max(), 1e-3 * weight, np.abs(residual).max(initial=0.0))
+        largest = max(np.abs(cost).max(), 1e-3 * weight)
         scale = 1.0 / max(1.0, largest if self.loss is None else largest / DEAR)
         P, matrix = data.filled(weight, np.concatenate(dense))
         P.data *= scale

@@ -24,6 +24,8 @@ DECREASE = 1e-12
 """Newton ends where its model promises less, relative to the objective."""
 INTERIOR = 1e-10
 """The same where an interior point solves the small program, which is no more exact."""
+INEXACT = 1e-7
+"""A small program is badly solved where its minimum is above the present point, by more than this part of the loss."""
 STEPS = 60
 """Newton steps of one smoothing width."""
 FEW_ENTRIES = 400
@@ -99,15 +101,17 @@ class Rows:
         """Return the argument of the loss for a residual (m,): the residual, or the norms of configurations (N,)."""
         return r if self.counts is None else np.sqrt(np.add.reduceat(r * r, self.starts))
 
-    def alone(
-        self, loss: Loss, which: np.ndarray, canonical: Canonical, squares: int
-    ) -> tuple[ReducedProgram, Array, Array]:
-        """Return the small program with some entries of a loss beside so many rows of squares, and their equations."""
-        counts, places = None, which
+    def equations(self, which: np.ndarray) -> tuple[Array, Array]:
+        """Return the equations A and b of some entries."""
+        places = which
         if self.counts is not None:
-            counts = self.counts[which]
             places = np.concatenate([np.arange(int(self.counts[i])) + self.starts[i] for i in which])
-        return ReducedProgram(canonical, squares, loss.some(which), counts), self.A[places], self.b[places]
+        return self.A[places], self.b[places]
+
+    def program(self, loss: Loss, which: np.ndarray, canonical: Canonical, squares: int) -> ReducedProgram:
+        """Return the small program with some entries of a loss as they are, beside so many rows of squares."""
+        counts = None if self.counts is None else self.counts[which]
+        return ReducedProgram(canonical, squares, loss.some(which), counts)
 
 
 @dataclass(eq=False)
@@ -218,6 +222,8 @@ class Newton:
             promised = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
             if self.point.iterations:  # Clarabel's accuracy
                 tolerance = max(tolerance, INTERIOR)
+            if promised < -INEXACT * size:
+                raise np.linalg.LinAlgError("the small program's minimum is none")
             if promised <= tolerance * size:
                 break
             Ad = self.rows.A @ d
@@ -305,9 +311,10 @@ class Newton:
             r = self._residual(z)
             gradient, H = self._model(r, 0.0, near)
             small = self.small
-            exact: list[Array] = []
+            exact: tuple[Array, ...] = ()
             if len(near):
-                small, *exact = self.rows.alone(self.loss, near, self.canonical, small.rows)
+                small = self.rows.program(self.loss, near, self.canonical, small.rows)
+                exact = self.rows.equations(near)
             try:
                 point = self._solved(z, gradient, H, small, *exact)
             except (Unsolved, np.linalg.LinAlgError):

@@ -35,13 +35,14 @@ GAP = 1e-8
 
 @dataclass(eq=False)
 class WarmStart:
-    """Warm start of the next solution: point, smoothing width, entries of working sets, Clarabel's data."""
+    """Warm start of the next solution: point, smoothing width, the last working set, Clarabel's data."""
 
     structure: Structure
     z: Array | None = None
     x: Array | None = None
     width: float = 0.0
     count: int = 0
+    part: tuple[np.ndarray, ReducedProgram] | None = None
     small: dict[Any, ReducedProgram] = field(default_factory=dict)
     kink: float = -1.0
     squares: WarmStart | None = None
@@ -63,7 +64,7 @@ class WarmStart:
         """Look for the next minimum from z (n,) on, with solvers set up anew."""
         with self.lock:
             self.z = self.x = z if len(self.canonical.at) == self.canonical.size else None
-            self.width, self.count, self.small = 0.0, 0, {}
+            self.width, self.count, self.part, self.small = 0.0, 0, None, {}
         return self
 
 
@@ -158,33 +159,37 @@ def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Da
     tangent = Tangent(loss, rows, rows.A @ z - rows.b)
     if not np.isfinite(tangent.value):
         return _all_rows(loss, rows, warm, weight, damping)
-    working = np.sort(tangent.near[: max(4 * n, warm.count or np.count_nonzero(tangent.pull))])
-    for _ in range(GENERATIONS):
+    working, small = warm.part or (None, None)
+    if working is None:
+        working = np.sort(tangent.near[: max(4 * n, warm.count or np.count_nonzero(tangent.pull))])
+    for generation in range(GENERATIONS):
         outside = np.ones(loss.variable.size, dtype=bool)
         outside[working] = False
         slope = np.where(rows.spread(outside), tangent.slope, 0.0)
-        small, *equations = rows.alone(loss, working, warm.canonical, len(terms.y))
-        small.data.clarabel.attempts = (EQUILIBRATED,)
+        if small is None or small.rows != len(terms.y):
+            small = rows.program(loss, working, warm.canonical, len(terms.y))
+            small.data.clarabel.attempts = (EQUILIBRATED,)
         part: Any = small.loss
         part.price(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
         try:
-            point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *equations)
+            point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *rows.equations(working))
         except Unsolved:
             if len(working) == len(outside):
                 raise
-            working = np.union1d(working, tangent.near[: 4 * len(working)])  # too few to bound the loss from below
+            working, small = np.union1d(working, tangent.near[: 4 * len(working)]), None  # bounded too little
             continue
         r = rows.A @ point.x[at] - rows.b
         bound = part.value(point.rest) + float(slope @ r) + float(tangent.constant[outside].sum())
         there = Tangent(loss, rows, r)
         if there.value - bound <= GAP * max(abs(bound), 1.0):
             warm.count = len(working) // 2
+            warm.part = None if generation else (working, small)
             return point
         other = np.flatnonzero(np.abs(there.pull - tangent.pull) > INACTIVE * np.abs(there.pull).max())
         more = np.union1d(working, np.union1d(other, there.near[: 4 * n]))
         if len(more) == len(working):
             break
-        tangent, working = there, more
+        tangent, working, small = there, more, None
     return _all_rows(loss, rows, warm, weight, damping)
 
 
