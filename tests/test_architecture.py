@@ -142,7 +142,7 @@ ELSEWHERE = {
     "rpim_opt.calibration.leverage",
     "rpim_opt.convex.infeasible",
     "rpim_opt.bayes.population",
-    "rpim_opt.convex.tolerances",
+    "rpim_opt.convex.constraint_parser",
     "rpim_opt.robot.formats.urdf",
     "cattrs",
 }

@@ -264,7 +264,7 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
 
 def known(text: str) -> Statement:
     """Return the statement that a combination of parameters has a known value, as of `Prior.known`."""
-    from rpim_opt.convex.tolerances import combination  # texts are read where there are any
+    from rpim_opt.convex.constraint_parser import combination  # texts are read where there are any
 
     stated = combination(text)
     (combined,) = stated.sums

@@ -70,7 +70,7 @@ def sentence(text: str) -> Sentence:
     InputError for other words and signs, numbers without a unit, units of different dimensions, and demands that are
     not convex.
 
-    >>> from rpim_opt.convex.tolerances import sentence
+    >>> from rpim_opt.convex.constraint_parser import sentence
     >>> found = sentence("d2 + d3 = 850.00 +- 0.05 mm")
     >>> found.kind, found.limit, found.sums
     ('within', 5e-05, (Sum(names=('d2', 'd3'), factors=(1.0, 1.0), constant=-0.85, nominal=0),))
@@ -86,7 +86,7 @@ def combination(text: str) -> Sentence:
 
     InputError for numbers without a unit, and for a standard deviation that is not above zero.
 
-    >>> from rpim_opt.convex.tolerances import combination
+    >>> from rpim_opt.convex.constraint_parser import combination
     >>> known = combination("a2 - 0.5 a3 = nominal + 0.2 +- 0.05 mm")
     >>> known.limit, known.sums
     (5e-05, (Sum(names=('a2', 'a3'), factors=(1.0, -0.5), constant=-0.0002, nominal=-1),))

@@ -19,7 +19,7 @@ from rpim_opt.problem.workspace import bounding
 from rpim_opt.robot.parameters import Parameters
 
 if TYPE_CHECKING:
-    from rpim_opt.convex.tolerances import Sentence, Sum
+    from rpim_opt.convex.constraint_parser import Sentence, Sum
 
 __all__ = [
     "Box",
@@ -512,7 +512,7 @@ def parse(text: str, where: Mapping[str, Any] | None = None) -> Parsed:
     |theta4| <= 1 mrad: 2.88 a mrad
     move at most 2 mm: home: 131.04 a mm
     """
-    from rpim_opt.convex.tolerances import sentence  # texts are parsed where there are any
+    from rpim_opt.convex.constraint_parser import sentence  # texts are parsed where there are any
 
     if where is not None and not isinstance(where, Mapping):
         raise InputError("parse", f"places as {type(where).__name__}", "{'home': [0, ...]}, by name")

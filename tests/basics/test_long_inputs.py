@@ -12,7 +12,7 @@ import rpim_opt as ro
 from rpim_opt.basics.files import parse_json, read_toml
 from rpim_opt.basics.tables import read_columns
 from rpim_opt.basics.units import fits, split, split_unit
-from rpim_opt.convex.tolerances import combination, sentence
+from rpim_opt.convex.constraint_parser import combination, sentence
 from rpim_opt.store.new_folder import stated_target
 
 MANY = 19_000

@@ -11,8 +11,8 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
 from rpim_opt.bayes.prior_terms import FIXED, Statement, listed
+from rpim_opt.convex.constraint_parser import combination
 from rpim_opt.convex.quadratic import quadratic
-from rpim_opt.convex.tolerances import combination
 
 PROBLEM = ro.load("position").problem
 FREE = PROBLEM.parameters.free

@@ -11,7 +11,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes.prior import Prior, kind_of
-from rpim_opt.convex.tolerances import combination
+from rpim_opt.convex.constraint_parser import combination
 from tests.convex.test_formulation import model
 
 MODEL = model()

@@ -19,7 +19,7 @@ import rpim_opt as ro
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.units import parse_units
-from rpim_opt.convex.tolerances import sentence
+from rpim_opt.convex.constraint_parser import sentence
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
