@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
-from rpim_opt.bayes.outliers import beyond_noise, error_vectors, outlier_candidates, unexplained
+from rpim_opt.bayes.outliers import beyond_noise, error_vectors, isolated, outlier_candidates, unexplained
 from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.blocks import Source
@@ -69,14 +69,9 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
             estimator, whole = plain, without
             reason = f"it lowers -2 ln L by {fall:.1f}; {REQUIRED_GAIN:g} are required."
             notes = (f"The population prior is not used: {reason}",)
-    fit, trials, outliers = _without_outliers(every, estimator, whole, model)
+    fit, trials, gain, outliers = _without_outliers(every, estimator, whole, model)
     requested = p.free.names
-    curved = None
-    gain = 0.0
-    if model == "auto" and possible(fit.problem):
-        curved = admitted(estimator, fit, requested, trials)
-    if curved is not None:
-        fit, trials, gain = curved
+    if gain > 0:
         problem = problem.with_transmission(fit.problem.robot.model.curves)
     laid = problem.with_parameters(fit.laid.parameters).with_repeatability(fit.laid.repeatability)
     if not problem.keeps_rows or len(every.data) < len(problem.labels):
@@ -100,33 +95,40 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
 
 def _without_outliers(
     every: CalibrationProblem, estimator: Estimator, whole: Fit, model: str
-) -> tuple[Fit, tuple[Trial, ...], dict[str, float]]:
-    """Return the fit without outliers, the models compared, and the outliers."""
+) -> tuple[Fit, tuple[Trial, ...], float, dict[str, float]]:
+    """Return the fit without outliers, the models compared, the gain by transmission errors, and the outliers."""
 
-    def explain(outliers: Mapping[str, float]) -> tuple[Fit, tuple[Trial, ...]]:
+    def explain(outliers: Mapping[str, float]) -> tuple[Fit, tuple[Trial, ...], float]:
         fit = whole
         if outliers:
             fit = estimator.fit(whole.problem.without(outliers), whole.x, None, ROUNDS)
         if model == "geometry":
-            return fit, ()
-        return select_model(estimator, fit)
+            return fit, (), 0.0
+        fit, trials = select_model(estimator, fit)
+        curved = None
+        if possible(fit.problem):
+            curved = admitted(estimator, fit, every.parameters.free.names, trials)
+        return curved or (fit, trials, 0.0)
 
     outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
-    fit, trials = explain(outliers)
+    fit, trials, gain = explain(outliers)
     for _ in range(OUTLIER_SEARCHES):  # what extensions explain, and the worst outliers, stood before the smaller ones
         if not outliers and not (trials and trials[0].extensions):
             break
-        more = outlier_candidates(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
+        if gain > 0:  # a resistant fit with hundreds of coefficients would take up outliers itself
+            more = isolated(fit.laid.on(every.data), fit.x)
+        else:
+            more = outlier_candidates(fit.problem.on(every.data), fit.x, fit.laid.parameters.free.scale, fit.spare)
         if not more.keys() - outliers.keys():
             break
         outliers = {**more, **outliers}
-        fit, trials = explain(outliers)
+        fit, trials, gain = explain(outliers)
     if outliers:
         left = unexplained(fit.laid.on(every.data), fit.x, fit.covariance, outliers)
         if left.keys() != outliers.keys():
             outliers = left
-            fit, trials = explain(outliers)
-    return fit, trials, outliers
+            fit, trials, gain = explain(outliers)
+    return fit, trials, gain, outliers
 
 
 def with_extensions(problem: Source, found: Estimated) -> Source:

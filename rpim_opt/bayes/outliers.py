@@ -182,6 +182,14 @@ def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
     return {labels[i]: float(typical[i]) for i in np.flatnonzero(rare)}
 
 
+def isolated(problem: CalibrationProblem, x: Array) -> dict[str, float]:
+    """Return the rows that the noise of a fit x (n,) [SI] cannot explain, without clusters of neighbours."""
+    beyond = beyond_noise(problem, x)
+    rows = np.array([i for i, label in enumerate(problem.labels) if label in beyond], dtype=int)
+    alone = rows[~clustered(problem, x, rows)]
+    return {problem.labels[i]: beyond[problem.labels[i]] for i in alone}
+
+
 def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]) -> dict[str, float]:
     """Return the excluded rows that a fit without them, x (n,) with covariance (n, n) [SI], cannot explain."""
     reasons = dict(labels)
