@@ -55,7 +55,10 @@ DEFAULT = {
         "1.0-10000.0",
         "1000.0-1000.0",
     ),
-    "tests/problem/test_inspection.py::test_likely_mistakes_are_named": ("degrees as radians", "a frame flipped"),
+    "tests/problem/test_inspection.py::test_likely_mistakes_are_named": (
+        "lengths in an unknown unit",
+        "a frame flipped",
+    ),
     "tests/problem/test_inspection.py::test_good_data_raise_no_suspicion": ("pose", "cable", "mixed", "scara"),
     "tests/store/test_problems.py::test_ten_configurations_of_real_data_beat_least_squares": ("ur5_jacobi",),
     "tests/store/test_results.py::test_ready_made_formulations_can_be_solved_again": ("own numbers", "lasso"),

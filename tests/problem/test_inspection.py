@@ -32,6 +32,7 @@ MISTAKES = {
     "degrees as radians": ("position", {"q": np.degrees}, "degrees, not radians"),
     "millimetres as metres": ("position", {"y": lambda y: 1e3 * y}, "a thousand times smaller"),
     "millimetres as inches": ("position", {"y": lambda y: 25.4 * y}, "in mm, not inches"),
+    "lengths in an unknown unit": ("position", {"y": lambda y: 1.37 * y}, "multiply all measured lengths by 0.72"),
     "a column a row too high": (
         "position",
         {"q": lambda q: np.concatenate([np.roll(q[..., :1], -1, axis=0), q[..., 1:]], axis=-1)},
