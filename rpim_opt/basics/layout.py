@@ -168,7 +168,7 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     most = max(counts, default=0)
     if not grid.rows:
         raise InputError("the table", "an empty file", "a header and at least one row")
-    if most < 2:
+    if most < 2 and (len(counts) == 1 or 0 in counts[1:]):  # else a row a coordinate, in which names are the rest
         found = f"{len(grid.rows)} lines, none of numbers" if len(grid.rows) > 1 else "a header and no rows"
         raise InputError("the table", found, "at least one row of numbers")
     numeric = _without_numbered_header([i for i, count in enumerate(counts) if count >= FULL * most], grid.rows)
