@@ -433,9 +433,7 @@ class CalibrationProblem(RobotModel):
     @cached_property
     def identified(self) -> Identified:
         """The identified parameters, with the problem of one row of each kind, which predicts positions."""
-        blocks = tuple(block.take(np.array([0]), np.array([i])) for i, block in enumerate(self.data.blocks))
-        labels = tuple(f"{self.data.label[int(block.row[0])]}" for block in self.data.blocks)
-        few = replace(self, data=Dataset(blocks, labels, np.arange(len(blocks))))
+        few = replace(self, data=self.data.take([int(block.row[0]) for block in self.data.blocks]))
         table = {each.name: getattr(self.parameters.free, each.name) for each in fields(Parameters)}
         return Identified(**table, problem=few)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -170,26 +170,16 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
         first, second = (touched[name] for name in each.between)
         if second.robot != first.robot:
             first = second
-        own = {"q": np.concatenate([first.q, second.q], axis=1), "torque": None, "approach": None}
+        stated: dict[str, Any] = {"payload": first.payload}
         for what in ("torque", "approach"):
             both = [getattr(one, what) for one in (first, second)]
             if all(values is not None for values in both):
-                own[what] = np.concatenate(both, axis=1)
-        covariance = each.sigma**2 * np.eye(len(each.measurement.components))[None]
-        relation = replace(
-            first,
-            measurement=each.measurement,
-            y=np.array([[each.value]]),
-            covariance=covariance,
-            columns={},
-            **own,
-            row=np.array([len(data) + i]),
-            markers=(*first.markers, *second.markers),
-            fixture="",
-            session=None,
-            point=np.array([each.between], dtype=object),
-        )
-        blocks.append(relation)
+                stated[what] = np.concatenate(both, axis=1)
+        q = np.concatenate([first.q, second.q], axis=1)
+        (relation,) = Dataset.of(q, np.array([[each.value]]), each.sigma, (), each.measurement, **stated).blocks
+        row, markers = np.array([len(data) + i]), (*first.markers, *second.markers)
+        point = np.array([each.between], dtype=object)
+        blocks.append(replace(relation, row=row, markers=markers, robot=first.robot, point=point))
         label = " to ".join(each.between)
         if label in labels:  # planes may have both an angle and a distance
             label = f"{label}, {each.measurement.name.removeprefix('known_')}"

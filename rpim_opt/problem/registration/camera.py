@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import scipy
@@ -177,42 +178,37 @@ def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
     """Return the data with a pose for every view of a camera; other measurements as they are."""
     if not camera_blocks(data):
         return data
-    blocks: list[Block] = []
-    labels: list[str] = []
-    configuration: list[int] = []
-    for block in data.blocks:
-        seen, rows = block, block.row
-        if block.measurement in CAMERAS.values():
-            camera = {name: own.get(of_fixture(f"camera_{name}", block.fixture), 0.0) for name in INTRINSICS}
-            if not (camera["fx"] > 0 and camera["fy"] > 0):
-                raise InputError("the camera", f"a focal length of {camera['fx']:g} px", "one greater than zero")
-            points = targets(block)
-            xy = normalized(block.y, camera)
-            _, _, planar = _plane(points)
-            covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))
-            placed_views = []  # the first entry of each view, and its pose
-            for view in rows_by_view(data, block):
-                if len(view) >= FEWEST[planar]:
-                    with suppress(InputError):  # points on a line
-                        placed_views.append((int(view[0]), view_pose(points[view], xy[view])))
-            if not placed_views:
-                accepted = f"views of {FEWEST[planar]} points or more"
-                raise InputError("the camera", "no view that determines a pose", accepted)
-            index = np.array([i for i, _ in placed_views])
-            T = np.array([there for _, there in placed_views])
-            focus = float(np.sqrt(camera["fx"] * camera["fy"]))
-            spread = np.sqrt(np.trace(covariance[index], axis1=1, axis2=2) / 2)
-            deviation = UNCERTAIN * spread / focus * T[:, 2, 3]
-            sigma = deviation[:, None] * [1, 1, 1, *[1 / float(np.ptp(points, axis=0).max())] * 3]
-            if block.measurement is eye_in_hand:
-                T = np.linalg.inv(T)
-            quaternion = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_quat()
-            rows = block.row[index]
-            seen = replace(
-                block.take(index, index), measurement=pose, y=np.hstack([T[:, :3, 3], quaternion[:, [3, 0, 1, 2]]]),
-                covariance=sigma[:, :, None] ** 2 * np.eye(6), fixture="", point=None, columns={},
-            )  # fmt: skip
-        blocks.append(replace(seen, row=len(labels) + np.arange(len(rows))))
-        labels += [data.label[i] for i in rows]
-        configuration += data.configuration[rows].tolist()
-    return Dataset(tuple(blocks), tuple(labels), np.array(configuration, dtype=int))
+    cameras = CAMERAS.values()
+    views = [_views(data, each, own) if each.measurement in cameras else (each.row, {}) for each in data.blocks]
+    some = data.take(np.concatenate([rows for rows, _ in views]))
+    pairs = zip(some.blocks, views, strict=True)
+    return replace(some, blocks=tuple(replace(block, **poses) for block, (_, poses) in pairs))
+
+
+def _views(data: Dataset, block: Block, own: Mapping[str, float]) -> tuple[np.ndarray, dict[str, Any]]:
+    """Return the first row (V,) of every view that determines a pose, and what a block of these poses has instead."""
+    camera = {name: own.get(of_fixture(f"camera_{name}", block.fixture), 0.0) for name in INTRINSICS}
+    if not (camera["fx"] > 0 and camera["fy"] > 0):
+        raise InputError("the camera", f"a focal length of {camera['fx']:g} px", "one greater than zero")
+    points = targets(block)
+    xy = normalized(block.y, camera)
+    _, _, planar = _plane(points)
+    placed = []  # the first entry of each view, and its pose
+    for view in rows_by_view(data, block):
+        if len(view) >= FEWEST[planar]:
+            with suppress(InputError):  # points on a line
+                placed.append((int(view[0]), view_pose(points[view], xy[view])))
+    if not placed:
+        raise InputError("the camera", "no view that determines a pose", f"views of {FEWEST[planar]} points or more")
+    index = np.array([i for i, _ in placed])
+    T = np.array([there for _, there in placed])
+    focus = float(np.sqrt(camera["fx"] * camera["fy"]))
+    covariance = np.broadcast_to(block.covariance, (len(block.row), 2, 2))[index]
+    deviation = UNCERTAIN * np.sqrt(np.trace(covariance, axis1=1, axis2=2) / 2) / focus * T[:, 2, 3]
+    sigma = deviation[:, None] * [1, 1, 1, *[1 / float(np.ptp(points, axis=0).max())] * 3]
+    if block.measurement is eye_in_hand:
+        T = np.linalg.inv(T)
+    quaternion = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_quat()
+    y = np.hstack([T[:, :3, 3], quaternion[:, [3, 0, 1, 2]]])
+    poses = {"measurement": pose, "y": y, "covariance": sigma[:, :, None] ** 2 * np.eye(6)}
+    return block.row[index], poses | {"fixture": "", "point": None, "columns": {}}
