@@ -293,20 +293,16 @@ class Dataset(Tabled):
             accepted = f"{of_q} joint values and (N, {c}) measured values: {', '.join(measurement.columns)}"
             raise InputError("q and y", f"shapes {joints.shape} and {y.shape}", accepted)
         rows = np.arange(N)
+        covariance = _covariances(sigma, N, len(measurement.components))
+        beside = {"torque": (torque, q), "payload": (payload, rows), "approach": (approach, q)}
+        stated = {name: _beside(values, name, like) for name, (values, like) in beside.items()}
+        further = {name: _beside(values, f"column {name}", rows) for name, values in columns.items()}
         names = _names(point, "point", N)
+        seen = None if names is None else names[:, None]
+        sessions = named_sessions(session, N)
+        nameless = ("",) * points
         block = Block(
-            measurement,
-            q,
-            y,
-            _covariances(sigma, N, len(measurement.components)),
-            rows,
-            ("",) * measurement.points,
-            torque=_beside(torque, "torque", q),
-            payload=_beside(payload, "payload", rows),
-            approach=_beside(approach, "approach", q),
-            columns={name: _beside(values, f"column {name}", rows) for name, values in columns.items()},
-            point=None if names is None else names[:, None],
-            session=named_sessions(session, N),
+            measurement, q, y, covariance, rows, nameless, columns=further, point=seen, session=sessions, **stated
         )
         return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
 

@@ -148,10 +148,12 @@ class Touches:
     these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for square ones,
     n_2 along two directions in the first for parallel ones.
 
-    ``rows`` are the numbers (K, 3) of the equations of the touches of every thing, ``planar`` which of these are
-    planes, ``ties`` what is known of two of them, ``equations`` how many there are before the elimination.
+    ``names`` are those of the things, ``rows`` the numbers (K, 3) of the equations of the touches of each, ``planar``
+    which of these are planes, ``ties`` what is known of two of them, ``equations`` how many there are before the
+    elimination.
     """
 
+    names: tuple[str, ...]
     rows: tuple[np.ndarray, ...]
     planar: tuple[bool, ...]
     ties: tuple[Tie, ...]
@@ -182,7 +184,7 @@ class Touches:
             if one is not None and other is not None:
                 ties.append(Tie(equations, block.measurement.name, float(block.y[i, 0]), (one, other)))
         rows = tuple(np.array(first)[:, None] + np.arange(3) for first in at.values())
-        return cls(rows, tuple(planar.values()), tuple(ties), sum(map(np.size, numbers)))
+        return cls(tuple(at), rows, tuple(planar.values()), tuple(ties), sum(map(np.size, numbers)))
 
     def located(self, residual: Array) -> Features:
         """Return where points and planes are, of a residual (m,) that is -p_i for touches."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -13,7 +12,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.measurements.camera import INTRINSICS, eye_in_hand, pixels
 from rpim_opt.data.measurements.contact import revisit
-from rpim_opt.data.measurements.measurement import of_fixture
+from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
@@ -55,14 +55,14 @@ def moved(problem: CalibrationProblem, q: Array, marker: str | None, at: Array |
 
 
 def _there(
-    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None
+    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, kind: Measurement = position
 ) -> CalibrationProblem:
-    """Return the problem whose measurements are the positions of a reflector."""
+    """Return the problem whose measurements are the positions of a reflector, or another type of its measurements."""
     q = np.atleast_2d(np.asarray(q, dtype=float))
     if not np.isfinite(q).all() or q.shape[1] != problem.robot.dof:
         found = f"joint values of shape {q.shape}"
         raise InputError("positions", found, f"finite numbers (N, {problem.robot.dof}) [rad or m]")
-    return problem.measuring(q, marker=marker, torque=torque)
+    return problem.measuring(q, kind, marker, torque)
 
 
 def markers(problem: CalibrationProblem) -> list[str]:
@@ -111,10 +111,7 @@ def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | N
 
 def in_base(problem: CalibrationProblem, q: Array, marker: str | None = None) -> Array:
     """Return where the nominal reflector is in the robot's base frame, (N, 3) [m]; arguments as for `predicted`."""
-    p = problem.parameters
-    nominal = np.where([name.startswith("base_") for name in p.names], 0.0, p.nominal)
-    at_base = problem.with_parameters(replace(p, nominal=nominal))
-    return _there(at_base, q, marker).modelled(np.zeros(len(p.free)))[0]
+    return _there(problem, q, marker, kind=revisit).modelled(np.zeros(len(problem.parameters.free)))[0]
 
 
 DRAWS = 200  # random configurations that are tried for each row

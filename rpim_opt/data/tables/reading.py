@@ -74,22 +74,14 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     except RowError as error:
         raise error.named(f"row {label[error.row]}") from None
     q, torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("q", "tau", "approach"))
-    payload = columns.get(("payload", ""))
-    _require_states(payload, approach, label)
+    stated = {"torque": torque, "payload": columns.get(("payload", "")), "approach": approach}
+    _require_states(stated["payload"], approach, label)
+    noise = covariances(columns, declared, kind, y, label)
+    further = {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
     naming = _naming_column(table, kind)
-    whole = Dataset.of(
-        q,
-        y,
-        covariances(columns, declared, kind, y, label),
-        label,
-        kind,
-        torque=torque,
-        payload=payload,
-        approach=approach,
-        columns={name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns},
-        session=texts(table.get("session", ()), "session"),
-        point=texts(table[naming], naming) if naming else (),
-    )
+    point = texts(table[naming], naming) if naming else ()
+    session = texts(table.get("session", ()), "session")
+    whole = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
     blocks = _by_markers(whole.blocks[0], table, kind, label)
     data = Dataset(blocks, label, _configurations(table, q.reshape(N, -1)))
     return data.grouped_by_points() if kind.touching else data

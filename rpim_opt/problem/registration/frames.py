@@ -116,24 +116,17 @@ def shared_bases(problem: CalibrationProblem) -> dict[str, Array]:
     """
     known: dict[str, Array] = {}
     bases = {}
-    for robot, arm in problem.arms.items():
-        p = problem.parameters.of_robot(robot)
-        touched: dict[str, list[Array]] = {}
-        own = [block for block in problem.data.blocks if block.robot == robot]
-        for block in own:
-            if block.touched is None or not block.measurement.touching or block.measurement.planar:
-                continue
-            tool = numeric_frame(p.nominal[_frame_of(p, tool_prefix(block.markers[0]))])
-            T = forward_kinematics(arm, block.q[:, 0]) @ tool
-            for name, position in zip(block.touched[:, 0], T[:, :3, 3], strict=True):
-                touched.setdefault(str(name), []).append(position)
-        if not touched:
+    for robot in problem.arms:
+        alone = problem.alone(robot)
+        things = zip(alone.touches.names, alone.touched, strict=True) if alone.touches else ()
+        places = {str(name): thing.centre for name, thing in things if not thing.planar}  # in the robot's own frame
+        if not places:
             continue
-        places = {name: np.mean(positions, axis=0) for name, positions in touched.items()}  # in the robot's own frame
+        p = alone.parameters
         k = _frame_of(p, "base_")
         base = numeric_frame(p.nominal[k])
         common = {name: place for name, place in places.items() if name in known}
-        free = p.identified[k].all() and all(block.touched is not None for block in own)
+        free = p.identified[k].all() and all(block.touched is not None for block in alone.data.blocks)
         if free:
             with suppress(InputError):  # too few, or on a line
                 base = register(np.array(list(common.values())), np.array([known[name] for name in common]))
