@@ -544,9 +544,7 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
-        from rpim_opt.use.reading import read_commands
-
-        read, left_out = read_commands(loaded, targets, tables.options)
+        read, left_out = ro.use.read_targets(loaded, targets, tables.options)
         say("compensating")
         compensation = ro.use.compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,

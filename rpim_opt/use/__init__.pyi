@@ -1,6 +1,5 @@
 from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate
-from .compensation import compensate_file as compensate_file
 from .export import export_files as export_files
 from .export import export_urdf as export_urdf
 from .export import geometry_alone as geometry_alone

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -12,7 +11,6 @@ import scipy
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
-from rpim_opt.basics.files import write_text
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
@@ -34,7 +32,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
 from rpim_opt.use.export import noted
 from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
-from rpim_opt.use.reading import Targets, read_targets
+from rpim_opt.use.reading import Targets
 
 SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
@@ -272,22 +270,6 @@ def compensate(
     return Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
     )
-
-
-def compensate_file(result: Calibration, targets: str | Path, out: str | Path, **options: Any) -> Compensation:
-    """Compensate the targets of a table (`read_targets`) and write `Compensation.csv`; ``options`` of `compensate`.
-
-    >>> import rpim_opt as ro
-    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
-    >>> found = ro.use.compensate_file(result, "targets.csv", "commands.csv")
-    >>> len(found.q), set(found.status)  # some joints are beyond the nine measured configurations
-    (18, {'extrapolated'})
-    """
-    read = read_targets(targets, result.problem.robot)
-    columns = {"torque": read.torque, "payload": read.payload, "label": read.label}
-    compensation = compensate(result, read.q, read.poses, **(columns | options))
-    write_text(Path(out), compensation.csv())
-    return compensation
 
 
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:

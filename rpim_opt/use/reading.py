@@ -13,7 +13,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, in_file, pick
 from rpim_opt.basics.layout import TableOptions
-from rpim_opt.basics.tables import EXCEL, read_columns
+from rpim_opt.basics.tables import EXCEL
 from rpim_opt.basics.units import display, joint_columns, split_unit
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -25,7 +25,6 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.mdh import Robot
 from rpim_opt.store.raw import Understanding, rows_of, understand_of
 
 
@@ -42,65 +41,50 @@ class Targets(NamedTuple):
     payload: Array | None = None
 
 
-def read_targets(source: Any, robot: Robot) -> Targets:
-    """Return the targets of a table.
+def read_targets(
+    result: Calibration, source: Any, options: TableOptions | None = None
+) -> tuple[Targets, tuple[str, ...]]:
+    """Return the targets of a table, whose columns are recognized by name, and the names of ignored columns.
 
-    Columns ``q1_deg``, ... are joint values; ``x_mm, y_mm, z_mm`` positions in the robot's base, with
-    ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses. A table has the former, the latter, or
-    both: joint values are then where to look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ...,
-    ``payload_kg``.
-
-    ``source`` is a path (``.csv``, ``.parquet``, ``.xlsx``), a pandas or polars data frame, or a mapping from column
-    names to cells; the robot's joints decide the joint columns. InputError names the file, the row or column, what was
-    found and what is accepted.
+    Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
+    ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses, or both: joint values are then where to
+    look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ..., ``payload_kg``. ``source`` and
+    ``options`` are as for `read_measurements`. InputError names the file, the row or column, what was found and what is
+    accepted.
 
     >>> import rpim_opt as ro
-    >>> robot = ro.load("paper_arm").problem.robot
-    >>> targets = ro.use.read_targets({"label": ["P1"], "x_mm": [400], "y_mm": [0], "z_mm": [500]}, robot)
+    >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
+    >>> targets, _ = ro.use.read_targets(result, {"label": ["P1"], "x_mm": [400], "y_mm": [0], "z_mm": [500]})
     >>> targets.label, targets.q, targets.poses
     (('P1',), None, array([[0.4, 0. , 0.5]]))
     """
-    with in_file(source):
-        return _targets(dict(read_columns(source)), robot)
-
-
-def _targets(columns: dict[str, Any], robot: Robot) -> Targets:
-    """Return the targets of columns; read as measurements are, with zeros for the half that targets need not have."""
+    understanding = _understood(result, source, pose, options or TableOptions(), targets=True)
+    robot = result.problem.robot
+    columns = dict(understanding.columns)
     stems = {split_unit(name)[0] for name in columns}
     joints = not stems.isdisjoint(f"q{i}" for i in range(1, robot.dof + 1))
     oriented = not stems.isdisjoint({"qw", "rx", "r11"})
     positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
-    if not joints and not positions:
-        raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
-    absent = [] if joints else list(joint_columns(robot.joint_dimensions))
-    absent += [] if positions else ["x_mm", "y_mm", "z_mm"]
-    columns = columns | dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
-    noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
-    data = read_data(columns, robot, noise, pose if oriented else position)
-    block, *others = data.blocks
-    if others:
-        raise InputError("column marker", "several reflectors", "targets of one")
-    if block.approach is not None:
-        accepted = "none: joints are in the middle of their backlash"
-        raise InputError("column approach1", "directions of approach", accepted)
-    return Targets(
-        data.label,
-        data.q if joints else None,
-        block.y if positions else None,
-        None if block.torque is None else block.torque[:, 0],
-        block.payload,
-    )
-
-
-def read_commands(
-    result: Calibration, source: str | Path, options: TableOptions | None = None
-) -> tuple[Targets, tuple[str, ...]]:
-    """Return the targets of a table, read with the options of the calibration's tables, and the ignored columns."""
-    understanding = _understood(result, source, pose, options or TableOptions(), targets=True)
     with in_file(source):
         if any(each.doubt == "quaternion" for each in understanding.tables):
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
-        return _targets(dict(understanding.columns), result.problem.robot), understanding.left_out
+        if not joints and not positions:
+            raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")
+        # read as measurements are, with zeros for the half that targets need not have
+        absent = [] if joints else list(joint_columns(robot.joint_dimensions))
+        absent += [] if positions else ["x_mm", "y_mm", "z_mm"]
+        columns |= dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
+        noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
+        data = read_data(columns, robot, noise, pose if oriented else position)
+        block, *others = data.blocks
+        if others:
+            raise InputError("column marker", "several reflectors", "targets of one")
+        if block.approach is not None:
+            accepted = "none: joints are in the middle of their backlash"
+            raise InputError("column approach1", "directions of approach", accepted)
+    torque = None if block.torque is None else block.torque[:, 0]
+    targets = Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
+    return targets, understanding.left_out
 
 
 class Measured(NamedTuple):

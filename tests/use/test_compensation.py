@@ -6,6 +6,7 @@ import csv
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -397,6 +398,12 @@ def test_several_reflectors_and_torques() -> None:
         ro.use.compensate(result, q)
 
 
+def compensated(result: ro.calibration.Calibration, table: Path, **options: Any) -> ro.use.Compensation:
+    targets, _ = ro.use.read_targets(result, table)
+    columns = {"torque": targets.torque, "payload": targets.payload, "label": targets.label}
+    return ro.use.compensate(result, targets.q, targets.poses, **columns, **options)
+
+
 def test_torques_of_a_table_are_those_of_an_array(tmp_path) -> None:
     instance = ro.load("joints")
     result = ro.calibrate(instance.problem, instance.formulation, 1.0)
@@ -405,7 +412,7 @@ def test_torques_of_a_table_are_those_of_an_array(tmp_path) -> None:
     rows = np.hstack([np.degrees(q), torque])
     names = [f"q{i}_deg" for i in range(1, 7)] + [f"tau{i}_Nm" for i in range(1, 7)]
     np.savetxt(tmp_path / "targets.csv", rows, delimiter=",", header=",".join(names), comments="", fmt="%.17g")
-    found = ro.use.compensate_file(result, tmp_path / "targets.csv", tmp_path / "out.csv", orientation=False)
+    found = compensated(result, tmp_path / "targets.csv", orientation=False)
     assert found.q == pytest.approx(ro.use.compensate(result, q, torque=torque, orientation=False).q, abs=1e-12)
     other = ro.use.compensate(result, q, torque=torque[:, ::-1], orientation=False)
     assert np.abs(found.q - other.q).max() > 1e-6
@@ -436,22 +443,20 @@ def test_tables_of_targets_in_and_of_commands_out(tmp_path: Path, orientation: s
     write(tmp_path / "both.csv", head, np.hstack([q / unit, 1e3 * poses[:, :3], turn]))
     write(tmp_path / "joints.csv", ["label", *names], q / unit)
     write(tmp_path / "poses.csv", ["label", *head[5:]], np.hstack([1e3 * poses[:, :3], turn]))
-    targets = ro.use.read_targets(tmp_path / "both.csv", SCARA)
+    targets, _ = ro.use.read_targets(result, tmp_path / "both.csv")
     assert targets.label == tuple("ABCDEF")
     assert targets.q == pytest.approx(q)
     assert targets.poses == pytest.approx(poses[:, : 7 if orientation else 3], abs=1e-12)
-    assert ro.use.read_targets(tmp_path / "joints.csv", SCARA).poses is None
-    assert ro.use.read_targets(tmp_path / "poses.csv", SCARA).q is None
-    out = tmp_path / "out" / "commands.csv"
-    found = ro.use.compensate_file(result, tmp_path / "joints.csv", out)
-    with out.open() as stream:
-        rows = list(csv.DictReader(stream))
+    assert ro.use.read_targets(result, tmp_path / "joints.csv")[0].poses is None
+    assert ro.use.read_targets(result, tmp_path / "poses.csv")[0].q is None
+    found = compensated(result, tmp_path / "joints.csv")
+    rows = list(csv.DictReader(found.csv().splitlines()))
     assert [row["label"] for row in rows] == list("ABCDEF")
     assert [row["status"] for row in rows] == list(found.status)
     written = np.array([[float(row[name]) for name in names] for row in rows]) * unit
     assert written == pytest.approx(found.q, abs=1e-10)
     assert float(rows[0]["std_mm"]) == pytest.approx(1e3 * found.std[0], abs=1e-6)
-    again = ro.use.compensate_file(result, tmp_path / "both.csv", out)
+    again = compensated(result, tmp_path / "both.csv")
     assert again.position_error.max() < 1e-7
     assert "6 targets" in str(again)
 
@@ -462,7 +467,7 @@ def write(path: Path, head: list[str], values: np.ndarray) -> None:
     path.write_text("\n".join(lines) + "\n")
 
 
-def test_bad_input_is_answered_in_a_sentence_and_leaves_the_file(tmp_path: Path) -> None:
+def test_bad_input_is_answered_in_a_sentence(tmp_path: Path) -> None:
     result, q = known(), commands(ARM, 3)
     wrong = {
         "targets: found neither joint values nor poses": {},
@@ -479,10 +484,9 @@ def test_bad_input_is_answered_in_a_sentence_and_leaves_the_file(tmp_path: Path)
     for message, arguments in wrong.items():
         with pytest.raises(ro.InputError, match=message):
             ro.use.compensate(result, **arguments)
-    table, out = tmp_path / "targets.csv", tmp_path / "out.csv"
-    out.write_text("what was there")
+    table = tmp_path / "targets.csv"
     for text, message in {
-        "label,speed\na,1\n": f"{table.name}, the header: found no targets",
+        "load,speed\n1,2\n": f"{table.name}, the header: found no targets",
         "q1_deg,q2_deg\n1,2\n": "'q3'",
         "x_mm,y_mm\n1,2\n": "'z'",
         "x_mm,y_mm,z_mm,qw,qx,qy,qz\n0,0,0,2,0,0,0\n": "row 1: found a quaternion of norm 2",
@@ -490,8 +494,7 @@ def test_bad_input_is_answered_in_a_sentence_and_leaves_the_file(tmp_path: Path)
     }.items():
         table.write_text(text)
         with pytest.raises(ro.InputError, match=message):
-            ro.use.compensate_file(result, table, out)
-    assert out.read_text() == "what was there"
+            compensated(result, table)
 
 
 def test_a_row_beyond_the_measured_joint_ranges_is_extrapolated_and_the_uncertainty_is_that_of_a_prediction() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -171,19 +172,24 @@ def test_payloads_may_differ_by_row_and_lie_elsewhere() -> None:
     assert np.abs(there.modelled(result.x)[0] - nominal)[ok].max() < 1e-7
 
 
-def test_targets_state_payloads_and_no_sides(tmp_path: Path) -> None:
+def compensated(result: ro.calibration.Calibration, table: dict[str, Any], **options: Any) -> ro.use.Compensation:
+    targets, _ = ro.use.read_targets(result, table)
+    return ro.use.compensate(result, targets.q, targets.poses, payload=targets.payload, **options)
+
+
+def test_targets_state_payloads_and_no_sides() -> None:
     result, *_ = calibrated(arm())
     q = np.random.default_rng(9).uniform(-1.5, 1.5, (5, 6))
     columns = {f"q{i + 1}_rad": q[:, i] for i in range(6)}
     targets = columns | {"payload_kg": [0.0, 0.5, 1.0, 2.0, 2.5]}
-    found = ro.use.compensate_file(result, targets, tmp_path / "commands.csv", orientation=False)
+    found = compensated(result, targets, orientation=False)
     same = ro.use.compensate(result, q, payload=[0.0, 0.5, 1.0, 2.0, 2.5], orientation=False)
     assert np.abs(found.q - same.q).max() < 1e-12
-    without = ro.use.compensate_file(result, columns, tmp_path / "commands.csv", orientation=False)
+    without = compensated(result, columns, orientation=False)
     assert np.abs(without.q - found.q).max() > 1e-5
     sides = {f"approach{i}": [1] * 5 for i in range(1, 7)}
     with pytest.raises(ro.InputError, match="column approach1"):
-        ro.use.read_targets(columns | sides, ARM)
+        ro.use.read_targets(result, columns | sides)
 
 
 def test_a_payload_that_cannot_count_is_refused() -> None:

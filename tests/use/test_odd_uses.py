@@ -161,7 +161,7 @@ PLACES = {"x_mm": [1.0, 2.0], "y_mm": [1.0, 2.0], "z_mm": [1.0, 2.0]}
 )
 def test_targets_that_are_none(table: dict[str, Any], said: str) -> None:
     with pytest.raises(ro.InputError) as error:
-        ro.use.read_targets(table, calibrated().robot)
+        ro.use.read_targets(calibrated(), table)
     assert said in str(error.value)
 
 
