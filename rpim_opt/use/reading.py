@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import EXCEL
 from rpim_opt.basics.units import display, joint_columns, split_unit
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
@@ -130,27 +131,12 @@ def read_measurements(
         raise InputError("measurement", "several", choices("", types))
     calibrated = pick(types, measurement or next(iter(types)), "measurement")
     understanding = _understood(result, source, calibrated, options or TableOptions())
-    stems = {split_unit(name)[0] for name in understanding.columns}
-    kind = calibrated
-    if not stems >= set(calibrated.columns):  # poses may be validated by positions
-        parts = [part for part in calibrated.parts if not any(stems >= set(form) for form, _ in calibrated.forms)]
-        kind = next((part for part in parts if stems >= set(part.columns)), calibrated)
+    kind = _measured_in(understanding, calibrated)
     columns = understanding.columns
-    if understanding.left_out and not columns:
-        accepted = f"joints' values and {', '.join(kind.columns)}"
-        known = f"only unknown columns {', '.join(understanding.left_out)}"[:200]
-        raise InputError("the header", known, accepted, understanding.file)
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
-    # the typical standard deviation of every component, as [noise] has it
-    known = [block for block in blocks if block.measurement is calibrated]
-    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in known], axis=0)
-    noise = {}
-    for (component, dimension), sigma in zip(calibrated.components.items(), np.sqrt(variance), strict=True):
-        unit, si = display(dimension)
-        if component in kind.components:
-            noise[f"{component}_{unit}"] = float(sigma) / si
+    noise = _typical_noise([block for block in blocks if block.measurement is calibrated], kind)
     data = rows_of(understanding, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
@@ -158,6 +144,26 @@ def read_measurements(
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
     return Measured(data, left_out, (*notes, *understanding.notes), clock)
+
+
+def _measured_in(understanding: Understanding, calibrated: Measurement) -> Measurement:
+    """Return the type that columns show: the calibrated one, or a part: poses may be validated by positions."""
+    stems = {split_unit(name)[0] for name in understanding.columns}
+    if not stems and understanding.left_out:
+        known = f"only unknown columns {', '.join(understanding.left_out)}"[:200]
+        accepted = f"joints' values and {', '.join(calibrated.columns)}"
+        raise InputError("the header", known, accepted, understanding.file)
+    if any(stems >= set(form) for form in (calibrated.columns, *(form for form, _ in calibrated.forms))):
+        return calibrated
+    return next((part for part in calibrated.parts if stems >= set(part.columns)), calibrated)
+
+
+def _typical_noise(blocks: Sequence[Block], kind: Measurement) -> dict[str, float]:
+    """Return the typical standard deviations in blocks that measure a type's components, as ``[noise]`` has them."""
+    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
+    sigma = dict(zip(blocks[0].measurement.components, np.sqrt(variance).tolist(), strict=True))
+    units = {name: display(dimension) for name, dimension in kind.components.items()}
+    return {f"{name}_{unit}": sigma[name] / si for name, (unit, si) in units.items()}
 
 
 def _understood(
