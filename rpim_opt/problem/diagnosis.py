@@ -191,7 +191,7 @@ class Inspection(Tabled):
             of = dict(zip(kind.components, sigma.tolist(), strict=True))
             where = ", ".join(filter(None, [" to ".join(filter(None, block.markers)), block.fixture]))
             for i, (column, dimension) in enumerate((kind.columns or kind.components).items()):
-                unit, si = display(dimension) if dimension else ("", 1.0)
+                unit, si = display(dimension)
                 what = f"{kind.name}{f' of {where}' if where else ''}: {column}"
                 row = {"measured": what, "unit": unit, "from": None, "to": None}
                 if kind.columns:

@@ -260,17 +260,14 @@ class CalibrationProblem(RobotModel):
         q = np.atleast_2d(np.asarray(q, dtype=float))
         N = len(q)
         y = np.zeros((N, len(measurement.columns)))
-        if "qw" in measurement.columns:
-            y[:, list(measurement.columns).index("qw")] = 1.0
-        arrays = {name: np.asarray(each, dtype=float) for name, each in columns.items()}
-        approach = np.broadcast_to(arrays.pop("approach", 0.0), q.shape)
-        if all(block.approach is None for block in self.data.blocks):
-            approach = None
+        y[:, [name == "qw" for name in measurement.columns]] = 1.0
+        stated = {name: np.asarray(values, dtype=float) for name, values in columns.items()}
+        approach = np.broadcast_to(stated.pop("approach", 0.0), q.shape)
         data = Dataset.of(
-            q, y, covariance, measurement=measurement, approach=approach,
-            torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
+            q, y, covariance, measurement=measurement, torque=torque,
+            approach=None if all(block.approach is None for block in self.data.blocks) else approach,
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
-            columns={name: np.broadcast_to(each, N) for name, each in arrays.items()},
+            columns={name: np.broadcast_to(values, N) for name, values in stated.items()},
         )  # fmt: skip
         first = self.data.blocks[0]
         own = first.markers[:1] if marker is None else (marker,)

@@ -165,9 +165,8 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
     for name in measurement.parameters:
         if not name.startswith(in_frames):
             own[name] = p.value(of_fixture(name, of.fixture))
-    known = of.loads.named(symbols) | {"q": ca.reshape(symbols["q"], -1, points)}
-    if "torque" in symbols:
-        known["torque"] = ca.reshape(symbols["torque"], -1, points)
+    known = {name: ca.reshape(symbols[name], -1, points) for name in ("q", "torque") if name in symbols}
+    known |= columns_of(symbols)
     for name in measurement.sees:
         if name not in known:
             where = f"measurement {measurement.name}"
@@ -186,27 +185,21 @@ def _expressions(of: Structure, measurement: Measurement) -> tuple[list[ca.SX], 
 
 RowSymbols = Mapping[str, ca.SX]
 """The symbols of what a row states of its joints, point by point, in the order of `loads_in`."""
-COLUMN = "column {}"  # name of the symbol of a further column among these
+PER_JOINT = ("q", "torque", "approach")  # what a row states of every joint
+COLUMN = "column "  # before the name of a further column among what a row states
 
 
 class Loads(NamedTuple):
     """What rows state of their joints; ``gravity`` where it is asked for, ``weighs`` where it stands for torques."""
 
-    torques: bool = False
-    payload: bool = False
-    approach: bool = False
+    stated: tuple[str, ...] = ()
     gravity: Gravity | None = None
     weighs: bool = False
-    columns: tuple[str, ...] = ()
 
     def symbols(self, dof: int, points: int) -> RowSymbols:
         """Return the symbols of a row of some points."""
-        joints = dof * points
-        sizes = {
-            "q": joints, "torque": joints * self.torques, "payload": int(self.payload),
-            "approach": joints * self.approach, **dict.fromkeys(map(COLUMN.format, self.columns), 1),
-        }  # fmt: skip
-        return {name: ca.SX.sym(name, size) for name, size in sizes.items() if size}
+        sizes = {name: dof * points if name in PER_JOINT else 1 for name in ("q", *self.stated)}
+        return {name: ca.SX.sym(name, size) for name, size in sizes.items()}
 
     def configuration(
         self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: RowSymbols, point: int = 0
@@ -214,7 +207,7 @@ class Loads(NamedTuple):
         """Return what the joints of an arm of nominal parameters see at a point of a row, from the row's symbols."""
         dof = len(joint_types)
         at = slice(point * dof, (point + 1) * dof)
-        parts = {name: ca.vertsplit(stated[name][at]) for name in ("q", "torque", "approach") if name in stated}
+        parts = {name: ca.vertsplit(stated[name][at]) for name in PER_JOINT if name in stated}
         torque = parts.get("torque")
         if torque is None and not self.weighs:
             torque = [0.0] * dof
@@ -222,11 +215,19 @@ class Loads(NamedTuple):
         if self.gravity is not None:
             payload = stated.get("payload", self.gravity.payload)
             weight = Statics(payload, joint_types=joint_types, q=parts["q"], nominal=nominal, gravity=self.gravity)
-        return Configuration(parts["q"], torque, parts.get("approach"), weight, self.named(stated))
+        return Configuration(parts["q"], torque, parts.get("approach"), weight, columns_of(stated))
 
-    def named(self, stated: RowSymbols) -> dict[str, Symbol]:
-        """Return the symbols of columns by name."""
-        return {name: stated[COLUMN.format(name)] for name in self.columns}
+
+def columns_of(stated: RowSymbols) -> dict[str, Symbol]:
+    """Return the symbols of further columns by name."""
+    return {name.removeprefix(COLUMN): symbol for name, symbol in stated.items() if name.startswith(COLUMN)}
+
+
+def stated_in(block: Block) -> dict[str, Array]:
+    """Return what the rows of a block state of their joints besides joint values, by name."""
+    stated = {"torque": block.torque, "payload": block.payload, "approach": block.approach}
+    stated |= {COLUMN + name: values for name, values in block.columns.items()}
+    return {name: values for name, values in stated.items() if values is not None}
 
 
 def needed(robot: Robot, parameters: Parameters) -> Dependencies:
@@ -249,11 +250,7 @@ def measured_torques(data: Dataset, robot: str = "") -> bool:
 def loads_of(robot: Robot, needs: Dependencies, data: Dataset, block: Block) -> Loads:
     """Return the joint loads stated in the rows of a block, and those to compute from gravity."""
     weighs = needs.torques and not measured_torques(data, block.robot)
-    return Loads(
-        torques=block.torque is not None, payload=block.payload is not None, approach=block.approach is not None,
-        gravity=robot.gravity if weighs or needs.gravity or needs.moments else None, weighs=weighs,
-        columns=tuple(block.columns),
-    )  # fmt: skip
+    return Loads(tuple(stated_in(block)), robot.gravity if weighs or needs.gravity or needs.moments else None, weighs)
 
 
 def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool) -> Loads:
@@ -264,21 +261,20 @@ def loads_on(robot: Robot, parameters: Parameters, data: Dataset, torques: bool)
         raise InputError("compensation", f"a term that depends on column '{min(needs.columns)}'", accepted)
     weighs = needs.torques and not measured_torques(data)
     gravity = robot.gravity if weighs or needs.gravity or needs.moments else None
-    return Loads(torques=torques, payload=weighs or needs.gravity, gravity=gravity, weighs=weighs)
+    stated = {"torque": torques, "payload": weighs or needs.gravity}
+    return Loads(tuple(name for name, there in stated.items() if there), gravity, weighs)
 
 
 def loads_in(robot: Robot, block: Block) -> list[Array]:
     """Return what rows state of the joints of the model, (N, c) each, in the order of `Loads.symbols`."""
-    inputs = [block.q @ robot.joint_map.T]
+    inputs = {"q": block.q @ robot.joint_map.T, **stated_in(block)}
     if block.torque is not None:  # virtual work: tau_model = M^-T tau
         if robot.dof < len(robot.mdh):
             raise InputError("joint torques", "those of a robot with mimic joints", "a table without torques")
-        inputs.append(block.torque @ np.linalg.inv(robot.joint_map))
-    if block.payload is not None:
-        inputs.append(block.payload)
+        inputs["torque"] = block.torque @ np.linalg.inv(robot.joint_map)
     if block.approach is not None:
-        inputs.append(np.sign(block.approach @ robot.joint_map.T))
-    return [values.reshape(len(block.y), -1) for values in (*inputs, *block.columns.values())]
+        inputs["approach"] = np.sign(block.approach @ robot.joint_map.T)
+    return [values.reshape(len(block.y), -1) for values in inputs.values()]
 
 
 def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block]) -> None:

@@ -248,11 +248,11 @@ def compensate(
     N = len(targets.label)
     mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
     if payload is not None or payload_centre is not None:
-        if not cell.loads.payload:
+        if "payload" not in cell.loads.stated:
             raise InputError("payload", "a payload without effect on the model", WEIGHED)
         if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
             raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
-    if cell.loads.payload:
+    if "payload" in cell.loads.stated:
         targets = targets._replace(payload=np.broadcast_to(mass, N))
 
     def compensated(start: int) -> dict[str, Array]:

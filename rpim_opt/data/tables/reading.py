@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
-from rpim_opt.basics.units import LARGEST, SMALLEST, quantities, split_unit, with_unit
+from rpim_opt.basics.units import LARGEST, SMALLEST, Unit, quantities, split_unit, with_unit
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
@@ -221,8 +221,7 @@ def quantities_of(
         if name in names:
             continue
         stem, unit = split_unit(name)
-        dimension = unit.dimension if unit else ""
-        si = unit.si if unit else 1.0
+        dimension, si, zero = unit or Unit("", 1.0)
         if stem not in known:
             others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
             accepted = [each for key, dimensions in others.items() for each in with_unit(key, *dimensions, count=1)]
@@ -232,7 +231,7 @@ def quantities_of(
             raise InputError("the header", f"column '{name}' without a unit of the right dimension", accepted)
         if (stem, dimension) in columns:
             raise InputError("the header", f"column '{stem}' in two units", "one of them")
-        values = si * numbers(table[name], name, label) + (unit.zero if unit else 0.0)
+        values = si * numbers(table[name], name, label) + zero
         fits = np.abs(values) <= LARGEST
         accepted = f"a magnitude of at most {LARGEST / si:g}"
         if stem.startswith(tuple(SPREADS)) and fits.all():
