@@ -62,7 +62,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
     whole = estimator.fit(every, start, None, ROUNDS)
     notes: tuple[str, ...] = ()
     if estimator.prior.optional:  # left out where the marginal likelihood is against it
-        plain = replace(estimator, prior=replace(estimator.prior, centre={}, scale={}, optional=False))
+        plain = replace(estimator, prior=estimator.prior.without_optional())
         without = plain.fit(every, start, None, ROUNDS)
         fall = without.point.value - whole.point.value
         if fall < REQUIRED_GAIN:

@@ -79,7 +79,9 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
     every = [name for p in tables for name, frame in zip(p.free.names, p.free.of_frames, strict=True) if not frame]
     names = tuple(dict.fromkeys(every))
     table = tables[0].take(_places(tables[0].names, names))
-    generic = default_widths(table)
+    first = next(iter(named.values()))
+    stated = dict(zip(tables[0].free.names, _stated_widths(first).tolist(), strict=True))
+    generic = np.array([stated.get(name, width) for name, width in zip(names, default_widths(table), strict=True)])
     arms = []
     for label, result in named.items():
         robot, rows, values = data_likelihood(result)
@@ -112,12 +114,17 @@ def data_likelihood(result: Result) -> tuple[tuple[str, ...], Array, Array]:
     spread = result.spread
     R = spread.linear.triangle / np.sqrt(spread.noise_variance * spread.factor)
     n = len(free)
-    own = np.eye(n)[free.of_frames] * (free.scale / default_widths(free))[free.of_frames, None]
+    own = np.eye(n)[free.of_frames] * (free.scale / _stated_widths(result))[free.of_frames, None]
     robot = np.flatnonzero(~free.of_frames)
     rows, values = marginal(np.vstack([R[:, :n], own]), np.append(R[:, n], np.zeros(len(own))), robot)
     both = reduced_rows(np.column_stack([rows, values]))
     p = len(robot)
     return tuple(free.names[i] for i in robot), both[:p, :p] / free.scale[robot], both[:p, p]
+
+
+def _stated_widths(result: Result) -> Array:
+    """Return the prior standard deviations (n,) [SI] of a result's parameters before their scales were estimated."""
+    return default_widths(result.problem.parameters.free) if result.learned is None else result.learned.stated
 
 
 def _places(names: Sequence[str], some: Sequence[str]) -> np.ndarray:

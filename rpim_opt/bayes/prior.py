@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -47,9 +47,9 @@ class Prior:
     ("alpha?",))``. Of the others, lengths and angles, a URDF's origins included, joint offsets and every model
     extension share one each; session offsets have one for shifts and one for turns.
 
-    ``statements`` are of linear combinations (`known`, `from_result`). With ``optional`` (`from_population`) centre and
-    scale are left out where the marginal likelihood is against them. InputError for tails, factors or patterns that
-    cannot be.
+    ``statements`` are of linear combinations (`known`, `from_result`). ``optional`` are the keys of centre and scale
+    (`from_population`) that are left out where the marginal likelihood is against them. InputError for tails, factors
+    or patterns that cannot be.
 
     >>> import rpim_opt as ro
     >>> Prior = ro.bayes.Prior
@@ -66,7 +66,7 @@ class Prior:
     joint_offset: float = JOINT_OFFSET
     frames: float = FRAMES
     statements: tuple[Statement, ...] = ()
-    optional: bool = False
+    optional: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "centre", dict(self.centre))
@@ -131,7 +131,15 @@ class Prior:
         from rpim_opt.bayes.population import population
 
         centre, width = population(results)
-        return cls(centre=centre, scale=width, optional=True)
+        return cls(centre=centre, scale=width, optional=tuple(centre))
+
+    def without_optional(self) -> Prior:
+        """Return the prior without what is optional."""
+        centre, scale = (
+            {key: value for key, value in each.items() if key not in self.optional}
+            for each in (self.centre, self.scale)
+        )
+        return replace(self, centre=centre, scale=scale, optional=())
 
     def __and__(self, other: Prior) -> Prior:
         """Return both together; InputError where they contradict each other on a key."""

@@ -17,7 +17,7 @@ from rpim_opt.problem.linear import LinearModel
 DECREASE = 1e-6  # what the program at a solution may still promise of the objective: an interior point's accuracy
 DIRECTIONS = 2  # random directions in which the model's derivative is compared
 APART = 1e-4  # half the distance of a difference, in scales
-INEXACT = 1e-4  # relative difference, beyond rounding, from which the model's derivative is not the residual's
+INEXACT = 1e-4  # relative difference from which the model's derivative is not the residual's
 RESTING = 1e-12  # step, relative to 1 + |z|, below which it is rounding, whatever it promises of an objective near zero
 TINY = 1e-300  # where numbers end that something may be divided by
 

@@ -166,7 +166,8 @@ def calibrate(
         noise=noise,
         **(vars(options) | {"progress": None}),
     )
-    if weight is None and formulation.penalty is None:
+    unpenalized = weight is None and formulation.penalty is None
+    if unpenalized:
         weight = 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
     learned = None
@@ -183,6 +184,8 @@ def calibrate(
             problem = with_extensions(problem, estimate(problem, estimator, model, start))
         if prior is not None:
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
+            if unpenalized and formulation.penalty is not None:
+                weight = 1.0  # of statements, which have standard deviations
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
     notes += [mapping.sentence] if mapping else []
@@ -229,7 +232,7 @@ def ending(ended: Ended, most: int) -> str:
         if decrease is None:
             why = "the final convex program could not be solved again, so the solution is not certified."
         elif decrease > DECREASE:
-            why = f"the final convex program still predicts a decrease of the objective by {decrease:.1g}."
+            why = f"the final convex program still predicts a decrease of the objective by {100 * decrease:.1g} %."
     elif state.outcome == "stuck":
         why = (
             "no step, however short, decreases the nonlinear objective; the formulation may have no minimum "

@@ -113,8 +113,10 @@ def influence(result: Outcome) -> Influence:
     at_bound = {each.name for each in result.active_bounds}
     moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
-    if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):  # the loss is no matter of weights
+    if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):
         accepted = "a loss that is a reweighted sum of squares: squares, Huber's"
+        if formulation.constraints and result.program.box is None:
+            accepted = f"{accepted}; and no active constraints but bounds"
         raise InputError("influence", f"formulation '{formulation.name}'", accepted)
     T = np.zeros((len(free), len(A) + len(L)))  # H^-1 = T T'
     T[moving] = np.linalg.pinv(np.vstack([A, L])[:, moving], rcond=RANK_TOLERANCE)

@@ -36,6 +36,7 @@ from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
 from rpim_opt.convex.robust_loss import inliers_of
 from rpim_opt.convex.select import Selection
+from rpim_opt.convex.structure import INVARIANT
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
@@ -310,7 +311,12 @@ class Outcome:
     @property
     def squared_loss(self) -> bool:
         """Whether the requested loss is quadratic, even if blocks were solved with other squares."""
-        return self.program.formulation is self.formulation and self.program.loss_form is not None
+        return self.program.loss_form is not None and not self._reweighed
+
+    @property
+    def _reweighed(self) -> bool:
+        """Whether blocks were solved with squares in the place of another loss."""
+        return self.program.formulation is not self.formulation and self.formulation.loss not in INVARIANT
 
     @property
     def linear_penalty(self) -> bool:
@@ -322,10 +328,10 @@ class Outcome:
         """The equations whose squares the fit amounts to, and the weight that the loss gives to them."""
         program = self.program
         source = in_parts(self.problem)
-        if source.keeps_rows or program.formulation is self.formulation:
-            inliers = program.inliers(self.z)
-        else:
+        if self._reweighed:
             inliers = inliers_of(self.formulation, *source.configuration_errors(self.x))
+        else:
+            inliers = program.inliers(self.z)
         if inliers is None:
             form = program.loss_form
             return program.squared, 1.0 if form is None else form.size

@@ -180,7 +180,7 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
         variance = result.spread.noise_variance
     else:  # no degrees of freedom are known: as many as parameters
         squares = np.sum((fitted - program.model.b) ** 2)
-        variance = squares / max(len(fitted) - len(result.z), 1)
+        variance = squares / max(program.model.equations - len(result.z), 1)
     level = np.sqrt(variance)
     solutions = []
     for _ in range(draws):

@@ -163,6 +163,10 @@ def fingerprint(stated: Any, order: dict[int, int]) -> Any:
         data = _numbers(stated)
     elif isinstance(stated, cp.Constraint):  # whose number is another one at every call
         data = [each for each in data if each is not stated.constr_id]
+    elif type(stated).__name__ == "perspective":
+        data = [stated.f, stated.f_recession]
+    elif type(stated).__name__ == "SuppFuncAtom":
+        data = [stated._parent]
     return type(stated), stated.shape, fingerprint(data, order), fingerprint(stated.args, order)
 
 

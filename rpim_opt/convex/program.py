@@ -392,9 +392,11 @@ class Program(Brief):
         return [estimates[weight] for weight in checked.tolist()]
 
     def tangent(self, z: Array, weight: float) -> Array | None:
-        """Return an orthonormal basis (n, k) of the active constraints' null space at z; None without any.
+        """Return an orthonormal basis (n, k) of the active constraints' null space at z.
 
-        Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along.
+        Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along. None where
+        no constraint is active, and where it is not known: of constraints on positions, and with own variables that
+        the loss shares.
         """
         if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
             return None
@@ -536,7 +538,7 @@ class Program(Brief):
 
 def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
     """Return the equations whose squares a quadratic of the residual sums."""
-    if form.diagonal and (form.L == 1).all() and not form.c.any():
+    if form.diagonal and (form.L == 1).all() and not form.c.any() and form.constant == 0:
         return model
     A, b = form.times(model.A), form.times(model.b) + form.c
     group = model.group

@@ -376,11 +376,12 @@ def structure(
         key = (id(formulation), made.fingerprint, *key)
     if formulation.constraints or formulation.penalty_over is not None:  # which see the parameters
         key = (*key, p.names, p.dimensions, p.nominal.tobytes(), p.scale.tobytes(), p.tolerance.tobytes())
-    if key not in _KEPT:
+    found = _KEPT.get(key)  # another thread may clear them
+    if found is None:
         if len(_KEPT) >= MOST_KEPT:
             _KEPT.clear()
-        _KEPT[key] = made or Structure(formulation, p, m, groups)
-    return _KEPT[key]
+        found = _KEPT[key] = made or Structure(formulation, p, m, groups)
+    return found
 
 
 _KEPT: dict[Any, Structure] = {}
@@ -391,8 +392,8 @@ MOST_KEPT = 64
 def of_length(formulation: Formulation, equations: Callable[[], int]) -> Formulation | None:
     """Return the formulation whose loss sees only the length of the residual, in a way that holds for its QR factor.
 
-    A loss may depend on the number of equations: their mean square is no mean of the factor's rows. They are counted,
-    which reads all blocks, where a loss is not known. None for one that sees more.
+    A loss may depend on the number of equations: their mean square is no mean of the factor's rows. They are counted
+    where a loss is not known. None for one that sees more.
     """
     if formulation.loss_over != "equation" or (formulation.ready and formulation.loss not in INVARIANT):
         return None

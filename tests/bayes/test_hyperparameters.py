@@ -246,7 +246,7 @@ def test_what_other_arms_say_is_left_out_where_the_evidence_is_against_it() -> N
         names = [name + unit[d][0] for name, d in zip(free.names, free.dimensions, strict=True)]
         centre = {name: float(v) for name, v, own in zip(names, deviations, robot, strict=True) if own}
         width = {name: 0.2 * float(v) for name, v, own in zip(names, free.scale, robot, strict=True) if own}
-        return ro.bayes.Prior(centre=centre, scale=width, optional=True)
+        return ro.bayes.Prior(centre=centre, scale=width, optional=tuple(centre))
 
     right, wrong = (ro.calibrate(few, prior=told(each)) for each in (x, -3 * x))
     plain = ro.calibrate(few)

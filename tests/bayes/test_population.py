@@ -125,6 +125,20 @@ def test_the_prior_of_a_population_centres_on_what_calibrations_share() -> None:
     assert (apart / generic)[known] == pytest.approx(0, abs=0.25)
 
 
+def test_the_order_of_the_arms_does_not_matter() -> None:
+    """Also of arms whose scales were estimated: what is generic is what was stated."""
+    problem = ro.load("position").problem
+    results = [ro.calibrate(problem.on(problem.data.take(np.arange(k, 40, 2)))) for k in (0, 1)]
+    one, other = (Prior.from_population(each).stated(problem.parameters) for each in (results, results[::-1]))
+    assert one.centre == pytest.approx(other.centre, abs=1e-6)
+    assert one.scale == pytest.approx(other.scale, rel=1e-6)
+
+
+def test_a_rejected_population_takes_nothing_else_with_it() -> None:
+    both = Prior(centre={"a2_mm": 0.5}) & Prior(centre={"d4_mm": 0.1}, scale={"d4_mm": 0.2}, optional=("d4_mm",))
+    assert both.without_optional() == Prior(centre={"a2_mm": 0.5})
+
+
 @pytest.mark.parametrize("count", [0, 1])
 def test_one_arm_is_no_population(count: int) -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)

@@ -36,7 +36,7 @@ def result_of(formulation: ro.Formulation, linear: LinearModel, weight: float, n
     program = ro.convex.pose(formulation, linear)
     x = program.solve(weight).z * FREE.scale
     spread = SimpleNamespace(linear=linear, weight=weight, noise_variance=noise, factor=1.0, drift=None)
-    return SimpleNamespace(problem=PROBLEM, x=x, program=program, spread=spread)
+    return SimpleNamespace(problem=PROBLEM, x=x, program=program, spread=spread, learned=None)
 
 
 def then(prior: Prior, linear: LinearModel) -> np.ndarray:

@@ -277,3 +277,10 @@ def test_a_known_value_that_the_data_contradict_is_named() -> None:
     for text, apart in (("tool_x = nominal + 8 +- 0.5 mm", True), ("tool_x = nominal - 1 +- 0.5 mm", False)):
         message = ro.calibrate(ro.load("position").problem, prior=Prior.known(text)).message
         assert (f"The data contradict prior '{text}': the identified value is " in message) == apart
+
+
+def test_a_known_value_counts_without_penalty_and_weight() -> None:
+    known = Prior.known("a2 = nominal + 0.3 +- 0.0001 mm")
+    two = PROBLEM.identifying(np.isin(PROBLEM.parameters.names, ("a2", "d4")))
+    result = ro.calibrate(two, ro.least_squares, prior=known)
+    assert 1e3 * result.x[result.problem.parameters.free.names.index("a2")] == pytest.approx(0.3, abs=0.001)

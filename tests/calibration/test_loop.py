@@ -246,7 +246,7 @@ def test_why_passes_ran_out() -> None:
 
 
 def test_why_a_loop_at_rest_has_not_converged() -> None:
-    assert "still predicts a decrease of the objective by 0.002" in uncertified(Certificate(1.0, 0.0, 0.002))
+    assert "still predicts a decrease of the objective by 0.2 %" in uncertified(Certificate(1.0, 0.0, 0.002))
     assert "constraints are violated by 3e-05 prior standard deviations" in uncertified(Certificate(1.0, 3e-5, 1e-9))
     assert "the solution is not certified" in uncertified(Certificate(1.0, 0.0, None))
 

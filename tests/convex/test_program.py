@@ -22,6 +22,12 @@ def box(half: float) -> ro.constraints.Box:
     return ro.constraints.Box("box", lambda p: (np.full(len(p), -half), np.full(len(p), half)))
 
 
+def test_a_constant_of_the_loss_counts_on_a_path() -> None:
+    shifted = ro.Formulation("shifted", loss=lambda r: cp.sum_squares(r) + 5, penalty=cp.sum_squares)
+    program = ro.convex.pose(shifted, MODEL)
+    assert program.path([1.0])[0].loss == pytest.approx(program.solve(1.0).loss, rel=1e-12)
+
+
 DENSE = np.random.default_rng(4).normal(size=(N, N))
 FORMULATIONS = {
     "tikhonov": ro.tikhonov,

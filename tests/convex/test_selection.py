@@ -102,6 +102,23 @@ def test_what_rests_on_few_configurations_is_solved_without_each(formulation: ro
     assert held_out_error(program)(np.array([10.0]))[0] == pytest.approx(np.median(expected), rel=1e-5)
 
 
+@pytest.mark.parametrize("rule", [ro.leave_one_out, ro.two_step])
+def test_fewer_configurations_than_folds_are_held_out_each(rule: Any) -> None:
+    problem = ro.load("paper_arm").problem
+    few = problem.on(problem.data.take(np.arange(9)))
+    chosen = rule(ro.convex.pose(ro.lasso, few.linearize(np.zeros(len(few.parameters.free)))))
+    assert chosen.weight > 0
+    assert np.isfinite(chosen.score).all()
+
+
+def test_half_of_the_squares_have_half_of_the_weight() -> None:
+    problem = ro.load("position").problem
+    half = ro.Formulation("half", loss=lambda r: 0.5 * cp.sum_squares(r), penalty=cp.sum_squares)
+    linear = problem.linearize(np.zeros(len(problem.parameters.free)))
+    whole, halved = (ro.discrepancy(ro.convex.pose(each, linear)).weight for each in (ro.tikhonov, half))
+    assert halved == pytest.approx(0.5 * whole, rel=1e-6)
+
+
 def test_two_step_ends_below_the_corner_with_ten_held_out_errors() -> None:
     program = ro.convex.pose(ro.tikhonov, model(condition=1e5))
     choice = ro.two_step(program)

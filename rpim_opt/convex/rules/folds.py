@@ -128,10 +128,10 @@ def _least(program: Program, name: str, note: str, error: Score, begin: Score | 
 
 
 def _drawn(program: Program, count: int, seed: int = 0) -> list[np.ndarray]:
-    """Return the configurations in so many parts, at random."""
+    """Return the configurations in so many parts at most, at random."""
     groups, place = np.unique(program.model.group, return_index=True)
     groups = groups[np.argsort(place)]  # by their rows: numbers depend on where the rows stand
-    return np.array_split(np.random.default_rng(seed).permutation(groups), count)
+    return np.array_split(np.random.default_rng(seed).permutation(groups), min(count, len(groups)))
 
 
 def held_out_error(program: Program, parts: Sequence[np.ndarray] | None = None) -> Score:
