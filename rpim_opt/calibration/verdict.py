@@ -454,10 +454,10 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
         causes = list(diagnosis.shown_by_residuals(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))
+    unrelated = diagnosis.unrelated_rows(problem, error)
     if causes or error < LARGEST["length"]:  # which a robot's own effects may be
-        return causes
-    odd = diagnosis.odd_columns(problem), diagnosis.odd_joint(problem)
-    return first(*odd, diagnosis.unrelated_rows(problem, error))
+        return first(causes, unrelated)
+    return first(diagnosis.odd_column(problem), unrelated)
 
 
 def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:

@@ -40,14 +40,14 @@ FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
 SMALL = 0.2  # ratios and couplings [1, m] from which on a linearization says nothing of them
 RARE = 1e-6  # probability with which chance may explain what is reported
-FLAT = 1e-3  # a coordinate that spreads less than this part of another one is hardly measured
 FEW = 3  # outliers from which on they may have one cause
 FEWEST = 6  # rows on either side of a change, or of which copies are told
 LINEAR, EXACT = 13, 1e-5
 """Coefficients of a coordinate by position and rotation of the flange, and what no measurement comes up to [m]."""
 BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
-UNRELATED = 0.5  # part of the spread of positions that a fit leaves where joint values do not explain them
+NO_POSITIONS = 0.1  # spread of positions over that of the nominal flange below which they are another quantity
+UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
 ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their last decimal
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
@@ -64,6 +64,8 @@ OUTLYING, OUTLYING_ROUNDS = 10, 3
 """One of so many rows may be an outlier of the one calibration; rounds in which these are found."""
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
+JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
+CERTAIN = 5.0  # standard deviations by which residuals of successive rows are correlated
 PLACES, SPANS = 40, 12
 """Rows from which on something may have moved, and those between which it may have moved and moved back."""
 MOST_EQUATIONS = 3000  # equations up to which a change is looked for
@@ -419,28 +421,6 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
             )
 
 
-def odd_columns(problem: CalibrationProblem) -> Iterator[str]:
-    """Report columns of joint and measured values that are identical or sorted, coordinates that are flat or unsigned.
-
-    Asked of data that nothing else explains: a robot may be measured so.
-    """
-    for block in problem.data.blocks:
-        q, y = block.q[:, 0], block.y[:, :3]
-        named = dict(zip([*(f"q{i + 1}" for i in range(q.shape[1])), *"xyz"], np.hstack([q, y]).T, strict=False))
-        ordered = [name for name, column in named.items() if np.ptp(column) > 0 and (np.diff(column) >= 0).all()]
-        if len(ordered) == 1 and len(q) >= 2 * FEWEST:
-            yield f"column {ordered[0]} is the only one in ascending order: was it sorted alone?"
-        for (one, first), (other, second) in combinations(named.items(), 2):
-            if np.ptp(first) > 0 and (first == second).all():
-                yield f"columns {one} and {other} have the same values: is one a copy?"
-        if y.shape[1] == 3:
-            spread = y.std(axis=0)
-            for k in np.flatnonzero(spread < FLAT * spread.max()):
-                yield f"column {'xyz'[k]} varies by only {three_digits(1e3 * spread[k])} mm: is it the wrong column?"
-            if y.min() >= 0 and len(q) >= 2 * FEWEST:
-                yield "no value of column x, y and z is negative: were signs lost?"
-
-
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit."""
     causes: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
@@ -567,40 +547,59 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
-    """Report an RMS error [m] of a fit that is nearly the spread of the positions."""
+    """Report an RMS error [m] of a fit that is a large part of the spread of the positions."""
     points = points_of(problem)
     spread = 0.0 if points is None else float(np.sqrt(np.sum(np.var(points.y, axis=0))))
-    if points is not None and error > UNRELATED * spread:
-        yield (
-            f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, their "
-            f"spread is {three_digits(1e3 * spread)} mm): do the rows of the two tables match? Join them by a "
-            "common column, or by time."
-        )
+    if points is None or error <= UNRELATED * spread:
+        return
+    flange = float(np.sqrt(np.sum(np.var(forward_kinematics(points.robot, points.q)[:, :3, 3], axis=0))))
+    what = (
+        f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, their "
+        f"spread is {three_digits(1e3 * spread)} mm"
+    )
+    if spread < NO_POSITIONS * flange:
+        yield f"{what}, that of the flange {three_digits(1e3 * flange)} mm): are they deviations, or another quantity?"
+    else:
+        yield f"{what}): do the rows of the two tables match? Join them by a common column, or by time."
 
 
-def odd_joint(problem: CalibrationProblem) -> Iterator[str]:
-    """Report a joint whose values explain nothing: if every row may have its own, the other joints explain the points.
+def odd_column(problem: CalibrationProblem) -> Iterator[str]:
+    """Report a joint or coordinate whose values are wrong: with its own value in every row, the others fit.
 
-    Base, reflectors and the joint's values are fitted in turn, the values on a grid that gets narrower.
+    Base, reflectors and these values are fitted in turn, those of a joint on a grid that gets narrower. Coordinates
+    without a sign are reported, too.
     """
     points = points_of(problem)
-    if points is None or len(points.row) < 2 * FEWEST or points.turns is not None:
+    if points is None or len(points.row) < 2 * FEWEST:
+        return
+    points = replace(points, turns=None)
+    if points.y.min() >= 0:
+        yield "no value of column x, y and z is negative: were signs lost?"
         return
     whole = misfit(points)
     turning = [i for i, kind in enumerate(points.robot.joint_types) if kind == "revolute"]
-    fitted = {i: replace(points, q=_values_that_fit(points, i)) for i in turning}
-    left = {i: misfit(each) for i, each in fitted.items()}
-    i = min(left, key=left.__getitem__)
-    if left[i] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
+    fitted = {f"joint {i + 1}": replace(points, q=_values_that_fit(points, i)) for i in turning}
+    for k, axis in enumerate("xyz"):
+        other = points
+        for _ in range(MOST_ROUNDS):
+            other = replace(points, y=np.where(np.arange(3) == k, fit_points(other).modelled, points.y))
+        fitted[f"coordinate {axis}"] = other
+    left = {column: misfit(each) for column, each in fitted.items()}
+    column = min(left, key=left.__getitem__)
+    if left[column] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
         return
-    apart = np.abs(np.angle(np.exp(1j * (fitted[i].q - points.q)[:, i])))
-    odd = [problem.data.label[row] for row in points.row[apart > LEAST_TRAVEL["revolute"] / 2]]
-    what = f"{_rows(odd, 'has', 'have')} wrong values of joint {i + 1}"
+    best = fitted[column]
+    apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
+    apart |= np.abs(best.y - points.y).max(axis=1) > WRONG * points.extent
+    odd = [problem.data.label[row] for row in points.row[apart]]
+    what = f"{_rows(odd, 'has', 'have')} wrong values of {column}"
     if len(odd) > len(apart) / 2:
-        what = f"the values of joint {i + 1} explain nothing (sorted, shuffled or scaled alone, or another quantity?)"
+        what = (
+            f"the values of {column} explain nothing (sorted, copied, shuffled or scaled alone, or another quantity?)"
+        )
     yield (
-        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[i] * points.extent)} mm instead of "
-        f"{three_digits(1e3 * whole * points.extent)} mm; check column q{i + 1}."
+        f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[column] * points.extent)} mm instead "
+        f"of {three_digits(1e3 * whole * points.extent)} mm; check its column."
     )
 
 
@@ -830,7 +829,26 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
         yield f"{what} (that leaves {100 * best.left:.0f} % of the residuals): {remedy}."
     elif kinds is not None or transmission:
         most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
-        yield from first(two_positions(problem, x, most), [] if kinds is None else [_said_of_kinds(problem, kinds)])
+        said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
+        yield from first(two_positions(problem, x, most), said, _drifting(problem, model, x))
+
+
+def _drifting(problem: CalibrationProblem, model: LinearModel, x: Array) -> Iterator[str]:
+    """Report residuals at x (n,) that change slowly from row to row, where the joint values do not: a drift."""
+    q, N = problem.joint_values, len(problem.data)
+    if N < 2 * FEWEST or np.ptp(np.bincount(problem.owners, minlength=N)):
+        return
+    q = q[:, np.ptp(q, axis=0) > 0]
+    steps = np.diff(q, axis=0).var(axis=0) / (2 * q.var(axis=0))  # of every joint; one in rows of random order
+    r = model.b - model.A @ (x / model.parameters.scale)
+    r = r[np.argsort(problem.owners, kind="stable")].reshape(N, -1)
+    alike = float(np.sum(r[1:] * r[:-1]) / max(np.sum(r**2), 1e-300))
+    if steps.min(initial=1.0) > JUMPING and alike > max(MOVED, CERTAIN / np.sqrt(r.size)):
+        yield (
+            f"residuals change slowly from row to row (correlation {alike:.2f} with the next row), though the joint "
+            "values do not: instrument, base or temperature drift; measure reference points between the rows, or all "
+            "in a shorter time."
+        )
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
@@ -856,7 +874,7 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     there[p.identified[whole.parameters.identified]] = x
     A = whole.linearize(there).A
     for what, (names, cause) in parts.items():
-        yield from _changes(whole, there, A, names, what, cause, steadily=what in placed)
+        yield from _changes(whole, there, A, names, what, cause)
     free = whole.parameters.free
     nominal = whole.parameters.nominal[whole.parameters.identified]
     of_arm = (np.array(free.dimensions) == "length") & ~free.of_frames
@@ -875,9 +893,8 @@ def _changes(
     cause: str,
     *,
     least: int = 0,
-    steadily: bool = False,
 ) -> Iterator[Addition]:
-    """Yield that parameters changed at a row, between two rows, or ``steadily``; of ``least`` equations a parameter."""
+    """Yield that parameters changed at a row, between two rows or steadily; of ``least`` equations a parameter."""
     free, data, owners = problem.parameters.free, problem.data, problem.owners
     some = np.flatnonzero(np.isin(free.names, list(names)))
     if len(data) < 2 * FEWEST or not len(some):
@@ -894,12 +911,10 @@ def _changes(
         moved = f"{moved}, consistent with a changed {what}"
         return f"{when} {moved}", f"{cause}? Calibrate the two parts separately"
 
-    shares = {}
+    shares = {"more and more from row to row": owners / (len(data) - 1)}
     for start, end in [*((k, len(data)) for k in _places(len(data))), *combinations(_places(len(data), SPANS), 2)]:
         until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
         shares[f"from row {data.label[start]} {until}"] = ((owners >= start) & (owners < end)).astype(float)
-    if steadily:
-        shares["more and more from row to row"] = owners / (len(data) - 1)
     for when, share in shares.items():
         if np.count_nonzero(share) >= least * len(some):
             yield Addition(A[:, some] * share[:, None], partial(say, when, share))

@@ -15,6 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.measurements.position import from_elevation, from_zenith
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
@@ -147,7 +148,11 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
     for (factor, (unit, _)), i in product(list(ANGLES.items())[:2], np.flatnonzero(turning)):
         remedy = f"multiply column q{i + 1} by {factor:.6g} or name its unit"
         yield of(f"joint {i + 1} read {unit}", remedy, eye + (factor - 1) * np.outer(eye[i], eye[i]))
-    for i in np.flatnonzero(turning):
+    if not turning.all():
+        for factor, (unit, _) in LENGTHS.items():
+            remedy = f"multiply the columns of the linear joints by {factor:g} or name their unit"
+            yield of(f"values of linear joints {unit}", remedy, np.diag(np.where(turning, 1, factor)))
+    for i in range(robot.dof):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         sign = -int(signs(robot.joint_map)[i])
         yield of(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
@@ -197,12 +202,9 @@ def _of_positions() -> Iterator[Misreading]:
             yield _scaled(f"column {axis} {unit}", remedy, 1 + (factor - 1) * of_axis)
 
     def from_angles(degrees: float, zenith: bool, points: Points) -> Points:
-        azimuth, elevation = np.radians(degrees * points.y[:, :2].T / 1e-3)  # angles were read as millimetres
-        if zenith:
-            elevation = np.pi / 2 - elevation
-        flat = np.cos(elevation)
-        directions = np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), np.sin(elevation)])
-        return replace(points, y=points.y[:, [2]] * directions)
+        angles = np.radians(degrees * points.y[:, :2] / 1e-3)  # angles were read as millimetres
+        polar = np.column_stack([angles, points.y[:, 2]])
+        return replace(points, y=from_zenith(polar) if zenith else from_elevation(polar))
 
     def from_cylinder(points: Points) -> Points:
         radius, angle, height = points.y.T
@@ -239,6 +241,9 @@ def _of_poses() -> Iterator[Misreading]:
 
         return change
 
+    def in_degrees(turns: Array) -> Array:
+        return np.asarray(Rotation.from_rotvec(np.degrees(Rotation.from_matrix(turns).as_rotvec())).as_matrix())
+
     def reordered(order: list[int]) -> Callable[[Array], Array]:
         return lambda turns: Rotation.from_quat(Rotation.from_matrix(turns).as_quat()[:, order]).as_matrix()
 
@@ -264,6 +269,21 @@ def _of_poses() -> Iterator[Misreading]:
                 yield turned(f"{what}, columns in this order", remedy, euler(axes))
     for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):
         yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor=factor))
+    yield turned("rotation vectors in radians", "convert them to degrees", in_degrees)
+    for by, low, back in SLIPPED:
+        what = f"orientations one row too {low} in the table"
+        yield Misreading(what, f"move their columns one row {back}", partial(_slipped, None, by))
+
+
+def _slipped(joint: int | None, by: int, points: Points) -> Points:
+    """Return points with the values of a joint, or the orientations, of the row that is so many rows later."""
+    q, turns = points.q.copy(), points.turns
+    if joint is not None:
+        q[..., joint] = np.roll(q[..., joint], -by, axis=0)
+    elif turns is not None:
+        turns = np.roll(turns, -by, axis=0)
+    rows = np.arange(len(q))
+    return replace(points, q=q, turns=turns).take(rows[:-1] if by > 0 else rows[1:])
 
 
 def _in_one_frame(points: Points) -> Points:
@@ -299,14 +319,8 @@ def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
         yield of(f"measured values {by} too low in the table", remedy.format("up"), rows[:-k], rows[k:])
         yield of(f"measured values {by} too high in the table", remedy.format("down"), rows[k:], rows[:-k])
     for i, (by, low, back) in product(range(dof), SLIPPED):
-
-        def slipped(points: Points, i: int = i, by: int = by) -> Points:
-            q = points.q.copy()
-            q[..., i] = np.roll(q[..., i], -by, axis=0)
-            return replace(points, q=q).take(rows[:-1] if by > 0 else rows[1:])
-
         what = f"column q{i + 1} one row too {low} in the table"
-        yield Misreading(what, f"move column q{i + 1} one row {back}", slipped)
+        yield Misreading(what, f"move column q{i + 1} one row {back}", partial(_slipped, i, by))
     yield of("the rows of joint values in the reverse order", "reverse the order of one of the two", rows[::-1], rows)
     by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
@@ -378,6 +392,11 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
         mdh[:, k] = np.roll(mdh[:, k], -by)
         remedy = f"move column {column} one row {back} in the DH table"
         yield read_as(f"column {column} one row too {low} in the DH table", remedy, replace(robot, mdh=mdh))
+    for what, remedy, mdh in (
+        ("columns a and d of the DH table exchanged", "exchange them", robot.mdh[:, [0, 3, 2, 1, 4]]),
+        ("alpha of the other sign in the DH table", "change the signs of alpha", robot.mdh * [-1, 1, 1, 1, 1]),
+    ):
+        yield read_as(what, remedy, replace(robot, mdh=mdh))
     for name in robots():
         ready = read_robot(READY / f"{name}.toml")
         if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):

@@ -170,15 +170,21 @@ def moved_otherwise(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return changed
 
 
-def column_d_slipped(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
-    """Write column d of the DH table a row too low."""
-    mdh = problem.robot.mdh.copy()
-    mdh[:, 3] = np.roll(mdh[:, 3], 1)
-    names, nominal = problem.parameters.names, problem.parameters.nominal.copy()
-    nominal[[names.index(f"d{i + 1}") for i in range(len(mdh))]] = mdh[:, 3]
-    return replace(
-        problem, robots=replace(problem.robot, mdh=mdh), parameters=replace(problem.parameters, nominal=nominal)
-    )
+def dh_table(change: Callable[[np.ndarray], np.ndarray]) -> Change:
+    """Write another DH table (n, 5)."""
+
+    def changed(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        robot = replace(problem.robot, mdh=change(problem.robot.mdh))
+        nominal = np.concatenate([robot.mdh.ravel(), problem.parameters.nominal[robot.mdh.size :]])
+        return replace(problem, robots=robot, parameters=replace(problem.parameters, nominal=nominal))
+
+    return changed
+
+
+def deviations(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Write how far the points are from those of the nominal robot."""
+    computed = problem.modelled(np.zeros(len(problem.parameters.free)))[0]
+    return values(lambda y: y - computed)(problem)
 
 
 MAPPED = "Joint mapping estimated from the data"
@@ -242,11 +248,11 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         values(lambda y: np.abs(y - y.mean(axis=0))),
         "no value of column x, y and z is negative",
     ),
-    "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "columns x and y have the same values"),
-    "z a column of RMS": (values(lambda y: y * [1, 1, 1e-5]), "column z varies by only"),
+    "y a copy of x": (values(lambda y: y[:, [0, 0, 2]]), "the values of coordinate"),
+    "z a column of RMS": (values(lambda y: y * [1, 1, 1e-5]), "the values of coordinate z explain nothing"),
     "x sorted alone": (
         values(lambda y: np.column_stack([np.sort(y[:, 0]), y[:, 1:]])),
-        "column x is the only one in ascending order",
+        "the values of coordinate x explain nothing",
     ),
     "distances too long": (values(too_long), "too long"),
     "joint 2 slipped halfway": (
@@ -282,7 +288,31 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < 4)),
         "the reflector on the link of joint 4",
     ),
-    "column d a row too low": (column_d_slipped, "column d one row too low in the DH table"),
+    "column d a row too low": (
+        dh_table(lambda mdh: np.column_stack([mdh[:, :3], np.roll(mdh[:, 3], 1), mdh[:, 4]])),
+        "column d one row too low in the DH table",
+    ),
+    "columns a and d exchanged": (
+        dh_table(lambda mdh: mdh[:, [0, 3, 2, 1, 4]]),
+        "columns a and d of the DH table exchanged",
+    ),
+    "signs of x lost": (
+        values(lambda y: np.column_stack([np.abs(y[:, 0] - y[:, 0].mean()), y[:, 1:]])),
+        "values of coordinate x",
+    ),
+    "z shuffled": (
+        values(lambda y: np.column_stack([y[:, :2], np.random.default_rng(3).permutation(y[:, 2])])),
+        "the values of coordinate z explain nothing",
+    ),
+    "deviations": (deviations, "deviations, or another quantity"),
+    "the floor heaves": (
+        values(lambda y: y + 1e-3 * np.outer(np.sin(np.arange(COUNT) / 3.5), [0, 0, 1])),
+        "residuals change slowly from row to row",
+    ),
+    "joint 2 creeps": (
+        of_joint(1, lambda q: q + 8e-3 * np.linspace(-0.5, 0.5, COUNT)),
+        "consistent with a changed zero of joint 2",
+    ),
     "the instrument sinks": (
         values(lambda y: y + np.array([0, 0, 2e-3]) * np.linspace(0, 1, COUNT)[:, None] ** 2),
         "more and more from row to row",

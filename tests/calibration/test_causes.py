@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
@@ -58,6 +59,9 @@ QUICK = {
         "the last joint half a turn off in rows",
         "mirrored, and joint 1 reversed",
         "inches, joint 2 from 90 degrees and joint 3 reversed",
+        "signs of x lost",
+        "the floor heaves",
+        "columns a and d exchanged",
     ],
     "irb120": [
         "joint 5 shuffled",
@@ -70,6 +74,9 @@ QUICK = {
         "joints rounded to 0.1 degrees",
         "every third row computed",
         "commanded degrees",
+        "z shuffled",
+        "deviations",
+        "joint 2 creeps",
     ],
     "iiwa7": [
         "a column in centimetres",
@@ -374,7 +381,22 @@ def test_misread_orientations_are_named() -> None:
     assert any("inverted orientations" in text for text in causes), causes
     scalar_last = values(lambda y: y[:, [0, 1, 2, 4, 5, 6, 3]])(problem)
     causes = likely_causes(ro.calibrate(scalar_last))
-    assert "quaternions with w last" in causes[0]
+    assert "quaternions with w last" in causes[1]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        (lambda R: Rotation.from_rotvec(np.radians(R.as_rotvec())), "rotation vectors in radians"),
+        (lambda R: R[np.roll(np.arange(len(R)), 1)], "orientations one row too low"),
+    ],
+)
+def test_rotation_vectors_and_orientations_of_other_rows_are_named(change, named: str) -> None:
+    def turned(y: np.ndarray) -> np.ndarray:
+        quaternions = change(Rotation.from_quat(y[:, [4, 5, 6, 3]])).as_quat()
+        return np.column_stack([y[:, :3], quaternions[:, [3, 0, 1, 2]]])
+
+    assert named in better_reading(values(turned)(ro.load("pose").problem)).sentence
 
 
 def test_an_arm_of_poor_repeatability_with_a_joint_on_one_side_is_not_flagged() -> None:
@@ -399,6 +421,12 @@ def test_stroke_and_roll_exchanged_are_named() -> None:
 
     causes = likely_causes(ro.calibrate(joints(change)(problem)))
     assert any(f"joints {i + 1} and {j + 1} exchanged" in text for text in causes), causes
+
+
+def test_a_stroke_in_inches_is_named() -> None:
+    problem = ro.load("scara").problem
+    inches = np.where(np.array(problem.robot.joint_dimensions) == "length", 1 / 25.4, 1.0)
+    assert "values of linear joints in inches" in better_reading(joints(lambda q: q * inches)(problem)).sentence
 
 
 @pytest.mark.slow

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import inspect, odd_columns
+from rpim_opt.problem.diagnosis import inspect, odd_column
 from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
@@ -94,8 +94,8 @@ def test_copied_values_limits_and_coverage() -> None:
 
 
 def test_columns_without_a_negative_value_are_named() -> None:
-    assert list(odd_columns(changed("position"))) == []
-    assert list(odd_columns(changed("position", y=np.abs))) == [
+    assert list(odd_column(changed("position"))) == []
+    assert list(odd_column(changed("position", y=np.abs))) == [
         "no value of column x, y and z is negative: were signs lost?"
     ]
 
