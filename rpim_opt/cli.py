@@ -338,17 +338,32 @@ def calibrate(
 
 @command
 def report(
-    result: Result, out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None
+    result: Result,
+    out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
+    data: Annotated[list[Path] | None, Option(help=f"New measurements to validate on; {Several}")] = None,
+    tables: Tables = TABLES,
+    measurement: Kind = None,
+    register: Register = False,
 ) -> Answer:
-    """Write the calibration report: one self-contained HTML page, ready to be signed."""
+    """Write the calibration report: one self-contained HTML page, ready to be signed.
+
+    With --data it has a section of their validation; verdict and acceptance stay those of the result.
+    """
     with _loaded(result) as (loaded, say):
+        new, notes = {}, ()
+        if data:
+            read = ro.use.read_measurements(loaded, data, measurement, tables.options)
+            names = ", ".join(f"{file.name} (SHA-256 {sha256_of(file)[:12]})" for file in data)
+            new[names], notes = ro.use.validate(loaded, read.data, register), read.notes
+        elif register:
+            raise InputError("--register", "no --data", "new measurements to register")
         say("writing the report")
         if out is None:
             folder = result if result.is_dir() else result.parent
             out = inside(folder, "report.html", "the file", folder)
         with refused(out):
-            ro.report.write_report(loaded, out)
-    return Answer("", {}, written=[out])
+            ro.report.write_report(loaded, out, new=new)
+    return Answer("", {}, written=[out], notes=notes)
 
 
 @command

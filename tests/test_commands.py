@@ -157,21 +157,28 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     export = ("export", "arm/results", "--urdf", str(cell / "arm.urdf"), "--out")
     capsys.readouterr()
     assert run(monkeypatch, *export, "corrected.urdf", "--tip-measured") == 0
-    stated_turn = re.search(r"orientation of its tip link .* ([\d.]+) mrad \(k = 2", capsys.readouterr().out)
+    stated = re.search(r"its tip link .* position ([\d.]+) mm, .* ([\d.]+) mrad \(k = 2", capsys.readouterr().out)
+    assert stated
+    stated_place, stated_turn = map(float, stated.groups())
     assert run(monkeypatch, *export, "behind.urdf") == 0
     assert "Positions of one reflector do not determine all of it" in capsys.readouterr().out
-    assert run(monkeypatch, "report", "arm/results") == 0
+    assert run(monkeypatch, "report", "arm/results", "--data", str(cell / "later.csv")) == 0
+    page = Path("arm/results/report.html").read_text(encoding="utf-8")
+    assert "Validation on new measurements" in page
+    assert "later.csv (SHA-256" in page
     assert {p.name for p in (tmp_path / "arm" / "results").iterdir()} == {"result.json", "report.html"}
     result = ro.load_result("arm/results")
     later = table(cell / "later.csv")[1]
-    stated = rms_mm(later[:, :3] - result.forward(later[:, 3:])[:, :3, 3])
+    residual = rms_mm(later[:, :3] - result.forward(later[:, 3:])[:, :3, 3])
     left = rms_mm(later[:, :3] - urdf_points(tmp_path / "corrected.urdf", later[:, 3:]))
-    assert left == pytest.approx(stated, abs=1e-9)
+    assert left == pytest.approx(residual, abs=1e-9)
     assert left < 0.03  # as the noise of the data; the drawing is off by more than a millimetre
     turns = [urdf_turns(path, later[:, 3:]) for path in ("corrected.urdf", cell / "true.urdf")]
     turned = 1e3 * (turns[0].inv() * turns[1]).magnitude().max()
-    assert stated_turn
-    assert turned < float(stated_turn[1]) < 10, turned
+    assert turned < stated_turn < 10, turned
+    places = [urdf_points(path, later[:, 3:]) for path in ("corrected.urdf", cell / "true.urdf")]
+    missed = 1e3 * np.linalg.norm(places[0] - places[1], axis=1).max()
+    assert missed < stated_place < 0.3, missed
     # a reflector near the tip link does not move it unless it is said to be the tip
     behind, nominal = (ro.read_urdf(path) for path in ("behind.urdf", cell / "arm.urdf"))
     assert np.abs(behind.tool - nominal.tool).max() < 1e-12
@@ -490,6 +497,7 @@ def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, c
     assert run(monkeypatch, "new", "short", *arguments[2:], "--urdf-tip", "link_5") == 0
     ignored = "Ignored joint values: joint_6. The robot (two.urdf, base_link to link_5) has 5 joints"
     assert ignored in capsys.readouterr().out
+    assert ro.load("short").record.details == {"ignored_joints": "joint_6"}  # which calibrate and report show
     assert run(monkeypatch, *arguments, "--urdf-tip", "smr") == 0
     assert "Ignored joint values" not in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "arm", "--out", "arm") == 0

@@ -16,7 +16,7 @@ from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.bayes.transmission import admitted, possible
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import frame_deviations
+from rpim_opt.problem.registration.frames import ridge_deviations
 
 ROUNDS = 6  # linearizations at which hyperparameters are estimated
 REQUIRED_GAIN = 6.0
@@ -58,7 +58,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         start = np.zeros(len(p.free))
         frames = p.placed & p.identified
         if frames.any():
-            start[p.placed[p.identified]] = frame_deviations(every.identifying(frames))
+            start[p.placed[p.identified]] = ridge_deviations(every.identifying(frames))
     whole = estimator.fit(every, start, None, ROUNDS)
     notes: tuple[str, ...] = ()
     if estimator.prior.optional:  # left out where the marginal likelihood is against it

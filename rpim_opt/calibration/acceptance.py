@@ -319,7 +319,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     try:
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
-        reasons = (*against, *lacking, f"No bound: {error}")
+        reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
         return Acceptance(requirement, "rejected" if against else "inconclusive", reasons, held_out=held_out)
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed

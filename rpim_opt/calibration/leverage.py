@@ -96,7 +96,7 @@ def influence(result: Outcome) -> Influence:
     ['c43', 'c14', 'c1']
     """
     if not result.linear_penalty:
-        raise InputError("influence", f"formulation '{result.formulation.name}'", "a squared penalty or none")
+        raise result.no_covariance("k_fold leaves configurations out of any formulation")
     free = result.problem.parameters.free
     model, first_label = _equations(result)
     numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)

@@ -346,8 +346,7 @@ class Outcome:
         InputError for a penalty that is no squared norm, or a loss that no squared one stands for.
         """
         if not self.linear_penalty:
-            found = f"formulation '{self.formulation.name}'"
-            raise InputError("uncertainty", found, "a squared penalty or none; monte_carlo serves any")
+            raise self.no_covariance("`forward` and monte_carlo serve any")
         linear, factor = self.squares
         form = ridge(linear, self.program.penalty_form)
         moves = self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
@@ -356,10 +355,25 @@ class Outcome:
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
         return Spread(linear, form, self.penalty_weight, self.z, factor, level, drift)
 
+    def no_covariance(self, instead: str) -> InputError:
+        """Return the error that says why there is no covariance, and what serves ``instead``."""
+        found = self.no_intervals.partition(": ")[2].rstrip(".")
+        return InputError("uncertainty", found, f"a squared penalty or none, and a loss with a gradient; {instead}")
+
+    @property
+    def no_intervals(self) -> str:
+        """Return a sentence on why there are no intervals; empty where there are."""
+        if self.linear_penalty and self.known_covariance is not None:
+            return ""
+        what, why = "loss", "rests on a few equations and has no quadratic model"
+        if not self.linear_penalty:
+            what, why = "penalty", "is no square; only that of a normal prior has a posterior covariance"
+        return f"No uncertainties and prediction intervals: the {what} of formulation '{self.formulation.name}' {why}."
+
     @property
     def variance_factor(self) -> float:
         """Ratio of the noise variance to the stated one if significantly larger, otherwise 1."""
-        if not self.linear_penalty or self.noise_test().probability >= UNLIKELY:
+        if self.known_covariance is None or self.noise_test().probability >= UNLIKELY:
             return 1.0
         return max(self.spread.noise_variance, 1.0)
 

@@ -13,6 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.calibration.outcome import Outcome
+from rpim_opt.convex.infeasible import name_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
@@ -20,7 +21,7 @@ from rpim_opt.problem.diagnosis import decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import frame_deviations
+from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.problem.row_functions import measured_torques
 from rpim_opt.robot.parameters import own_name
 
@@ -330,17 +331,20 @@ def likely_causes(result: Outcome) -> list[str]:
     signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = _in_table_order(result, problem)
+    shared = _of_any_fit(result, problem)
     if signs or not result.converged:
-        causes = [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
+        causes = _limited_by_formulation(result, problem, kept)
+        causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
     elif (other := _other_robot(result, problem)) is not None:
         causes = [other.sentence]
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
         if not causes and noticed and len(problem.arms) == 1:
-            causes = list(diagnosis.shown_by_residuals(_without_outliers(result, ordered), result.x))
+            limits = [f"{BAD}: residuals; {text}" for text in _limited_by_formulation(result, problem, kept)]
+            causes = [] if limits else list(diagnosis.shown_by_residuals(_without_outliers(result, ordered), result.x))
+            shared += limits
     if noticed:
         causes += _upward(result, problem)
-    shared = _of_any_fit(result, problem)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []
@@ -384,6 +388,25 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
     if share[worst] > 1:
         unit = "mm" if free.dimensions[worst] == "length" else "mrad"
         yield f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}"
+
+
+def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> list[str]:
+    """Say that loss, penalty or constraints leave what a squared penalty at weight 1 explains."""
+    if kept.mean() < 1 - EXCLUDED:  # downweighted by a fit that is wrong everywhere
+        kept = np.ones_like(kept)
+    rows = problem.on(problem.data.take(np.flatnonzero(kept)))
+    now, plain = (
+        max(noise_ratio(rows, rows.errors(x, each), each) for each in UNITS) for x in (result.x, ridge_deviations(rows))
+    )
+    if plain > NOISY or now < NOTICED * plain:
+        return []
+    names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
+    remedy = f"loosen its constraints ({joined(names)}) or use" if names else "use"
+    return [
+        f"the formulation, not the robot, limits the fit: residuals are {three_digits(now)} times the stated noise, "
+        f"but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint; {remedy} a smaller "
+        "weight."
+    ]
 
 
 def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
@@ -450,7 +473,7 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
         if curves:  # they take up ratios and scales of all kinds
             p = problem.parameters
             alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
-            x = frame_deviations(alone)
+            x = ridge_deviations(alone)
         causes = list(diagnosis.shown_by_residuals(alone, x))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))

@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
@@ -103,11 +102,8 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
 
 
 def noise_sentence(result: Outcome) -> list[str]:
-    """Return the noise test as a sentence; empty without a covariance."""
-    try:
-        return [result.noise_test().verdict]
-    except InputError:  # no freedom: a penalty that is no prior, or a loss that no squared one stands for
-        return []
+    """Return the noise test as a sentence, or why there is none."""
+    return [result.no_intervals or result.noise_test().verdict]
 
 
 def weight_lines(result: Outcome) -> list[str]:

@@ -672,8 +672,8 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
         other, what, far = "reflector", "the reflector was exchanged", reflectors
     yield (
         f"from row {problem.data.label[points.row[place]]} on the points fit another {other}, "
-        f"{three_digits(1e3 * far)} mm away: {what}; calibrate the two parts separately, or register the "
-        "second one again."
+        f"{three_digits(1e3 * far)} mm away: {what}; calibrate the two parts separately, or name them "
+        "in a column `session`."
     )
 
 
@@ -909,7 +909,8 @@ def _changes(
         if not rows.any():  # nothing but angles was measured
             moved = "the measurements contradict the others"
         moved = f"{moved}, consistent with a changed {what}"
-        return f"{when} {moved}", f"{cause}? Calibrate the two parts separately"
+        session = ", or name them in a column `session`" if what == "base" else ""
+        return f"{when} {moved}", f"{cause}? Calibrate the two parts separately{session}"
 
     shares = {"more and more from row to row": owners / (len(data) - 1)}
     for start, end in [*((k, len(data)) for k in _places(len(data))), *combinations(_places(len(data), SPANS), 2)]:

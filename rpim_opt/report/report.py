@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import contextlib
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -35,6 +36,7 @@ from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
+from rpim_opt.use.validation import COLUMNS, Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 FEW_NUMBERS = 8  # longer arguments of a penalty or constraint are said by their length: an earlier result is a matrix
@@ -42,14 +44,20 @@ WHY = {"learned": "maximum of the marginal likelihood"}  # reasons of choices th
 L_CURVE_HEIGHT = 430.0
 
 
-def write_report(calibration: Calibration, path: str | Path, validation: Dataset | None = None) -> None:
+def write_report(
+    calibration: Calibration,
+    path: str | Path,
+    validation: Dataset | None = None,
+    new: Mapping[str, Validation] = MappingProxyType({}),
+) -> None:
     """Write a calibration report: one HTML file that needs no network, written whole or not at all.
 
     In the order in which somebody signs it: verdict and headline; accuracy, with expanded uncertainty over the
     workspace; identified parameters with their expanded uncertainties; diagnostics (residuals, identifiability,
     flagged rows, convergence); provenance; and in an appendix the evidence for the regularization weight. Every text
     of a user's file is shown as text. ``validation`` are measurements that were not used for identification, by default
-    those of the calibration's record. InputError where they do not belong to the problem, or none is of a length.
+    those of the calibration's record; ``new`` are `ro.use.validate`'s results of further ones, by the names of their
+    tables, for a section of their own. InputError where they do not belong to the problem, or none is of a length.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
@@ -57,7 +65,7 @@ def write_report(calibration: Calibration, path: str | Path, validation: Dataset
     """
     record = calibration.record.dated()
     record = record if validation is None else replace(record, validation=validation)
-    write_text(Path(path), page(replace(calibration, record=record)))
+    write_text(Path(path), page(replace(calibration, record=record), new))
 
 
 class Content(NamedTuple):
@@ -67,9 +75,10 @@ class Content(NamedTuple):
     accepted: Acceptance | None
     map: Workspace | None
     composition: list[str]
+    new: Mapping[str, Validation]
 
 
-def page(result: Calibration) -> str:
+def page(result: Calibration, new: Mapping[str, Validation] = MappingProxyType({})) -> str:
     """Return the report as HTML."""
     heading = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     lacking = judged(result)
@@ -82,7 +91,9 @@ def page(result: Calibration) -> str:
     workspace = measured_workspace(result) if accepted is None else accepted.workspace
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
-    content = Content(result, accepted, workspace, composition)
+    failed = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure]
+    warnings = [*failed, *warnings]
+    content = Content(result, accepted, workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
@@ -172,6 +183,14 @@ def _accuracy(content: Content) -> Iterator[Block]:
         yield from _uncertainty(content.map, result)
 
 
+def _new_measurements(content: Content) -> Iterator[Block]:
+    for name, validation in content.new.items():
+        yield "table", Table(name, COLUMNS, validation.figures())
+        if validation.touched:
+            yield "table", Table(words.HEADER[0], words.HEADER, words.touch_rows(validation.touched))
+        yield "text", validation.sentences()
+
+
 def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
     lines = found.sentences()[1:]
     if found.workspace is not None:
@@ -239,7 +258,7 @@ def _parameters(content: Content) -> Iterator[Block]:
     result = content.result
     free = result.problem.parameters.free
     half = np.full(len(result.x), np.nan)
-    note = "No intervals: the formulation has no covariance."
+    note = result.no_intervals
     head = ["parameter", "nominal", "identified", "deviation", "U", "tolerance"]
     with contextlib.suppress(InputError):
         uncertainty = Uncertainty(result)
@@ -484,6 +503,7 @@ def _regularization(content: Content) -> Iterator[Block]:
 
 SECTIONS = (
     ("Accuracy and uncertainty", _accuracy),
+    ("Validation on new measurements", _new_measurements),
     ("Parameters", _parameters),
     ("Diagnostics", _diagnostics),
     ("Provenance", _provenance),

@@ -134,6 +134,7 @@ def new_problem(
             seed=seed, validated_by=next((file.name for file in later), ""),
             assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
             raw={str(file) if alike else file.name: files.sha256_of(file) for file in supplied},
+            ignored=_ignored_joints(arm, understanding),
             reading=replace(understanding.options, joints=arm.names).texts(),
         )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
@@ -159,14 +160,19 @@ def _remarks(arm: Described, source: Path, understanding: Understanding, noise: 
             f"[tool], `known` and --tool refer to the flange frame after the last joint. In it {frame} is at "
             f"{placed(arm.tool)}: transform points of {frame} by it."
         )
-    dof = arm.robot.dof
-    beyond = {f"q{i}" for i in range(dof + 1, dof + 9)}
-    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in beyond]
+    further = _ignored_joints(arm, understanding)
     if further:
         yield (
-            f"Ignored joint values: {joined(further)}. The robot ({arm.robot.source or arm.robot.name}) has "
-            f"{dof} joints; if these move the tool, state another robot, or another link: --urdf-tip."
+            f"Ignored joint values: {further}. The robot ({arm.robot.source or arm.robot.name}) has {arm.robot.dof} "
+            "joints; if these move the tool, state another robot, or another link: --urdf-tip."
         )
+
+
+def _ignored_joints(arm: Described, understanding: Understanding) -> str:
+    """Return the columns of joints behind the robot's last one; empty if there are none."""
+    beyond = {f"q{i}" for i in range(arm.robot.dof + 1, arm.robot.dof + 9)}
+    further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in beyond]
+    return joined(further) if further else ""
 
 
 def _files(stated: str | Path | Sequence[str | Path]) -> list[Path]:

@@ -40,6 +40,7 @@ FIELDS = {  # keys of ``[record]``, and what a report calls them
     "temperature": "Temperature",
     "load": "Load",
     "order": "Order",
+    "ignored_joints": "Ignored joint values",
     "notes": "Notes",
 }
 LONGEST_TEXT = 1000  # Characters of a text that somebody may want to read.

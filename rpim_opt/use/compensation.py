@@ -30,7 +30,6 @@ from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
-from rpim_opt.use.export import noted
 from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
 from rpim_opt.use.reading import Targets
 
@@ -165,7 +164,10 @@ class Compensation:
 
     def csv(self) -> str:
         """Return labels, corrected commands, remaining errors and status as CSV text."""
-        return noted(columns_csv(self._columns(), joint_columns(self.robot.joint_dimensions)), ".csv", self.note)
+        columns = self._columns()
+        if self.note:
+            columns["note"] = [self.note, *[""] * (len(self.q) - 1)]
+        return columns_csv(columns, joint_columns(self.robot.joint_dimensions))
 
 
 @one_blas_thread
@@ -235,7 +237,7 @@ def compensate(
     """
     verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
     note = verdict.require(despite_verdict)
-    note = " ".join(filter(None, [note, result.mapping and result.mapping.caution]))
+    note = " ".join(filter(None, [note, result.mapping and result.mapping.caution, result.no_intervals]))
     arm = pick(result.problem.arms, robot, "robot")
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:
@@ -270,6 +272,17 @@ def compensate(
     return Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
     )
+
+
+def tool_uncertainty(
+    result: Calibration, q: Array, tool: Sequence[float] | Array | None = None, marker: str = ""
+) -> tuple[Array, Array]:
+    """Return the standard uncertainties (N,) of position [m] and orientation [rad] of the tool at commands q (N, dof).
+
+    In the instrument's frame, as ``std`` and ``orientation_std`` of a `Compensation`; arguments as for `compensate`.
+    """
+    cell = _Cell.of(result, "", result.problem.robot, pose, tool, marker, False, False)
+    return cell.uncertainty(q, None, None)
 
 
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
@@ -391,7 +404,8 @@ class _Cell(NamedTuple):
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
         stated, located = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
         moved = np.linalg.inv(stated) @ located if base else np.eye(4)
-        measured = result.problem.sample().alone(which) if which else result.problem
+        measured = result.problem.sample()
+        measured = measured.alone(which) if which else measured
         repeatability = measured.repeatability
         if repeatability is not None and tool is not None:
             repeatability = replace(repeatability, at=values)
@@ -440,10 +454,10 @@ class _Cell(NamedTuple):
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields["position_before"], fields["orientation_before"] = self._norms(before)
         fields["position_error"], fields["orientation_error"] = self._norms(left)
-        fields["std"], fields["orientation_std"] = self._std(corrected, torque, payload)
+        fields["std"], fields["orientation_std"] = self.uncertainty(corrected, torque, payload)
         return fields
 
-    def _std(self, q: Array, torque: Array | None, payload: Array | None) -> tuple[Array, Array]:
+    def uncertainty(self, q: Array, torque: Array | None, payload: Array | None) -> tuple[Array, Array]:
         """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached; R is the repeatability's."""
         k = len(self.kind.components)
         if self.covariance is None:

@@ -27,7 +27,6 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
-from rpim_opt.data.measurements.pose import pose
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
@@ -35,6 +34,7 @@ from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
+from rpim_opt.use.compensation import tool_uncertainty
 
 CURVES = "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
 CONVENTION = {  # what is said of a table in a convention
@@ -167,12 +167,12 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
     accepted = accept(whole) if whole.record.requirement else None
     found = accepted.workspace if accepted else measured_workspace(whole)
     verdict, doubt = alone.verdict, inconclusive(whole, found)
-    remarks, undecided = [], False
+    remarks, undecided = list(filter(None, [whole.no_intervals])), False
     if accepted:
         verdict = accepted.on(verdict)
         doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
         undecided = bool(doubt) and verdict.delivered
-        remarks = [accepted.summary] if accepted.verdict == "accepted" else []
+        remarks += [accepted.summary] if accepted.verdict == "accepted" else []
     note = verdict.require(despite_verdict) or doubt
     if whole.learned is None or alone is whole or found is None:
         return note, remarks, undecided
@@ -323,7 +323,7 @@ def export_urdf(
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
         notes.append(f"URDF: its tip link keeps its pose from the file; {there}.")
-    notes += _orientation(result, marker)
+    notes += _tip_uncertainty(result, own.tool if tool is None else None, marker)
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, base, tool)
@@ -332,27 +332,20 @@ def export_urdf(
     return write_all([(Path(target), write)], note)
 
 
-def _orientation(result: Calibration, marker: str | None) -> list[str]:
-    """Say how well the orientation of the tip link is known, which positions of one reflector do not determine.
-
-    Nothing where no identified parameter turns it.
-    """
+def _tip_uncertainty(result: Calibration, tool: Array | None, marker: str | None) -> list[str]:
+    """Say how well the pose of the tip link is known, at ``tool`` in the flange frame or at the reflector."""
     problem = result.problem.sample()
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
-    slopes = problem.measuring(q, pose, marker).jacobian(result.x).reshape(len(q), 6, -1)[:, 3:]
-    C = result.known_covariance
-    if C is None or (np.abs(slopes[:, :, np.isinf(np.diag(C))]) > 0).any():
-        return ["URDF: the orientation of its tip link is undetermined: check it by other means."]
-    C = np.where(np.isfinite(C), C, 0.0)
-    largest = float(np.sqrt(np.einsum("nij,jk,nik->n", slopes, C, slopes).max()))
-    if not largest:
-        return []
+    name = reflectors(problem.parameters.names)[0] if marker is None else marker
+    position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, name))
+    if not np.isfinite([position, turn]).all():
+        return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
     seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
     rests = "" if seen else ". Positions of one reflector do not determine all of it; the rest is the prior's"
     return [
-        "URDF: expanded uncertainty of the orientation of its tip link in the instrument's frame: "
-        f"{2e3 * largest:.2g} mrad (k = 2, largest of the measured configurations){rests}."
+        f"URDF: expanded uncertainty of its tip link in the instrument's frame: position {2e3 * position:.2g} mm, "
+        f"orientation {2e3 * turn:.2g} mrad (k = 2, largest of the measured configurations){rests}."
     ]
 
 

@@ -210,8 +210,7 @@ def _innovations(result: Calibration, problem: CalibrationProblem, level: float)
     """
     C = result.known_covariance
     if C is None:
-        accepted = "one with a squared penalty or none, whose predictions have intervals"
-        raise InputError("monitor", f"formulation '{result.formulation.name}'", accepted)
+        raise result.no_covariance("`validate` gives errors without intervals")
     known = np.isfinite(np.diag(C))
     own = problem.parameters.free.scale[len(C) :]  # of sessions that the calibration does not know
     n = len(known)

@@ -20,6 +20,8 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import shared_rows
 
+COLUMNS = ["error [mm]", "rows", "mean", "RMS", "max"]
+
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Validation(HeldOut):
@@ -28,8 +30,8 @@ class Validation(HeldOut):
     ``vectors`` (N, 3) are measured minus predicted position [m], NaN where no position was measured, and ``angle`` (N,)
     the orientation errors [rad], NaN for rows that are no poses. ``outside`` are rows beyond the joint ranges that the
     calibration measured, ``touched`` says how far touches are from their points and planes, the worst first [mm],
-    ``remarks`` what a reader of the errors has to know, and ``mistake`` names another reading of the measurements that
-    fits far better, if there is one.
+    ``remarks`` what a reader of the errors has to know, ``mistake`` names another reading of the measurements that fits
+    far better, if there is one, and ``no_intervals`` says why there are none.
     """
 
     vectors: Array
@@ -38,6 +40,7 @@ class Validation(HeldOut):
     touched: tuple[Mapping[str, Any], ...] = ()
     remarks: tuple[str, ...] = ()
     mistake: str = ""
+    no_intervals: str = ""
 
     @property
     def largest(self) -> float:
@@ -48,6 +51,11 @@ class Validation(HeldOut):
     def worse(self) -> bool:
         """Whether the errors are significantly larger than those of the nominal robot."""
         return worse_than_nominal(self.nominal, self.error)
+
+    @property
+    def failure(self) -> str:
+        """Why the calibration fails on these measurements; empty where it does not."""
+        return self.mistake or (worse_sentence(self.nominal, self.error) if self.worse else "")
 
     @property
     def beyond(self) -> tuple[int, ...]:
@@ -78,7 +86,8 @@ class Validation(HeldOut):
         """Return the rows as CSV."""
         return columns_csv(self._rows())
 
-    def __str__(self) -> str:
+    def figures(self) -> list[list[str]]:
+        """Return the rows of the table of errors as text, under `COLUMNS`."""
         content = self.content()
         figures = {"nominal": content["nominal"], "identified": content["identified"]}
         for axis, of_axis in content["axes"].items():
@@ -89,10 +98,10 @@ class Validation(HeldOut):
         for name, of in figures.items():
             unit = "mm" if "mean_mm" in of else "mrad"
             rows.append([name, str(of["count"]), *(f"{of[f'{key}_{unit}']:.4f}" for key in ("mean", "rms", "max"))])
-        tables = [table(["error [mm]", "rows", "mean", "RMS", "max"], rows)]
-        if self.touched:
-            tables.append(table(HEADER, touch_rows(self.touched)))
-        worse = [worse_sentence(self.nominal, self.error)] if self.worse else []
+        return rows
+
+    def sentences(self) -> list[str]:
+        """Return the largest error, the rows outside their intervals, and what a reader of the errors has to know."""
         largest = ""
         if np.isfinite(self.error).any():
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
@@ -105,11 +114,16 @@ class Validation(HeldOut):
         ]
         judgement = f"Outside their prediction intervals: {listed(named)}.{covered}"
         if not np.isfinite(self.sigmas).any():
-            judgement = "The calibration has no covariance for these rows: there are no prediction intervals."
+            judgement = self.no_intervals or "No row has a prediction interval: data and penalty do not determine it."
         elif not named:
             judgement = f"No row is outside its prediction interval.{covered}"
-        sentences = [*worse, largest, judgement, *self.outside.sentences(), *self.remarks, self.mistake]
-        return "\n".join([*tables, *filter(None, sentences)])
+        worse = worse_sentence(self.nominal, self.error) if self.worse else ""
+        every = [worse, largest, judgement, *self.outside.sentences(), *self.remarks, self.mistake]
+        return [sentence for sentence in every if sentence]
+
+    def __str__(self) -> str:
+        touches = [table(HEADER, touch_rows(self.touched))] if self.touched else []
+        return "\n".join([table(COLUMNS, self.figures()), *touches, *self.sentences()])
 
     def _rows(self) -> dict[str, Sequence[Any]]:
         columns = {"nominal_mm": 1e3 * self.nominal, "error_mm": 1e3 * self.error}
@@ -150,6 +164,7 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         touched=touched,
         remarks=tuple(remarks),
         mistake=misread(result, data) or displaced(result, data, held) or _elsewhere(result, held.error),
+        no_intervals=result.no_intervals,
     )
 
 

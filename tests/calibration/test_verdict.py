@@ -193,3 +193,35 @@ def test_a_loss_with_own_variables_is_judged_where_rows_are_flagged() -> None:
     result = ro.calibrate(ro.load("blunders").problem, priced, 1.0)
     assert result.flagged
     assert "Outliers: " in str(result)
+
+
+def test_a_formulation_that_forbids_what_is_true_limits_the_fit() -> None:
+    problem = ro.load("position").problem
+    fixed = ro.Formulation("fixed", penalty=cp.sum_squares, constraints=(ro.constraints.at_nominal("a?", "d?"),))
+    heavy = ro.Formulation("heavy", lambda v: cp.sum(cp.huber(v, 1.5)), cp.norm1)
+    for formulation, weight, remedy in ((fixed, None, "at_nominal('a?', 'd?')"), (heavy, 1e3, "use a smaller weight")):
+        (reason,) = ro.calibrate(problem, formulation, weight).verdict.reasons
+        assert "the formulation, not the robot, limits the fit" in reason
+        assert remedy in reason
+    wide = ro.calibrate(problem, "minimax")  # twice the noise: delivered, with the cause
+    assert wide.verdict.delivered
+    assert "limits the fit" in wide.causes[0]
+    (block,) = problem.data.blocks
+    exchanged = replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]])
+    wrong = ro.calibrate(problem.on(replace(problem.data, blocks=(exchanged,))), fixed, 1.0)
+    assert "joints 2 and 3 exchanged" in str(wrong.verdict)
+
+
+def test_without_a_covariance_it_says_why_wherever_intervals_would_be() -> None:
+    instance = ro.load("position")
+    result = ro.calibrate(instance.problem, "lasso")
+    why = "the penalty of formulation 'lasso' is no square"
+    requirement = ro.data.Requirement(1e-4)
+    texts = [ro.use.validate(result, instance.validation), ro.use.compensate(result, instance.validation.q[:2]).note]
+    texts += [result, "".join(ro.calibration.accept(result, requirement).sentences())]
+    assert all(why in str(text) for text in texts)
+    for refused in (ro.calibration.Uncertainty, ro.influence, lambda r: r.predict(instance.validation.q)):
+        with pytest.raises(ro.InputError, match="is no square"):
+            refused(result)
+    loss = ro.use.validate(ro.calibrate(instance.problem, "minimax"), instance.validation)
+    assert "the loss of formulation 'minimax' rests on a few equations" in str(loss)

@@ -121,7 +121,7 @@ def test_two_checks_show_no_course() -> None:
 
 
 def test_what_a_formulation_cannot_do_is_said() -> None:
-    with pytest.raises(ro.InputError, match="monitor: found formulation 'lasso'"):
+    with pytest.raises(ro.InputError, match="the penalty of formulation 'lasso' is no square"):
         ro.use.monitor(calibrated("lasso"), checks())
 
 
@@ -265,7 +265,7 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
 
 def test_validation_says_what_it_knows_and_what_not() -> None:
     bare = str(ro.use.validate(calibrated("lasso"), checks()))
-    assert "has no covariance for these rows: there are no prediction intervals." in bare
+    assert "No uncertainties and prediction intervals: the penalty of formulation 'lasso' is no square" in bare
     assert "orientation" not in bare
     pose = ro.load("pose")
     assert pose.validation is not None

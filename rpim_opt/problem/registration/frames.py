@@ -277,7 +277,7 @@ def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: 
     x = np.zeros(len(free.free))
     for _ in range(TRIMMED):
         try:
-            x = frame_deviations(problem, STEPS)
+            x = ridge_deviations(problem, STEPS)
             error = np.nan_to_num(whole.errors(x))
             kept = np.flatnonzero(error <= GROSS * np.median(error))
             if len(kept) == len(problem.data):
@@ -375,11 +375,11 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
         return problem, np.zeros(len(p.free))
     alone = problem.identifying(frames)
     alone = relocated(alone) or alone
-    return alone, frame_deviations(alone)
+    return alone, ridge_deviations(alone)
 
 
-def frame_deviations(alone: Source, steps: int = 200) -> Array:
-    """Return the deviations (f,) [SI] of a problem that identifies frames alone, from their stated values.
+def ridge_deviations(alone: Source, steps: int = 200) -> Array:
+    """Return the deviations (n,) [SI] that minimize |A z - b|^2 + |z|^2, from nominal: a squared penalty at weight 1.
 
     Levenberg-Marquardt on the QR factor of a linearization, whatever the data's number.
     """
