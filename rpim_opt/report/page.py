@@ -106,7 +106,7 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     """
     path = Path(path)
     if path.suffix.lower() not in (".html", ".csv"):
-        raise InputError("--out", f"'{path.name}'", "a name that ends in .html or .csv")
+        raise InputError("the file", f"'{path.name}'", "a name that ends in .html or .csv")
     if path.suffix.lower() == ".csv":
         write_text(path, found.csv())
         return
