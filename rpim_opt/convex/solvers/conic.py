@@ -48,6 +48,9 @@ DENSE = 4e5
 """Entries of the constraints' matrix up to which active sets are tried."""
 CENTRED = 1e-10
 """Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
+LARGE = 1e-2
+"""Part of the largest residual from which the objective is scaled down: no scale costs accuracy where it is small, and
+iterations where it is large."""
 DEAR = 1e6
 """Costs beside a loss from which they are scaled down."""
 MOST_ACTIVE_SETS = 8
@@ -422,7 +425,7 @@ class ReducedProgram:
             dense.append(-A.ravel())
         cost = np.concatenate(q)
         # tolerances are absolute below one; a loss, which is no smaller, takes fewer iterations as it is
-        largest = max(np.abs(cost).max(), 1e-3 * weight)
+        largest = max(np.abs(cost).max(), 1e-3 * weight, LARGE * np.abs(residual).max(initial=0.0))
         scale = 1.0 / max(1.0, largest if self.loss is None else largest / DEAR)
         P, matrix = data.filled(weight, np.concatenate(dense))
         P.data *= scale

@@ -30,7 +30,7 @@ STEPS = 60
 """Newton steps of one smoothing width."""
 FEW_ENTRIES = 400
 """Entries of a loss up to which Clarabel takes them all as they are, where that is quicker."""
-NEAR = 12
+NEAR = 6
 """Times the number of parameters: rows near a kink that are taken as they are."""
 SMOOTHED = 0.02
 """Part of what smoothing may add to the loss below which Newton stops at a width."""
