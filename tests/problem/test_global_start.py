@@ -188,3 +188,18 @@ def test_robots_that_are_nominal_or_read_otherwise_are_not_mapped() -> None:
     for y in (block.y * [1, -1, 1], block.y[::-1]):
         wrong = problem.on(replace(problem.data, blocks=(replace(block, y=y),)))
         assert ro.calibrate(wrong).mapping is None
+
+
+def test_a_left_handed_frame_with_a_reversed_joint_is_named_beside_the_description_without_a_mirror() -> None:
+    problem = ro.load("position").problem  # an arm that is its own mirror image, but for joints 2, 4 and 5
+    (block,) = problem.data.blocks
+    q, y = block.q.copy(), block.y.copy()
+    q[..., 4] *= -1
+    reversed_ = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, q=q),))))
+    assert reversed_.mapping is not None
+    assert reversed_.mapping.behind == ""
+    assert reversed_.verdict.delivered
+    y[:, 1] *= -1
+    both = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, q=q, y=y),))))
+    assert not both.verdict.delivered
+    assert "left-handed measured frame with joint 5 reversed" in str(both.verdict)

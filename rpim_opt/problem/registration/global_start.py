@@ -52,6 +52,7 @@ FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
 MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
 COMPARED = 200  # configurations at which mappings are compared
+AS_STATED = "joints as stated"
 RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
 
 
@@ -84,6 +85,7 @@ class JointMapping:
     starts: int  # random starts of the search
     alternatives: tuple[Alternative, ...] = ()  # that the data cannot tell from it though they predict otherwise
     mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
+    behind: str = ""  # joints that fit as well in a left-handed frame, as stated or one of them reversed
     same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
 
     @property
@@ -118,10 +120,10 @@ class JointMapping:
 
     def _said(self, alternatives: Sequence[Alternative]) -> tuple[str, ...]:
         sentences = []
-        if self.mirrored:
+        if self.behind:
             sentences.append(
-                "A left-handed measured frame with the joints as stated fits as well: a known direction in the "
-                "instrument's frame (such as up) or measured orientations would decide."
+                f"A left-handed measured frame with {self.behind} fits as well: a known direction in the instrument's "
+                "frame (such as up) or measured orientations would decide."
             )
         for other in alternatives:
             what = described(self.joint_types, other.sign, other.zero).capitalize()
@@ -149,7 +151,7 @@ def described(joint_types: tuple[str, ...], sign: Array, zero: Array) -> str:
     shifts = [f"joint {i + 1} {_value(joint_types[i], zero[i], '+')}" for i in np.flatnonzero(np.abs(zero) > 1e-9)]
     if shifts:
         parts.append(f"zero of {joined(shifts)}")
-    return ", ".join(parts) or "joints as stated"
+    return ", ".join(parts) or AS_STATED
 
 
 def _value(kind: str, value: float, plus: str = "") -> str:
@@ -348,16 +350,29 @@ def _judged(
             apart = _apart(predictions[k], predictions[first], points.lengths)
             others.append(Alternative(sign[i], zeros[i], apart, deciding, mirror[k]))
     nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
-    left_handed = False
-    if not points.lengths:
-        other = fit_arms(Candidates.of([mirrored(points)]), LONG, zeros=True, noise=LEAST_NOISE)
-        small_zeros = np.abs(_gauged(robot, other.zero[0])).max() < NEAR_ZERO
-        left_handed = bool(small_zeros and rms(other)[0] < MIRRORED * left[plainest[first]])
     i = plainest[first]
+    behind = _behind_a_mirror(points, MIRRORED * left[i])
+    if plain[i][0] <= 2:  # as few changes as a mirror and a joint
+        behind = [name for name in behind if name == AS_STATED]
     again = {plain[k]: k for k in alike[first] if plain[k][0] == plain[i][0] and plain[k] != plain[i]}
     described_so = [Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof)) for _, k in sorted(again.items())]
     found = JointMapping(robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others))
-    return replace(found, mirrored=left_handed, same=tuple(described_so))
+    return replace(found, mirrored=AS_STATED in behind, behind=" or ".join(behind), same=tuple(described_so))
+
+
+def _behind_a_mirror(points: Points, largest: float) -> list[str]:
+    """Return which joints, none or one reversed, explain a left-handed frame to ``largest`` [m]; none of lengths."""
+    if points.lengths:
+        return []
+    n = points.robot.dof
+    sign = np.vstack([np.ones(n), np.ones((n, n)) - 2 * np.eye(n)])
+    other = mirrored(points)
+    fits = fit_arms(
+        Candidates.of([replace(other, q=each * other.q) for each in sign]), LONG, zeros=True, noise=LEAST_NOISE
+    )
+    small = [np.abs(_gauged(points.robot, zero)).max() < NEAR_ZERO for zero in fits.zero]
+    explained_so = np.flatnonzero(small & (rms(fits) < largest))
+    return [described(points.robot.joint_types, sign[k], np.zeros(n)) for k in explained_so]
 
 
 def _apart(one: Array, other: Array, lengths: bool) -> float:
