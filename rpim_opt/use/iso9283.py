@@ -140,11 +140,12 @@ def iso9283(
             raise InputError(f"pose '{name}'", "one approach", f"two or more, {CYCLES} by the standard")
         barycentre = attained[at].mean(axis=0)
         length = np.linalg.norm(attained[at] - barycentre, axis=1)
-        row: dict[str, Any] = {"pose": name, "cycles": int(at.sum())}
-        row |= dict.fromkeys(["AP_p_mm", *(f"AP_{axis}_mm" for axis in AXES)])
+        row: dict[str, Any] = {"pose": name, "cycles": int(at.sum()), "AP_p_mm": None}
+        row |= dict.fromkeys(f"AP_{axis}_mm" for axis in AXES)
         if commanded is not None:
             offset = barycentre - _one_command(commanded[at], name, "position")
-            row |= dict(zip(list(row)[2:], (1e3 * np.array([np.linalg.norm(offset), *offset])).tolist(), strict=True))
+            row["AP_p_mm"] = 1e3 * float(np.linalg.norm(offset))
+            row |= {f"AP_{axis}_mm": 1e3 * float(part) for axis, part in zip(AXES, offset, strict=True)}
         row["RP_l_mm"] = 1e3 * float(length.mean() + 3 * length.std(ddof=1))
         if turned is not None:
             start = None if commanded_turns is None else _one_command(commanded_turns[at], name, "orientation")
