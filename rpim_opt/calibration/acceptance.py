@@ -27,6 +27,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
+from rpim_opt.robot.parameters import of_session
 
 Verdict = Literal["accepted", "rejected", "inconclusive"]
 MOST = 3  # joints or rows that a reason names
@@ -336,6 +337,11 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         lacking.append(
             f"Missing: a tighter bound on repeatability: {1e3 * repeatability:.3f} mm may exceed the "
             "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
+        )
+    elif mapped.largest > limit and any(of_session(name) for name in result.problem.parameters.free.names):
+        lacking.append(
+            f"Missing: one registration for all sessions. The bound is {1e3 * mapped.largest:.3f} mm, session offsets "
+            "included: more configurations do not reduce them."
         )
     elif mapped.largest > limit:
         lacking.append(
