@@ -199,14 +199,15 @@ def test_real_data_reach_the_least_squares_figures(name: str) -> None:
 
 
 MODELLED = {  # RMS on the validation rows [mm] with extensions that the evidence wants
-    "ur5_jacobi": 0.102, "wam_jacobi": 2.08, "franka_fr3_nadeau": 1.32, "irb120_wu": 0.176, "rokae_lmpytorch": 0.086,
+    "ur10_joint_configurations": 0.095, "ur5_jacobi": 0.061, "wam_jacobi": 2.02, "franka_fr3_nadeau": 1.3,
+    "irb120_wu": 0.172, "rokae_lmpytorch": 0.083,
 }  # fmt: skip
 
 
 @real
 @pytest.mark.parametrize(
     ("name", "most"),
-    [("motoman_right", 0.068), *(pytest.param(*item, marks=pytest.mark.slow) for item in MODELLED.items())],
+    [("motoman_right", 0.048), *(pytest.param(*item, marks=pytest.mark.slow) for item in MODELLED.items())],
 )
 def test_real_data_choose_their_model(name: str, most: float) -> None:
     """The first one's tool hangs in one attitude: where the base may be anywhere it leaves 0.0693 mm."""
