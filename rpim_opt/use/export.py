@@ -339,6 +339,8 @@ def _tip_uncertainty(result: Calibration, tool: Array | None, marker: str | None
     q = np.concatenate([block.q[:, 0] for block in blocks])
     name = reflectors(problem.parameters.names)[0] if marker is None else marker
     position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, name))
+    if not (position or turn):  # nothing identified moves it
+        return []
     if not np.isfinite([position, turn]).all():
         return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
     seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
