@@ -40,6 +40,7 @@ EXCLUDED = 0.25  # share of the rows that may be outliers
 COMPUTED, COMPUTED_RMS = 0.05, 2e-5  # nominal RMS over the stated noise, and itself [m], of computed positions
 ROUNDED = 1.1  # nominal RMS over what rounding of the measured values makes, below which they were computed, too
 SPARE = 2.0  # equations per parameter of the frames below which nominal errors may vanish by themselves
+INTERPOLATED = 0.1  # residual degrees of freedom below which nothing checks a fit; 73 good tables of few rows left 0.3
 WORSE = 3.0  # standard errors by which squared errors on held-out rows are above those of the nominal robot
 ROWS = 12  # rows below which a standard error of squares says too little, and only twice the nominal error counts
 NOTICED = 2**0.5  # the same from which on an effect may explain half of the squares, and leave no less than the noise
@@ -104,8 +105,9 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
     Not delivered is a robot whose fit did not converge; whose residuals without outliers are beyond 3 times the stated
     noise and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors
-    on held-out rows are larger than the nominal robot's; whose data were computed; and one with a likely mistake. The
-    limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not limited.
+    on held-out rows are larger than the nominal robot's, or that interpolates all rows; whose data were computed; and
+    one with a likely mistake. The limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not
+    limited.
     """
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
@@ -256,7 +258,10 @@ def _deviations(result: Outcome) -> Iterator[str]:
 
 
 def _worse(result: Outcome) -> Iterator[str]:
-    """Say that the robot misses rows by more than the nominal one: by a far too large weight, or held-out ones."""
+    """Say that the robot misses rows by more than the nominal one, or that no row would tell.
+
+    By a far too large weight, or held-out rows; without these an interpolating fit may be anything.
+    """
     nominal, identified = result.nominal_errors(), result.errors()
     if worse_than_nominal(nominal, identified):
         sentence = worse_sentence(nominal, identified, "the identification rows")
@@ -267,6 +272,12 @@ def _worse(result: Outcome) -> Iterator[str]:
     elif validation is not None:
         nominal, identified = result.nominal_errors(validation), result.errors(validation)
     else:
+        if result.known_covariance is not None and result.spread.spare < INTERPOLATED:
+            yield (
+                f"The fit interpolates the data: of {result.program.model.equations} equations none is left to tell "
+                "errors of the robot from those of the measurements, and no validation data check it. Measure more "
+                "configurations."
+            )
         return
     if worse_than_nominal(nominal, identified):
         yield worse_sentence(nominal, identified)

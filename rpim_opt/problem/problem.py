@@ -264,7 +264,8 @@ class CalibrationProblem(RobotModel):
         stated = {name: np.asarray(values, dtype=float) for name, values in columns.items()}
         approach = np.broadcast_to(stated.pop("approach", 0.0), q.shape)
         data = Dataset.of(
-            q, y, covariance, measurement=measurement, torque=torque,
+            q, y, covariance, measurement=measurement,
+            torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
             approach=None if all(block.approach is None for block in self.data.blocks) else approach,
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
             columns={name: np.broadcast_to(values, N) for name, values in stated.items()},

@@ -70,6 +70,16 @@ def test_computed_positions_are_no_measurements() -> None:
     assert "computed" in reason
 
 
+def test_a_fit_that_interpolates_needs_rows_that_check_it() -> None:
+    problem = ro.load("position").problem
+    three = problem.identifying(np.isin(problem.parameters.names, ("a2", "d4", "tool_z")))
+    one = three.on(problem.data.take(np.array([0])))
+    result = ro.calibrate(one, ro.least_squares)
+    assert any("interpolates the data: of 3 equations" in reason for reason in result.verdict.reasons)
+    checked = replace(result, record=replace(result.record, validation=problem.data.take(np.arange(1, 21))))
+    assert not any("interpolates" in reason for reason in checked.verdict.reasons)
+
+
 def test_a_robot_worse_than_the_nominal_one_is_not_delivered() -> None:
     """Beyond chance: where both err by noise alone, either may be ahead."""
     instance = ro.load("position")
