@@ -272,7 +272,8 @@ def _worse(result: Outcome) -> Iterator[str]:
     elif validation is not None:
         nominal, identified = result.nominal_errors(validation), result.errors(validation)
     else:
-        if result.known_covariance is not None and result.spread.spare < INTERPOLATED:
+        checked = result.record.earlier or result.known_covariance is None  # an update is judged against what was known
+        if not checked and result.spread.spare < INTERPOLATED:
             yield (
                 f"The fit interpolates the data: of {result.program.model.equations} equations none is left to tell "
                 "errors of the robot from those of the measurements, and no validation data check it. Measure more "

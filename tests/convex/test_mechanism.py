@@ -141,6 +141,19 @@ def test_kinks_of_many_rows_are_those_of_all_rows_in_one_program(monkeypatch: py
         assert one.objective(z, weight) == pytest.approx(least, rel=EQUAL)
 
 
+def test_norms_that_are_far_from_zero_do_not_stay_smoothed(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Smoothing adds to every norm: with none near zero a fit ended 2e-6 above its minimum."""
+    problem, _ = simulated(configurations=500, noise=1e-4, seed=3)
+    model = problem.linearize(np.zeros(34))
+    turns = np.random.default_rng(0).normal(size=(500, 3))
+    far = replace(model, b=model.b + 100 * (turns / np.linalg.norm(turns, axis=1)[:, None]).ravel())
+    mine = ro.Formulation("mine", penalty=cp.sum_squares, **LOSSES["sum of norms"])
+    found = ro.convex.pose(mine, far).solve(1.0).z
+    monkeypatch.setattr("rpim_opt.convex.solvers.solve.FEW_ENTRIES", 10_000)
+    one = ro.convex.pose(mine, far)
+    assert one.objective(found, 1.0) == pytest.approx(one.objective(one.solve(1.0).z, 1.0), rel=EQUAL)
+
+
 def test_a_quantile_of_redundant_parameters_is_not_wrong_in_silence() -> None:
     """Rounding in directions that the data do not see once left it 5e-3 above the minimum."""
     for weight in (1e-4, 1.0):

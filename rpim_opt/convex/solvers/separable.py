@@ -275,7 +275,9 @@ class Newton:
                     return exact, warm_width
         while h > floor:
             v = self.rows.entries(self._residual(z))
-            added = np.count_nonzero(np.abs(v) < h) * h * self.kink  # what smoothing may add to the loss
+            # what smoothing may add to the loss: to that of a norm everywhere
+            widened = h * np.count_nonzero(np.abs(v) < h) if self.rows.counts is None else np.sum(np.hypot(v, h) - v)
+            added = float(widened) * self.kink
             before, z_before, x_before = self._value(z, self.x), z, self.x
             size = max(abs(self._total(self._residual(z))), TINY)
             z = self.smooth(z, self.x, h, max(SMOOTHED * added / size, DECREASE), 30)
