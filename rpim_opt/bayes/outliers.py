@@ -24,6 +24,7 @@ SPARE = 0.4  # part of the equations that must be left over: errors that the fit
 WELL_DETERMINED = 10.0  # equations a parameter from which on no single row can pull the fit to itself
 FULL_WEIGHT, STEPS = 1.5, 50
 """Medians up to which a resistant fit gives a row its full weight; reweighted fits, at most."""
+FINEST = 1e-8  # least median error of a resistant fit [m, rad, pixels]: fewer rows than parameters leave none
 SAME = 1e-3  # largest change of weights of rows that have converged
 RUN = 0.01  # probability with which chance makes neighbours of outliers: below, they are a cluster
 NEIGHBOURS, ALIKE = 3, 0.7
@@ -98,7 +99,7 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
         for kind in kinds:
             count = np.bincount(rows[kind])
             mean = np.bincount(rows[kind], e[kind] ** 2) / np.maximum(count, 1)
-            unit[kind] = max(float(np.sqrt(np.median(mean[count > 0]))), 1e-12)
+            unit[kind] = max(float(np.sqrt(np.median(mean[count > 0]))), FINEST)
         size = np.sqrt(np.bincount(rows, (e / unit) ** 2) / np.bincount(rows))
         before = weight
         weight = np.minimum(1.0, FULL_WEIGHT / np.maximum(size, 1e-12))

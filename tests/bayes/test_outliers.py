@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.bayes.outliers import coherent
+from rpim_opt.bayes.outliers import coherent, resistant_fit
 from rpim_opt.calibration import words
 from tests.simulate import simulated
 
@@ -110,3 +110,15 @@ def test_how_often_ten_good_configurations_are_accused() -> None:
         result = ro.calibrate(ro.study.simulated_arm(40_000 + seed, 10).problem, ro.robust, weight=ro.reml)
         accused += bool(result.flagged)
     assert accused <= 8
+
+
+def test_a_resistant_fit_to_fewer_rows_than_parameters_is_the_shortest_one() -> None:
+    """Residuals vanish there, and so did the median that divides them: the fit was a thousand times longer."""
+    problem = ro.load("cable").problem
+    few = problem.on(problem.data.take(np.arange(12)))
+    free = few.parameters.free
+    start = np.zeros(len(free))
+    residual, slopes = few.slopes(start)
+    shortest = np.linalg.lstsq(slopes * free.scale, residual, rcond=None)[0]
+    fitted = resistant_fit(few, start, free.scale) / free.scale
+    assert np.linalg.norm(fitted) == pytest.approx(np.linalg.norm(shortest), rel=0.05)
