@@ -222,7 +222,7 @@ class Newton:
             promised = -(gradient @ u + 0.5 * u @ H @ u + chord + pull + 0.5 * bend)
             if self.point.iterations:  # Clarabel's accuracy
                 tolerance = max(tolerance, INTERIOR)
-            if promised < -INEXACT * size:
+            if promised < -INEXACT * size and promised < -INEXACT * abs(self._total(r)):
                 raise np.linalg.LinAlgError("the small program's minimum is none")
             if promised <= tolerance * size:
                 break
