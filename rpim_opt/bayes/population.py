@@ -112,7 +112,7 @@ def data_likelihood(result: Result) -> tuple[tuple[str, ...], Array, Array]:
     """
     free = result.problem.parameters.free
     spread = result.spread
-    R = spread.linear.triangle / np.sqrt(spread.noise_variance * spread.factor)
+    R = spread.linear.triangle / np.sqrt(spread.noise_variance * spread.linear.factor)
     n = len(free)
     own = np.eye(n)[free.of_frames] * (free.scale / _stated_widths(result))[free.of_frames, None]
     robot = np.flatnonzero(~free.of_frames)

@@ -295,7 +295,7 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     free = result.problem.parameters.free
     spread = result.spread
     form = result.program.penalty_form
-    variance = spread.factor * (spread.noise_variance if noise is None else noise**2)
+    variance = spread.linear.factor * (spread.noise_variance if noise is None else noise**2)
     parts = [spread.linear.triangle[:, : len(free)] / np.sqrt(variance)]
     if form is not None and spread.weight > 0:
         parts.append(np.sqrt(spread.weight / variance) * form.matrix)

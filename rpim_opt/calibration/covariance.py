@@ -27,17 +27,15 @@ class Spread:
     """Covariance of a least-squares fit with a quadratic penalty, noise and prior separately (see `Uncertainty`).
 
     ``linear``, ``form`` and ``weight`` are the equations that the fit rests on, their closed form with the penalty, and
-    its weight; ``z`` (n,) the solution in units of the scales, ``factor`` the weight that a robust loss gives to the
-    equations, against squared residuals in sigmas. ``level`` is the noise's variance in units of the equations', where
-    it was estimated with the repeatability, ``drift`` (n, k) what estimated hyperparameters and heavy tails add: D with
-    D D' a covariance of the deviations [SI].
+    its weight; ``z`` (n,) the solution in units of the scales. ``level`` is the noise's variance in units of the
+    equations', where it was estimated with the repeatability, ``drift`` (n, k) what estimated hyperparameters and heavy
+    tails add: D with D D' a covariance of the deviations [SI].
     """
 
     linear: LinearModel
     form: Ridge
     weight: float
     z: Array
-    factor: float
     level: float | None = None
     drift: Array | None = None
 
@@ -58,11 +56,11 @@ class Spread:
             return self.level
         if self.spare <= 1e-6:
             return 1.0
-        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self.spare / self.factor
+        return float(np.sum((self.linear.A @ self.z - self.linear.b) ** 2)) / self.spare / self.linear.factor
 
     def _in_si(self, C: Array) -> Array:
         scale = self.linear.parameters.scale
-        return self.noise_variance * self.factor * C * np.outer(scale, scale)
+        return self.noise_variance * self.linear.factor * C * np.outer(scale, scale)
 
     @cached_property
     def noise(self) -> Array:

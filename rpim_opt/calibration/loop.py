@@ -113,9 +113,6 @@ class WeightChoice:
             selection = Selection(float(selection), name, np.empty(0), np.empty(0), True)
         if not isinstance(selection, Selection):
             raise InputError(f"selector {name}", f"a {type(selection).__name__}", "a weight, or a Selection with one")
-        if not isinstance(selection.name, str):
-            accepted = "Selection(weight, name, weights, scores, interior, note)"
-            raise InputError(f"selector {name}", f"a Selection whose name is {type(selection.name).__name__}", accepted)
         weight = float(selection.weight)
         if not (np.isfinite(weight) and weight >= 0):
             raise InputError(f"selector {selection.name}", f"weight {weight}", "a number, zero or more")

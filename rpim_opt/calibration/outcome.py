@@ -324,8 +324,8 @@ class Outcome:
         return self.program.linear_penalty
 
     @cached_property
-    def squares(self) -> tuple[LinearModel, float]:
-        """The equations whose squares the fit amounts to, and the weight that the loss gives to them."""
+    def squares(self) -> LinearModel:
+        """The equations whose squares the fit amounts to, multiplied by a factor."""
         program = self.program
         source = in_parts(self.problem)
         if self._reweighed:
@@ -333,11 +333,8 @@ class Outcome:
         else:
             inliers = program.inliers(self.z)
         if inliers is None:
-            form = program.loss_form
-            return program.squared, 1.0 if form is None else form.size
-        if source.keeps_rows:
-            return inliers(program.model, self.z)[0], inliers.factor
-        return source.linearize(self.x, inliers), inliers.factor
+            return program.squared
+        return inliers(program.model, self.z)[0] if source.keeps_rows else source.linearize(self.x, inliers)
 
     @cached_property
     def spread(self) -> Spread:
@@ -347,13 +344,12 @@ class Outcome:
         """
         if not self.linear_penalty:
             raise self.no_covariance("`forward` and monte_carlo serve any")
-        linear, factor = self.squares
-        form = ridge(linear, self.program.penalty_form)
+        form = ridge(self.squares, self.program.penalty_form)
         moves = self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
         if moves is not None:  # conditional on the active constraints
-            form = ridge_within(linear, self.program.penalty_form, moves, self.z)
+            form = ridge_within(self.squares, self.program.penalty_form, moves, self.z)
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
-        return Spread(linear, form, self.penalty_weight, self.z, factor, level, drift)
+        return Spread(self.squares, form, self.penalty_weight, self.z, level, drift)
 
     def no_covariance(self, instead: str) -> InputError:
         """Return the error that says why there is no covariance, and what serves ``instead``."""
@@ -384,10 +380,10 @@ class Outcome:
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
         'Residuals agree with the stated measurement noise (ratio 1.02).'
         """
-        linear, factor = self.squares
+        linear = self.squares
         repeatability = self.problem.repeatability
         if repeatability is None:
-            squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / factor
+            squares = float(np.sum((linear.A @ self.z - linear.b) ** 2)) / linear.factor
             return noise_test(squares, self.spread.spare)
         bare = self.problem.with_repeatability(None)
         squares = float(sum(np.sum(part.whitened_errors(self.x)[0] ** 2) for part in bare.rows()))
@@ -453,7 +449,7 @@ class Outcome:
         p = problem.parameters
         width = (default_widths(p) / p.scale)[p.identified]
         try:
-            weight = self.penalty_weight / self.squares[1]
+            weight = self.penalty_weight / self.squares.factor
         except InputError:  # a loss with own variables has no quadratic model by which a row could be contradicted
             return flags
         sure = contradicted(model, self.program.penalty_form, weight, width, groups)

@@ -442,10 +442,10 @@ def bent_upwards(names: Sequence[str], x: Array, sd: Array, moves: Array) -> tup
 
 def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     """Say which joints turn against gravity: the mounting is another one, or a force is not gravity's."""
-    C = result.known_covariance
-    if C is None or measured_torques(problem.data):
+    free, x, C = problem.parameters.free, result.x, result.known_covariance
+    bends = any(name.startswith("compliance") for name in free.names)
+    if not bends or C is None or measured_torques(problem.data):
         return []
-    free, x = problem.parameters.free, result.x
     moves = np.linalg.norm(problem.linearize(x).A * (x / free.scale), axis=0)
     joints = bent_upwards(free.names, x, np.sqrt(np.diag(C)), moves)
     if not joints:

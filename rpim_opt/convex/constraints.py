@@ -126,9 +126,14 @@ class Box:
         """Return the CVXPY constraints."""
         lower, upper = self.bounds(parameters)
         fixed, low, high = (np.flatnonzero(side) for side in box_sides(lower, upper))
-        made = [z[fixed] == lower[fixed]] if len(fixed) else []  # CVXPY before 1.8 knows no empty expression
-        made += [z[low] >= lower[low]] if len(low) else []
-        return [*made, z[high] <= upper[high]] if len(high) else made
+        made = []  # CVXPY before 1.8 knows no empty expression
+        if len(fixed):
+            made.append(z[fixed] == lower[fixed])
+        if len(low):
+            made.append(z[low] >= lower[low])
+        if len(high):
+            made.append(z[high] <= upper[high])
+        return made
 
 
 def box_sides(lower: Array, upper: Array) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

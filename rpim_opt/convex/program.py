@@ -547,7 +547,7 @@ def _squared(model: LinearModel, form: Quadratic) -> LinearModel:
         A, b, group = A[counts], b[counts], group[counts]
     else:
         group = np.zeros(len(b), dtype=int)  # its rows mix configurations
-    return replace(model, A=A, b=b, group=group, offset=model.offset + form.constant)
+    return replace(model, A=A, b=b, group=group, offset=model.offset + form.constant, factor=form.size)
 
 
 def _sides(lower: Array, upper: Array) -> np.ndarray:

@@ -79,7 +79,7 @@ def kept_equations(model: LinearModel, keep: np.ndarray, factor: float) -> Linea
     if factor != 1:
         A *= np.sqrt(factor)
         b *= np.sqrt(factor)
-    return replace(model, A=A, b=b, group=model.group[keep])
+    return replace(model, A=A, b=b, group=model.group[keep], factor=factor)
 
 
 def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: Term | None = None) -> Inliers:

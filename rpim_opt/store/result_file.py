@@ -424,10 +424,9 @@ def _known(file: Stored, program: Program) -> dict[str, Any]:
         return known
     known |= {name: getattr(file, name) for name in ("active_bounds", "shadow_prices", "inliers")}
     if file.inliers is not None:
-        factor = file.inliers.factor**2
         keep = np.ones(len(program.model.b), dtype=bool)
         keep[file.inliers.left_out] = False
-        known["squares"] = kept_equations(program.model, keep, factor), factor
+        known["squares"] = kept_equations(program.model, keep, file.inliers.factor**2)
     return known
 
 

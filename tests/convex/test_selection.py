@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import cvxpy as cp
@@ -111,11 +112,13 @@ def test_fewer_configurations_than_folds_are_held_out_each(rule: Any) -> None:
     assert np.isfinite(chosen.score).all()
 
 
-def test_half_of_the_squares_have_half_of_the_weight() -> None:
+@pytest.mark.parametrize("loss", [cp.sum_squares, ro.huber(1.5)])
+def test_half_of_a_loss_has_half_of_the_weight(loss: Any) -> None:
+    """By the discrepancy principle, too, which compares with the declared noise."""
     problem = ro.load("position").problem
-    half = ro.Formulation("half", loss=lambda r: 0.5 * cp.sum_squares(r), penalty=cp.sum_squares)
+    half = ro.Formulation("half", loss=lambda r: 0.5 * loss(r), penalty=cp.sum_squares)
     linear = problem.linearize(np.zeros(len(problem.parameters.free)))
-    whole, halved = (ro.discrepancy(ro.convex.pose(each, linear)).weight for each in (ro.tikhonov, half))
+    whole, halved = (ro.discrepancy(ro.convex.pose(each, linear)).weight for each in (replace(half, loss=loss), half))
     assert halved == pytest.approx(0.5 * whole, rel=1e-6)
 
 

@@ -126,10 +126,9 @@ def discrepancy(program: Program) -> Selection:
 
     def score(weights: Array) -> Array:  # ln(rho / (tau^2 (m - dof)))
         rho, freedom = program.ridge.misfits(weights)
-        left = factor * DISCREPANCY**2 * np.maximum(program.squared.equations - freedom, 1e-9)
+        left = program.squared.factor * DISCREPANCY**2 * np.maximum(program.squared.equations - freedom, 1e-9)
         return np.log(np.maximum(rho, np.finfo(float).tiny) / left)
 
-    factor = 1.0 if program.loss_form is None else program.loss_form.size  # of |r|^2 in the loss
     note = f"residual norm {DISCREPANCY:g} times that of the declared noise"
     chosen = linear_rule(program, "discrepancy", score, note)
     fits = np.flatnonzero(chosen.score <= 0)

@@ -57,6 +57,11 @@ class Selection(Tabled):
     interior: bool
     note: str = ""
 
+    def __post_init__(self) -> None:
+        if not isinstance(self.name, str):  # arguments in another order
+            accepted = "a text, the second argument: Selection(weight, name, weights, score, interior, note)"
+            raise InputError("Selection, name", f"a {type(self.name).__name__}", accepted)
+
     def _short(self) -> str:
         where = "inside" if self.interior else "at an edge of"
         return f"{self.name}: weight {self.weight:.4g}, {where} {counted(len(self.weights), 'weight')}"
