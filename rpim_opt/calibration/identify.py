@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import counted, joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
-from rpim_opt.bayes.hyperparameters import Estimator
+from rpim_opt.bayes.hyperparameters import Estimator, Learned
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Statement
 from rpim_opt.calibration.certificate import DECREASE
@@ -25,6 +25,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.select import weight_of
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import require_affordable
 from rpim_opt.problem.problem import CalibrationProblem
@@ -146,16 +147,10 @@ def calibrate(
     if start is not None:
         start = require_start(start, len(problem.parameters.free))
     else:
-        found = find_mapping(problem)
-        if found is not None:
+        if (found := find_mapping(problem)) is not None:
             mapping, problem = found
-            # quarter turns are conventions, other zeros chance
-            own = np.flatnonzero((mapping.zero % (np.pi / 2) != 0) & (np.array(mapping.joint_types) == "revolute"))
-            wide = ((1 / ZERO,),)
-            zeros = [Statement((f"theta{i + 1}",), ("angle",), wide, (0.0,), whole=True) for i in own]
-            prior = (prior or Prior()) & Prior(statements=tuple(zeros))
-        elsewhere = relocated(problem)
-        if elsewhere is not None:
+            prior = (prior or Prior()) & _wide_zeros(mapping)
+        if (elsewhere := relocated(problem)) is not None:
             notes, problem = _displaced_frames(problem, elsewhere), elsewhere
     again: Callable[[Source], Calibration] = partial(
         calibrate,
@@ -166,26 +161,21 @@ def calibrate(
         noise=noise,
         **(vars(options) | {"progress": None}),
     )
-    unpenalized = weight is None and formulation.penalty is None
-    if unpenalized:
-        weight = 0.0
+    if weight is None and formulation.penalty is None:  # statements have standard deviations
+        weight = 1.0 if prior is not None and prior.statements else 0.0
     estimator = Estimator(prior or Prior(), kinds, nearby)
     learned = None
     excluded = None
     if weight is None:
-        found = estimate(problem, estimator, model, start)
-        if found.learned.left_out and isinstance(problem, CalibrationProblem):
-            labels = [row.label for row in found.learned.left_out]
-            excluded = problem.data.take(np.flatnonzero(np.isin(problem.labels, labels)))
-        problem, weight, start, learned = found.problem, 1.0, found.x, found.learned
-        formulation = found.stated.penalized(formulation)
+        estimated = estimate(problem, estimator, model, start)
+        excluded = _excluded(problem, estimated.learned)
+        problem, weight, start, learned = estimated.problem, 1.0, estimated.x, estimated.learned
+        formulation = estimated.stated.penalized(formulation)
     else:
         if model == "auto":
             problem = with_extensions(problem, estimate(problem, estimator, model, start))
         if prior is not None:
             formulation = prior.stated(problem.parameters, widened=False).penalized(formulation)
-            if unpenalized and formulation.penalty is not None:
-                weight = 1.0  # of statements, which have standard deviations
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
     notes += [mapping.sentence] if mapping else []
@@ -207,6 +197,20 @@ def calibrate(
         mapping=mapping,
         excluded=excluded,
     )
+
+
+def _wide_zeros(mapping: JointMapping) -> Prior:
+    """Return the prior of joint zeros that were estimated: quarter turns are conventions, all others chance."""
+    estimated = (mapping.zero % (np.pi / 2) != 0) & (np.array(mapping.joint_types) == "revolute")
+    names = [f"theta{i + 1}" for i in np.flatnonzero(estimated)]
+    return Prior(statements=tuple(Statement((name,), ("angle",), ((1 / ZERO,),), (0.0,), whole=True) for name in names))
+
+
+def _excluded(problem: Source, learned: Learned) -> Dataset | None:
+    """Return the rows in memory that were excluded as outliers."""
+    if not learned.left_out or not isinstance(problem, CalibrationProblem):
+        return None
+    return problem.data.take(np.flatnonzero(np.isin(problem.labels, [row.label for row in learned.left_out])))
 
 
 def ending(ended: Ended, most: int) -> str:
