@@ -263,36 +263,35 @@ class Newton:
     def non_smooth(self, z: Array, x: Array, warm_width: float, warm: bool) -> tuple[Array, float]:
         """Return the minimum (n,) of a non-smooth loss, and the width of smoothing at which it was found."""
         self.x = x
-        few = max(NEAR * self.rows.A.shape[1], 200)
+        if warm and warm_width:
+            exact = self._exact(z, warm_width)
+            if exact is not None:
+                return exact, warm_width
         v = np.abs(self.rows.entries(self._residual(z)))
         h = float(np.median(v)) / (NARROWER if warm else 1.0)
         floor = NARROWEST * max(float(np.mean(v)), TINY)
-        if warm and warm_width:
-            near = self._near(self.rows.entries(self._residual(z)), 3 * warm_width)
-            if 0 < len(near) <= few:
-                exact = self._exact(z, near, warm_width)
-                if exact is not None:
-                    return exact, warm_width
         while h > floor:
-            v = self.rows.entries(self._residual(z))
-            # what smoothing may add to the loss: to that of a norm everywhere
-            widened = h * np.count_nonzero(np.abs(v) < h) if self.rows.counts is None else np.sum(np.hypot(v, h) - v)
-            added = float(widened) * self.kink
-            before, z_before, x_before = self._value(z, self.x), z, self.x
-            size = max(abs(self._total(self._residual(z))), TINY)
+            r = self._residual(z)
+            total, added = self._total(r), self._added(self.rows.entries(r), h)
+            before, z_before, x_before = total + self._others(z, self.x), z, self.x
+            size = max(abs(total), TINY)
             z = self.smooth(z, self.x, h, max(SMOOTHED * added / size, DECREASE), 30)
             if self._value(z, self.x) > before + 2 * added + 1e-12 * abs(before):  # below what rounding lets pass
                 self.x = x_before
                 return z_before, h
-            near = self._near(self.rows.entries(self._residual(z)), 3 * h)
             if added <= self.accuracy * size:
                 return z, h
-            if len(near) <= few:
-                exact = self._exact(z, near, h)
-                if exact is not None:
-                    return exact, h
+            exact = self._exact(z, h)
+            if exact is not None:
+                return exact, h
             h /= NARROWER
         return z, h
+
+    def _added(self, v: Array, h: float) -> float:
+        """Return what smoothing with width h may add to the loss: to that of a norm everywhere."""
+        if self.rows.counts is None:
+            return self.kink * h * np.count_nonzero(np.abs(v) < h)
+        return self.kink * float(np.sum(np.hypot(v, h) - v))
 
     def _near(self, v: Array, h: float) -> np.ndarray:
         """Return the entries within h of a kink."""
@@ -302,13 +301,17 @@ class Newton:
         rise = self.loss.slope(v + h) - self.loss.slope(np.maximum(v - h, -1e-12))
         return np.flatnonzero((rise > 0.1 * self.kink) | (v < h))
 
-    def _exact(self, z: Array, near: np.ndarray, h: float) -> Array | None:
+    def _exact(self, z: Array, h: float) -> Array | None:
         """Return the minimum with rows near a kink as they are, the others by their model, until no other row bends."""
         at, T = self.canonical.at, self.rows.whitened[1]
+        near = self._near(self.rows.entries(self._residual(z)), 3 * h)
+        few = max(NEAR * self.rows.A.shape[1], 200)
+        if len(near) > few:
+            return None
         x, best = self.x, self.point
         value = self._value(z, x)
         for _ in range(8):
-            if len(near) > 2 * max(NEAR * self.rows.A.shape[1], 200):
+            if len(near) > 2 * few:
                 return None
             r = self._residual(z)
             gradient, H = self._model(r, 0.0, near)
