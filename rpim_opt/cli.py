@@ -19,6 +19,7 @@ from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer import Argument, Option
+from typer.core import TyperGroup
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
@@ -36,7 +37,44 @@ acceptance inconclusive.
 """
 
 
-app = typer.Typer(no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False, help=HELP)
+OTHERS = "rpim_opt.commands"  # entry points that are commands of other packages
+PLAIN: Any = {"rich_markup_mode": None, "pretty_exceptions_enable": False}
+
+
+class Commands(TyperGroup):
+    """Our commands, then those of other packages, which are loaded where they are asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands; of two with one name ours is meant."""
+        return list(dict.fromkeys([*super().list_commands(ctx), *sorted(entry_points(group=OTHERS).names)]))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of a name; one that cannot be loaded says so, and hides no other."""
+        others = () if cmd_name in self.commands else entry_points(group=OTHERS, name=cmd_name)
+        for each in others:
+            alone = typer.Typer(add_completion=False, **PLAIN)
+            try:
+                _add(alone, cmd_name, each.load())
+            except Exception as error:  # code of somebody else may raise anything
+                _add(alone, cmd_name, _failing(f"cannot be loaded: {str(error) or type(error).__name__}"))
+            self.commands[cmd_name] = typer.main.get_command(alone)
+        return super().get_command(ctx, cmd_name)
+
+
+def _add(to: typer.Typer, name: str, function: Callable[..., Any]) -> None:
+    """Add a command, which the list of commands shows with the whole first line of its docstring."""
+    to.command(name, short_help=(function.__doc__ or "").partition("\n\n")[0])(function)
+
+
+def _failing(text: str) -> Callable[[], None]:
+    def fail() -> None:
+        raise RpimError(f"The command {text}.")
+
+    fail.__doc__ = text
+    return fail
+
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, **PLAIN)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
@@ -56,9 +94,14 @@ def _version(asked: bool) -> None:
 
 @app.callback()
 def _common(
+    context: typer.Context,
     version: Annotated[bool, Option("--version", help="Print the version.", is_eager=True, callback=_version)] = False,
 ) -> None:
-    """Take what stands before a command."""
+    """Set Python and libraries up for a command that loads them, runs and ends."""
+    if context.invoked_subcommand not in LONG:
+        for name, value in LIBRARY_SETTINGS.items():
+            os.environ.setdefault(name, value)
+        gc.set_threshold(GARBAGE_THRESHOLD)
 
 
 def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
@@ -167,13 +210,15 @@ class Tables(NamedTuple):
 TABLES = Tables()
 CODES = {"accepted": 0, "rejected": 1, "inconclusive": 4}  # exit codes of an acceptance test
 FAILURES = {NoSolutionFound: 3, NotDelivered: 1}  # exit codes of errors; of any other one of ours 2
+PASSED = ("tables", "as_json")  # parameters of commands that are no options by themselves
 CODELESS = ("new", "iso9283", "study", "robots")  # commands that read no folder of a calibration, which may name code
 
 
 def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
     """Add a command: its answer is printed, as text or with --json as a document, and decides the exit code.
 
-    A parameter ``tables`` stands for the options of `Tables`; a command that runs a folder's code takes --allow-code.
+    A parameter ``tables`` stands for the options of `Tables`, ``as_json`` for --json; a command that runs a folder's
+    code takes --allow-code.
     """
     own = signature(function).parameters
     added: dict[str, tuple[Any, Any]] = {}
@@ -181,15 +226,15 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
         added = {name: (kind, Tables._field_defaults[name]) for name, kind in Tables.__annotations__.items()}
     if function.__name__ not in CODELESS:
         added["allow_code"] = Code, False
-    if "as_json" not in own:  # which some commands need while they run
-        added["as_json"] = Json, False
-    options = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in own.values() if each.annotation is not Tables]
+    added["as_json"] = Json, False
+    options = [each.replace(kind=Parameter.KEYWORD_ONLY) for each in own.values() if each.name not in PASSED]
     for name, (kind, default) in added.items():
         options.append(Parameter(name, Parameter.KEYWORD_ONLY, annotation=kind, default=default))
 
     @wraps(function)
-    def run(allow_code: bool = False, **values: Any) -> None:
-        as_json = values["as_json"] if "as_json" in own else values.pop("as_json")
+    def run(as_json: bool, allow_code: bool = False, **values: Any) -> None:
+        if "as_json" in own:
+            values["as_json"] = as_json
         if "tables" in own:
             values["tables"] = Tables(**{name: values.pop(name) for name in Tables._fields})
         answer = function(**values)
@@ -198,33 +243,8 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
             raise typer.Exit(answer.code)
 
     vars(run)["__signature__"] = signature(run).replace(parameters=options)
-    _add(function.__name__, run)
+    _add(app, function.__name__, run)
     return function
-
-
-def _add(name: str, function: Callable[..., Any]) -> None:
-    """Add a command, which the list of commands shows with the whole first line of its docstring."""
-    app.command(name, short_help=(function.__doc__ or "").partition("\n\n")[0])(function)
-
-
-def _add_others() -> None:
-    """Add the commands of other packages (entry points ``rpim_opt.commands``); ours go before one of the same name."""
-    for each in entry_points(group="rpim_opt.commands"):
-        if each.name in {own.name for own in app.registered_commands}:
-            continue
-        try:
-            function = each.load()
-        except Exception as error:  # code of somebody else may raise anything, and hides no other command
-            function = _failing(f"cannot be loaded: {str(error) or type(error).__name__}")
-        _add(each.name, function)
-
-
-def _failing(text: str) -> Callable[[], None]:
-    def fail() -> None:
-        raise RpimError(f"The command {text}.")
-
-    fail.__doc__ = text
-    return fail
 
 
 @command
@@ -243,7 +263,7 @@ def new(
     chain: Chain = "",
     dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
-    as_json: Json = False,
+    as_json: bool = False,
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
     with console.progress():
@@ -350,13 +370,13 @@ def report(
     With --data it has a section of their validation; verdict and acceptance stay those of the result.
     """
     with _loaded(result) as (loaded, say):
+        _require_data(register, data)
         new, notes = {}, ()
         if data:
             read = ro.use.read_measurements(loaded, data, measurement, tables.options)
             names = ", ".join(f"{file.name} (SHA-256 {sha256_of(file)[:12]})" for file in data)
-            new[names], notes = ro.use.validate(loaded, read.data, register), read.notes
-        elif register:
-            raise InputError("--register", "no --data", "new measurements to register")
+            new = {names: ro.use.validate(loaded, read.data, register)}
+            notes = read.notes
         say("writing the report")
         if out is None:
             folder = result if result.is_dir() else result.parent
@@ -413,6 +433,7 @@ def accept(
     with _loaded(result) as (loaded, say):
         from rpim_opt.calibration.held_out import registered
 
+        _require_data(register, data)
         left_out, notes, measured = (), (), None
         if data:
             read = ro.use.read_measurements(loaded, data, measurement, tables.options)
@@ -420,8 +441,6 @@ def accept(
             if register:
                 measured, motion = registered(loaded, measured)
                 notes = (*notes, f"Registered again: the measurements were {motion}.")
-        elif register:
-            raise InputError("--register", "no --data", "new measurements to register")
         say("searching for the maximum uncertainty")
         acceptance = ro.calibration.accept(loaded, console.required(limit, box, loaded.record.requirement), measured)
     return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], left_out=left_out, notes=notes)
@@ -639,7 +658,6 @@ def study(
     redraw: Annotated[bool, Option("--redraw", help="Only rewrite the report, from stored replicates.")] = False,
     gate: Annotated[bool, Option("--gate", help="Fail when a metric is worse than its baselines.json allows.")] = False,
     out: Annotated[File, Option(help="Folder for the results.")] = None,
-    as_json: Json = False,
 ) -> Answer:
     """Run a study: replicates in parallel, resumable, with provenance in the results.
 
@@ -647,15 +665,12 @@ def study(
     """
     from rpim_opt.study.studies import regressions, run_study
 
-    with progress_bar(name, not as_json) as say:
+    with progress_bar(name) as say:
         report, folder = run_study(name, quick, workers, resume, redraw, out, progress=say)
     worse = regressions(name, quick, report.metrics) if gate else []
     document = {"report": report.text, "metrics": report.metrics, "worse": worse}
-    answer = Answer(f"{report.text}\n", document, written=[folder])
-    if worse:
-        answer.show(as_json)
-        console.fail("\n".join(f"Worse: {line}" for line in worse), 1)
-    return answer
+    text = "\n".join([f"{report.text}\n", *(f"Worse: {line}" for line in worse)])
+    return Answer(text, document, int(bool(worse)), [folder])
 
 
 @command
@@ -673,7 +688,6 @@ def compare(
     workers: Workers = 1,
     resume: Resume = None,
     out: Annotated[File, Option(help="Folder for the summary, the replicates and the figure.")] = None,
-    as_json: Json = False,
 ) -> Answer:
     """Compare formulations, selectors and baselines on problems, in pairs, on held-out configurations.
 
@@ -686,7 +700,7 @@ def compare(
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),
         counts=numbers(counts) or None, noise=numbers(noise), seeds=seeds, metrics=words(metrics) or USUAL,
-        workers=workers, journal=journal, resume=resume, progress=not as_json,
+        workers=workers, journal=journal, resume=resume,
     )  # fmt: skip
     summary = comparison.summary(against=against)
     written: list[Path] = []
@@ -717,6 +731,11 @@ def _loaded(result: Path) -> Iterator[tuple["ro.calibration.Calibration", Callab
     with console.progress() as say:
         say("reading the result")
         yield ro.load_result(result), say
+
+
+def _require_data(register: bool, data: list[Path] | None) -> None:
+    if register and not data:
+        raise InputError("--register", "no --data", "new measurements to register")
 
 
 def _calibrated(
@@ -771,15 +790,9 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
 
 def main() -> None:
     """Run the command line; what a user can mend is one sentence, never a traceback."""
-    if not set(LONG).intersection(sys.argv[1:2]):
-        for name, value in LIBRARY_SETTINGS.items():
-            os.environ.setdefault(name, value)
-        gc.set_threshold(GARBAGE_THRESHOLD)
     atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
     with console.arriving():
         try:
-            if not {own.name for own in app.registered_commands}.intersection(sys.argv[1:2]):
-                _add_others()
             code = app(standalone_mode=False)
             if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word
                 console.fail("Interrupted.", INTERRUPTED)

@@ -25,8 +25,11 @@ GROSS = 6.0  # factor on the median distance from which on a row does not count 
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
-def compared(result: Calibration, data: Dataset) -> HeldOut:
-    """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals."""
+def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
+    """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
+
+    The coverage is that of the rows that are ``counted`` (N,), by default all.
+    """
     N = len(data)
     sigmas, allowed = np.full((2, N), np.nan)
     errors = result.nominal_errors(data), result.errors(data)
@@ -34,6 +37,7 @@ def compared(result: Calibration, data: Dataset) -> HeldOut:
     C = result.known_covariance
     if C is None:
         return held
+    counted = np.ones(N, dtype=bool) if counted is None else counted
     inside: list[np.ndarray] = []
     problem = result.problem.on(data)
     parts = by_block(problem, np.column_stack(problem.slopes(result.x)))
@@ -53,7 +57,7 @@ def compared(result: Calibration, data: Dataset) -> HeldOut:
         lengths = np.array([d in ("length", "pixel") for d in block.measurement.components.values()])
         factor = coverage_factor(freedom, CONFIDENCE)[:, None]
         within = np.abs(r) <= factor * np.sqrt(np.einsum("nkk->nk", S))
-        inside.append(within[predicted][:, lengths].ravel())
+        inside.append(within[predicted & counted[block.row]][:, lengths].ravel())
     covered = np.concatenate(inside)
     return replace(held, coverage=float(covered.mean()) if len(covered) else None)
 
@@ -147,17 +151,15 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     whole = Dataset.together([original.data, apart], ["identification", "validation"])
     refitted = result.calibrate_again(original.on(whole))
     labels = whole.label[len(original.data) :]
-    kept = np.flatnonzero(np.isin(labels, refitted.problem.labels))
-    held = replace(compared(result, apart), label=labels, coverage=compared(result, apart.take(kept)).coverage)
+    held = replace(compared(result, apart, np.isin(labels, refitted.problem.labels)), label=labels)
     record = replace(result.record, validation=None, held_out=held)
     if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)
         refitted = replace(refitted, learned=replace(refitted.learned, left_out=left_out))
     excluded = [rows for rows in (result.excluded, refitted.excluded) if rows is not None]
     if excluded:
-        refitted = replace(
-            refitted, excluded=Dataset.together(excluded, ["identification", "all rows"][: len(excluded)])
-        )
+        named = ["identification", "all rows"][: len(excluded)]
+        refitted = replace(refitted, excluded=Dataset.together(excluded, named))
     return replace(refitted, record=record)
 
 

@@ -102,9 +102,6 @@ class Outcome:
     excluded: Dataset | None = None
     known: Mapping[str, Any] = field(default_factory=dict)
 
-    def __post_init__(self) -> None:
-        vars(self).update(self.known)  # where `cached_property` looks before it computes
-
     @property
     def z(self) -> Array:
         """The deviations (n,) in units of their scales."""
@@ -326,6 +323,8 @@ class Outcome:
     @cached_property
     def squares(self) -> LinearModel:
         """The equations whose squares the fit amounts to, multiplied by a factor."""
+        if "squares" in self.known:
+            return self.known["squares"]
         program = self.program
         source = in_parts(self.problem)
         if self._reweighed:
@@ -351,20 +350,25 @@ class Outcome:
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
         return Spread(self.squares, form, self.penalty_weight, self.z, level, drift)
 
+    @property
+    def _undefined(self) -> str:
+        """The reason why there is no covariance; empty where there is one."""
+        of = f"of formulation '{self.formulation.name}'"
+        if not self.linear_penalty:
+            return f"the penalty {of} is no square; only that of a normal prior has a posterior covariance"
+        if self.known_covariance is None:
+            return f"the loss {of} rests on a few equations and has no quadratic model"
+        return ""
+
     def no_covariance(self, instead: str) -> InputError:
         """Return the error that says why there is no covariance, and what serves ``instead``."""
-        found = self.no_intervals.partition(": ")[2].rstrip(".")
-        return InputError("uncertainty", found, f"a squared penalty or none, and a loss with a gradient; {instead}")
+        accepted = f"a squared penalty or none, and a loss with a gradient; {instead}"
+        return InputError("uncertainty", self._undefined, accepted)
 
     @property
     def no_intervals(self) -> str:
         """Return a sentence on why there are no intervals; empty where there are."""
-        if self.linear_penalty and self.known_covariance is not None:
-            return ""
-        what, why = "loss", "rests on a few equations and has no quadratic model"
-        if not self.linear_penalty:
-            what, why = "penalty", "is no square; only that of a normal prior has a posterior covariance"
-        return f"No uncertainties and prediction intervals: the {what} of formulation '{self.formulation.name}' {why}."
+        return f"No uncertainties and prediction intervals: {self._undefined}." if self._undefined else ""
 
     @property
     def variance_factor(self) -> float:
@@ -494,6 +498,8 @@ class Outcome:
         the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong data, or a
         drawing that does not describe this robot.
         """
+        if "active_bounds" in self.known:
+            return self.known["active_bounds"]
         program, z = self.program, self.z
         if program.box is None or not program.formulation.constraints:
             return ()
@@ -514,6 +520,8 @@ class Outcome:
     @cached_property
     def shadow_prices(self) -> tuple[ShadowPrice, ...]:
         """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none."""
+        if "shadow_prices" in self.known:
+            return self.known["shadow_prices"]
         program, z = self.program, self.z
         constraints, parameters = program.formulation.constraints, program.model.parameters
         texts = [(i, parsed) for i, parsed in enumerate(constraints) if isinstance(parsed, Parsed)]

@@ -53,8 +53,8 @@ class Calibration(Outcome):
     excluded
         The rows that were excluded as outliers; None without any, of data in blocks and of a result that was read.
     known
-        Values of properties by their names, which then do not compute them: of a result that was read from a file its
-        causes, and what a script's functions gave, which a file cannot hold.
+        Values of ``causes``, ``active_bounds``, ``shadow_prices`` and ``squares``, which then are not computed: of a
+        result that was read from a file its causes, and what a script's functions gave, which a file cannot hold.
 
     Examples
     --------
@@ -77,6 +77,8 @@ class Calibration(Outcome):
     @cached_property
     def causes(self) -> tuple[str, ...]:
         """Likely causes of a poor fit, one sentence each (`likely_causes`)."""
+        if "causes" in self.known:
+            return self.known["causes"]
         return tuple(likely_causes(self))
 
     def weight_sentence(self) -> str:

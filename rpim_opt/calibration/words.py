@@ -97,13 +97,13 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
             errors = f"Identification error (mean): {means}."
             break
     reasons = [text for text in verdict.reasons if text != result.message]
-    lines = [*turned_frames(result), errors, *reasons, *weight_lines(result), *noise_sentence(result)]
+    lines = [*turned_frames(result), errors, *reasons, *weight_lines(result), noise_sentence(result)]
     return [*lines, *remarks(result)]
 
 
-def noise_sentence(result: Outcome) -> list[str]:
+def noise_sentence(result: Outcome) -> str:
     """Return the noise test as a sentence, or why there is none."""
-    return [result.no_intervals or result.noise_test().verdict]
+    return result.no_intervals or result.noise_test().verdict
 
 
 def weight_lines(result: Outcome) -> list[str]:

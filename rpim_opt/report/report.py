@@ -8,7 +8,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -36,7 +35,7 @@ from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
 from rpim_opt.store.result_file import definition
 from rpim_opt.store.statements import FIELDS
-from rpim_opt.use.validation import COLUMNS, Validation
+from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
 FEW_NUMBERS = 8  # longer arguments of a penalty or constraint are said by their length: an earlier result is a matrix
@@ -48,7 +47,7 @@ def write_report(
     calibration: Calibration,
     path: str | Path,
     validation: Dataset | None = None,
-    new: Mapping[str, Validation] = MappingProxyType({}),
+    new: Mapping[str, Validation] | None = None,
 ) -> None:
     """Write a calibration report: one HTML file that needs no network, written whole or not at all.
 
@@ -78,8 +77,9 @@ class Content(NamedTuple):
     new: Mapping[str, Validation]
 
 
-def page(result: Calibration, new: Mapping[str, Validation] = MappingProxyType({})) -> str:
+def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> str:
     """Return the report as HTML."""
+    new = new or {}
     heading = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     lacking = judged(result)
     composition = [] if lacking is None else lacking.sentences()
@@ -91,8 +91,7 @@ def page(result: Calibration, new: Mapping[str, Validation] = MappingProxyType({
     workspace = measured_workspace(result) if accepted is None else accepted.workspace
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
-    failed = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure]
-    warnings = [*failed, *warnings]
+    warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
     content = Content(result, accepted, workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
@@ -158,12 +157,13 @@ def _accuracy(content: Content) -> Iterator[Block]:
     if record.held_out is not None:
         used = "Errors of held-out rows are those of a fit without them; the delivered parameters use all rows."
     notes = [summary.nominal_note(result), used]
-    covered = record.held_out and record.held_out.coverage
-    if record.held_out is None and record.validation is not None:
-        covered = compared(result, record.validation).coverage
-    if covered is not None and content.accepted is None:  # whose section says it
-        share = percent(round(covered, 2))
-        notes.append(f"{share} of the held-out coordinates lie in their 95 % prediction intervals.")
+    if content.accepted is None:  # otherwise its section says it
+        held = record.held_out
+        if held is None and record.validation is not None:
+            held = compared(result, record.validation)
+        if held is not None and held.coverage is not None:
+            share = percent(round(held.coverage, 2))
+            notes.append(f"{share} of the held-out coordinates lie in their 95 % prediction intervals.")
     yield "text", notes
     head = ["data, model", *summary.COLUMNS]
     rows = [row for row in summary.error_rows(result) if row["count"]]
@@ -185,9 +185,8 @@ def _accuracy(content: Content) -> Iterator[Block]:
 
 def _new_measurements(content: Content) -> Iterator[Block]:
     for name, validation in content.new.items():
-        yield "table", Table(name, COLUMNS, validation.figures())
-        if validation.touched:
-            yield "table", Table(words.HEADER[0], words.HEADER, words.touch_rows(validation.touched))
+        for head, rows in validation.tables():
+            yield "table", Table(name, head, rows)
         yield "text", validation.sentences()
 
 
@@ -328,7 +327,7 @@ def _diagnostics(content: Content) -> Iterator[Block]:
 
 
 def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
-    yield "text", [*words.noise_sentence(result), *composition]
+    yield "text", [words.noise_sentence(result), *composition]
     rows = []
     what = ""
     if len(summary.sets(result)) > 1:

@@ -199,7 +199,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         *([] if uncertainty is None else [f"{uncertainty.summary}; region: {uncertainty.requirement.where}."]),
         *words.weight_lines(result),
         identifiability(result),
-        *words.noise_sentence(result),
+        words.noise_sentence(result),
         *words.turned_frames(result),
         nominal_note(result),
         *warnings(result),

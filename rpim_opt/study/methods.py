@@ -16,6 +16,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
+from rpim_opt.calibration.held_out import compared
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of, tikhonov
 from rpim_opt.convex.program import Program
@@ -28,7 +29,6 @@ from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.store.instances import Instance, load
 from rpim_opt.store.problem_file import find_problem
 from rpim_opt.study.studies import Row
-from rpim_opt.use.validation import validate
 
 ACCEPTED = "a folder, a name, ro.load(...), a problem, or a function of a seed that returns one"
 RETURNS = "an instance, a simulated arm, a problem, or a pair of a problem and validation data"
@@ -344,7 +344,9 @@ def _statistic(name: str, fitted: Fitted) -> float | None:
 
 
 def _coverage(fitted: Fitted) -> float | None:
-    share = None if fitted.result is None else validate(fitted.result, fitted.held_out).coverage
+    if fitted.result is None:
+        return None
+    share = compared(fitted.result, fitted.held_out).coverage
     return None if share is None else 100 * share
 
 

@@ -20,8 +20,6 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import shared_rows
 
-COLUMNS = ["error [mm]", "rows", "mean", "RMS", "max"]
-
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Validation(HeldOut):
@@ -86,8 +84,8 @@ class Validation(HeldOut):
         """Return the rows as CSV."""
         return columns_csv(self._rows())
 
-    def figures(self) -> list[list[str]]:
-        """Return the rows of the table of errors as text, under `COLUMNS`."""
+    def tables(self) -> list[tuple[list[str], list[list[str]]]]:
+        """Return head and rows of the table of errors as text, and of that of touches where there are any."""
         content = self.content()
         figures = {"nominal": content["nominal"], "identified": content["identified"]}
         for axis, of_axis in content["axes"].items():
@@ -98,7 +96,8 @@ class Validation(HeldOut):
         for name, of in figures.items():
             unit = "mm" if "mean_mm" in of else "mrad"
             rows.append([name, str(of["count"]), *(f"{of[f'{key}_{unit}']:.4f}" for key in ("mean", "rms", "max"))])
-        return rows
+        errors = ["error [mm]", "rows", "mean", "RMS", "max"], rows
+        return [errors, (HEADER, touch_rows(self.touched))] if self.touched else [errors]
 
     def sentences(self) -> list[str]:
         """Return the largest error, the rows outside their intervals, and what a reader of the errors has to know."""
@@ -122,8 +121,7 @@ class Validation(HeldOut):
         return [sentence for sentence in every if sentence]
 
     def __str__(self) -> str:
-        touches = [table(HEADER, touch_rows(self.touched))] if self.touched else []
-        return "\n".join([table(COLUMNS, self.figures()), *touches, *self.sentences()])
+        return "\n".join([*(table(head, rows) for head, rows in self.tables()), *self.sentences()])
 
     def _rows(self) -> dict[str, Sequence[Any]]:
         columns = {"nominal_mm": 1e3 * self.nominal, "error_mm": 1e3 * self.error}

@@ -154,7 +154,7 @@ def test_the_command(toy, tmp_path, monkeypatch, capsys) -> None:
     assert "4 numbers" in capsys.readouterr().out
     (folder / "baselines.json").write_text(json.dumps({"toy-quick": {"mean": 1e-9}}))
     assert run(monkeypatch, "study", "toy", "--quick", "--gate", "--out", str(tmp_path / "out")) == 1
-    assert "Worse: mean: found" in capsys.readouterr().err
+    assert "Worse: mean: found" in capsys.readouterr().out
     assert run(monkeypatch, "study", "tay") == 2
     assert "did you mean toy?" in capsys.readouterr().err
     (folder / "broken.py").write_text("QUESTION = 1\n")
