@@ -258,26 +258,37 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
     lines = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, lines))
-    units: list[str] = []
-    bare = [cell.strip("[]()") for cell in lines[-1]]
-    if len(lines) > 1 and any(bare) and all(cell.lower() in UNIT_SIGNS for cell in filter(None, bare)):
-        units = ["" if cell in ("-", "1") else cell for cell in bare]
-        lines = lines[:-1]
+    units = _units_alone(lines[-1]) if len(lines) > 1 else []
+    if units:
+        lines.pop()
     lacking = [""] * (width - len(units))
     units = lacking + units if grid.blanks else units + lacking  # a blank cell of the label cannot be seen
     *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
-    groups = [""] * width
     downwards = [  # merged downwards: the name stands higher up
         not name and any(row[i] and row[i + 1 : i + 2] != [""] for row in grouping) for i, name in enumerate(names)
     ]
-    for row in grouping:
-        group = ""  # merged with what is right of it
-        for i, cell in enumerate(row):
-            if downwards[i]:
-                names[i] = cell or names[i]
-            group = "" if downwards[i] else cell or group
-            groups[i] = f"{groups[i]} {group}".strip()
-    return [(_with_unit(name, unit), group) for name, unit, group in zip(names, units, groups, strict=True)], above
+    higher = [next(filter(None, cells), "") for cells in zip(*reversed(grouping), names, strict=True)]
+    names = [top if alone else name for top, name, alone in zip(higher, names, downwards, strict=True)]
+    groups = [_merged(row, downwards) for row in grouping]
+    heads = zip(names, units, *groups, strict=True)
+    return [(_with_unit(name, unit), " ".join(filter(None, above_it))) for name, unit, *above_it in heads], above
+
+
+def _units_alone(line: Sequence[str]) -> list[str]:
+    """Return the units in a line of the header that has nothing else; of other lines nothing."""
+    bare = [cell.strip("[]()") for cell in line]
+    signs = {cell.lower() for cell in bare} - {""}
+    return ["" if cell in ("-", "1") else cell for cell in bare] if signs and signs <= UNIT_SIGNS else []
+
+
+def _merged(row: Sequence[str], downwards: Sequence[bool]) -> list[str]:
+    """Return the groups of a line of the header: a cell also counts for blank ones to its right."""
+    group = ""
+    groups = []
+    for cell, alone in zip(row, downwards, strict=True):
+        group = "" if alone else cell or group
+        groups.append(group)
+    return groups
 
 
 def _with_unit(name: str, unit: str) -> str:
@@ -451,36 +462,35 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 def _one_row_each(table: RawTable) -> RawTable:
     """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint with a row a point; others as is."""
-    named = {name: {str(cell).strip().lower() for cell in cells} for name, cells in table.columns.items()}
-    axis = next(
-        (name for name, some in named.items() if len(some) < 10 and PARTS.fullmatch(" ".join(sorted(some)))), ""
-    )
+    axis = next((name for name, cells in table.columns.items() if _names_parts(cells)), "")
     if not axis:
         return table
-    letters = [str(cell).strip().lower() for cell in table.columns[axis]]
-    parts = sorted(named[axis])
-    texts = {
-        name: _without_letters([str(cell).strip() for cell in cells], letters)
-        for name, cells in table.columns.items()
-        if name != axis
-    }
+    texts = {name: [str(cell).strip() for cell in cells] for name, cells in table.columns.items()}
+    letters = [cell.lower() for cell in texts.pop(axis)]
+    parts = sorted(set(letters))
+    texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
         accepted = f"a column naming the point; {', '.join(parts)} once each"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
-    columns: dict[str, Sequence[Any]] = {}
-    for name, cells in texts.items():
-        own = [{cells[i] for i in rows.values()} for rows in points]
-        if all(len(each) == 1 for each in own):
-            columns[name] = [each.pop() for each in own]
+    of_points = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
+    columns = {name: [min(own) for own in each] for name, each in of_points.items() if max(map(len, each)) == 1}
     value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
-    units = {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
-    unit = split(value)[1] or (units.pop() if len(units) == 1 else "")
-    for letter in parts:
-        cells = [texts[value][rows[letter]] if letter in rows else "" for rows in points]
-        columns[_with_unit(letter, unit)] = cells
+    units = {split(value)[1]} - {""}
+    units = units or {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
+    unit = units.pop() if len(units) == 1 else ""
+    for part in parts:
+        columns[_with_unit(part, unit)] = [texts[value][rows[part]] if part in rows else "" for rows in points]
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))
+
+
+def _names_parts(cells: Sequence[Any]) -> bool:
+    """Return whether cells name x, y, z or the joints, and nothing else."""
+    if len(set(map(str, cells[:10]))) == 10:  # a column of numbers
+        return False
+    names = sorted({str(cell).strip().lower() for cell in cells})
+    return PARTS.fullmatch(" ".join(names)) is not None
 
 
 def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:

@@ -22,7 +22,7 @@ from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.misreadings import BETTER, WRONG, better_reading, coupling, signs
 from rpim_opt.problem.noise import UNITS, Equations
-from rpim_opt.problem.problem import CalibrationProblem, near_parallel
+from rpim_opt.problem.problem import SHIFTED, CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.points import Fit, Points, fit_points, lengths_of, misfit, points_of
@@ -46,7 +46,6 @@ LINEAR, EXACT = 13, 1e-5
 """Coefficients of a coordinate by position and rotation of the flange, and what no measurement comes up to [m]."""
 BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
-NO_POSITIONS = 0.1  # spread of positions over that of the nominal flange below which they are another quantity
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
 ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their last decimal
 NARROWER, GRID = 0.25, 61
@@ -65,7 +64,7 @@ OUTLYING, OUTLYING_ROUNDS = 10, 3
 TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
-CERTAIN = 5.0  # standard deviations by which residuals of successive rows are correlated
+COURSES = 6  # half waves that a slow motion has over all rows at most
 PLACES, SPANS = 40, 12
 """Rows from which on something may have moved, and those between which it may have moved and moved back."""
 MOST_EQUATIONS = 3000  # equations up to which a change is looked for
@@ -553,14 +552,11 @@ def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
     if points is None or error <= UNRELATED * spread:
         return
     flange = float(np.sqrt(np.sum(np.var(forward_kinematics(points.robot, points.q)[:, :3, 3], axis=0))))
-    what = (
-        f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, their "
-        f"spread is {three_digits(1e3 * spread)} mm"
+    yield (
+        f"joint values hardly explain the measured positions (residual RMS {three_digits(1e3 * error)} mm, spread "
+        f"{three_digits(1e3 * spread)} mm, that of the nominal flange {three_digits(1e3 * flange)} mm): do the rows of "
+        "the two tables match? Join them by a common column, or by time. Or are these deviations, or another quantity?"
     )
-    if spread < NO_POSITIONS * flange:
-        yield f"{what}, that of the flange {three_digits(1e3 * flange)} mm): are they deviations, or another quantity?"
-    else:
-        yield f"{what}): do the rows of the two tables match? Join them by a common column, or by time."
 
 
 def odd_column(problem: CalibrationProblem) -> Iterator[str]:
@@ -573,9 +569,6 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
     if points is None or len(points.row) < 2 * FEWEST:
         return
     points = replace(points, turns=None)
-    if points.y.min() >= 0:
-        yield "no value of column x, y and z is negative: were signs lost?"
-        return
     whole = misfit(points)
     turning = [i for i, kind in enumerate(points.robot.joint_types) if kind == "revolute"]
     fitted = {f"joint {i + 1}": replace(points, q=_values_that_fit(points, i)) for i in turning}
@@ -587,6 +580,8 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
     left = {column: misfit(each) for column, each in fitted.items()}
     column = min(left, key=left.__getitem__)
     if left[column] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
+        if points.y.min() >= 0:
+            yield "no value of column x, y and z is negative: were signs lost?"
         return
     best = fitted[column]
     apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
@@ -594,9 +589,7 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
     odd = [problem.data.label[row] for row in points.row[apart]]
     what = f"{_rows(odd, 'has', 'have')} wrong values of {column}"
     if len(odd) > len(apart) / 2:
-        what = (
-            f"the values of {column} explain nothing (sorted, copied, shuffled or scaled alone, or another quantity?)"
-        )
+        what = f"the values of {column} explain nothing (sorted, copied, shuffled, without signs, another quantity?)"
     yield (
         f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[column] * points.extent)} mm instead "
         f"of {three_digits(1e3 * whole * points.extent)} mm; check its column."
@@ -830,25 +823,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     elif kinds is not None or transmission:
         most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
-        yield from first(two_positions(problem, x, most), said, _drifting(problem, model, x))
-
-
-def _drifting(problem: CalibrationProblem, model: LinearModel, x: Array) -> Iterator[str]:
-    """Report residuals at x (n,) that change slowly from row to row, where the joint values do not: a drift."""
-    q, N = problem.joint_values, len(problem.data)
-    if N < 2 * FEWEST or np.ptp(np.bincount(problem.owners, minlength=N)):
-        return
-    q = q[:, np.ptp(q, axis=0) > 0]
-    steps = np.diff(q, axis=0).var(axis=0) / (2 * q.var(axis=0))  # of every joint; one in rows of random order
-    r = model.b - model.A @ (x / model.parameters.scale)
-    r = r[np.argsort(problem.owners, kind="stable")].reshape(N, -1)
-    alike = float(np.sum(r[1:] * r[:-1]) / max(np.sum(r**2), 1e-300))
-    if steps.min(initial=1.0) > JUMPING and alike > max(MOVED, CERTAIN / np.sqrt(r.size)):
-        yield (
-            f"residuals change slowly from row to row (correlation {alike:.2f} with the next row), though the joint "
-            "values do not: instrument, base or temperature drift; measure reference points between the rows, or all "
-            "in a shorter time."
-        )
+        yield from first(two_positions(problem, x, most), said)
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
@@ -878,10 +853,21 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     free = whole.parameters.free
     nominal = whole.parameters.nominal[whole.parameters.identified]
     of_arm = (np.array(free.dimensions) == "length") & ~free.of_frames
-    grown = A @ np.where(of_arm, nominal / free.scale, 0.0) * problem.owners / max(len(problem.data) - 1, 1)
-    remedy = "did it warm up? Measure it warm, or in random order, or state temperature_C of every row (expansion)"
+    elapsed = problem.owners / max(len(problem.data) - 1, 1)
+    grown = A @ np.where(of_arm, nominal / free.scale, 0.0) * elapsed
+    warm = "did it warm up? Measure it warm, or in random order, or state temperature_C of every row (expansion)"
     what = "the arm grows from row to row, by {} from the first to the last"
-    yield Addition(grown[:, None], lambda c: (what.format(f"{100 * c[0]:.2g} %"), remedy), SMALL)
+    yield Addition(grown[:, None], lambda c: (what.format(f"{100 * c[0]:.2g} %"), warm), SMALL)
+    base = np.flatnonzero(np.isin(free.names, SHIFTED))
+    q = problem.joint_values[:, np.ptp(problem.joint_values, axis=0) > 0]
+    if len(q) < 2 * FEWEST or not len(base):
+        return
+    steps = np.diff(q, axis=0).var(axis=0) / (2 * q.var(axis=0))  # of every joint; one in rows of random order
+    if steps.min(initial=1.0) > JUMPING:  # else model errors follow the rows as well
+        courses = np.cos(np.pi * np.outer(elapsed, range(1, COURSES + 1)))
+        slow = "the instrument or the base drifted slowly, though the joint values are in no order"
+        remedy = "temperature? Measure reference points between the rows, or all in a shorter time"
+        yield Addition((A[:, base, None] * courses[:, None]).reshape(len(A), -1), lambda c: (slow, remedy))
 
 
 def _changes(

@@ -19,7 +19,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import shared_bases
-from rpim_opt.robot.parameters import concatenated, frame_of, known_patterns, of_session, session_prefix
+from rpim_opt.robot.parameters import Parameters, concatenated, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
 MOST_PARAMETERS = 2000  # parameters up to which sessions are identified
@@ -100,28 +100,30 @@ def _common(
     for pattern in chain.from_iterable(patterns.values()):
         if not any(fits(name, pattern) for name in several):
             raise InputError("together, shared", f"'{pattern}'", known_patterns(several, pattern) + ", of several")
-    having: dict[str, list[str]] = {}
-    for key, part in parts.items():
-        for name in part.parameters.names:
-            if count[name] > 1 and any(fits(name, pattern) for pattern in patterns.get(key, ())):
-                having.setdefault(name, []).append(key)
-    for name, (first, *others) in having.items():
-        one = parts[first].parameters
-        i = one.names.index(name)
-        for key in others:
-            p = parts[key].parameters
-            k = p.names.index(name)
-            for what in ("dimensions", "scale", "tolerance", "identified"):
-                mine = getattr(one, what)[i]
-                theirs = getattr(p, what)[k]
-                if mine != theirs:
-                    found = f"{what.removesuffix('s')} {mine} in '{first}' and {theirs} in '{key}'"
-                    raise InputError(f"together, shared '{name}'", found, "the same in all")
-            apart = abs(one.nominal[i] - p.nominal[k])
-            if apart > FAR * one.scale[i]:
-                found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} scales"
-                raise InputError(f"together, shared '{name}'", found, "one nominal value in all")
-    return {key: {name for name, keys in having.items() if key in keys and len(keys) > 1} for key in parts}
+    common: dict[str, set[str]] = {key: set() for key in parts}
+    for name in several:
+        wanting = [key for key in parts if any(fits(name, pattern) for pattern in patterns.get(key, ()))]
+        having = [key for key in wanting if name in parts[key].parameters.names]
+        for key in having[1:]:
+            _require_alike(name, having[0], parts[having[0]].parameters, key, parts[key].parameters)
+            common[having[0]].add(name)
+            common[key].add(name)
+    return common
+
+
+def _require_alike(name: str, first: str, p: Parameters, second: str, other: Parameters) -> None:
+    """Refuse a shared parameter that two problems state differently."""
+    i, k = p.names.index(name), other.names.index(name)
+    where = f"together, shared '{name}'"
+    for what in ("dimensions", "scale", "tolerance", "identified"):
+        mine, theirs = getattr(p, what)[i], getattr(other, what)[k]
+        if mine != theirs:
+            found = f"{what.removesuffix('s')} {mine} in '{first}' and {theirs} in '{second}'"
+            raise InputError(where, found, "the same in all")
+    apart = abs(p.nominal[i] - other.nominal[k])
+    if apart > FAR * p.scale[i]:
+        found = f"nominal values {apart:g} apart in '{first}' and '{second}', more than {FAR:g} scales"
+        raise InputError(where, found, "one nominal value in all")
 
 
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:

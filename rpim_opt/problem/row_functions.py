@@ -198,8 +198,8 @@ class Loads(NamedTuple):
 
     def symbols(self, dof: int, points: int) -> RowSymbols:
         """Return the symbols of a row of some points."""
-        sizes = {name: dof * points if name in PER_JOINT else 1 for name in ("q", *self.stated)}
-        return {name: ca.SX.sym(name, size) for name, size in sizes.items()}
+        counts = {name: dof * points if name in PER_JOINT else 1 for name in ("q", *self.stated)}
+        return {name: ca.SX.sym(name, count) for name, count in counts.items()}
 
     def configuration(
         self, joint_types: Sequence[str], nominal: Callable[[str], Symbol], stated: RowSymbols, point: int = 0

@@ -307,7 +307,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "deviations": (deviations, "deviations, or another quantity"),
     "the floor heaves": (
         values(lambda y: y + 1e-3 * np.outer(np.sin(np.arange(COUNT) / 3.5), [0, 0, 1])),
-        "residuals change slowly from row to row",
+        "the instrument or the base drifted slowly",
     ),
     "joint 2 creeps": (
         of_joint(1, lambda q: q + 8e-3 * np.linspace(-0.5, 0.5, COUNT)),
@@ -315,7 +315,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     ),
     "the instrument sinks": (
         values(lambda y: y + np.array([0, 0, 2e-3]) * np.linspace(0, 1, COUNT)[:, None] ** 2),
-        "more and more from row to row",
+        "the instrument or the base drifted slowly",
     ),
     "joint 3 with backlash": (
         of_joint(2, lambda q: q + 3.5e-3 * np.random.default_rng(4).choice([-1, 1], COUNT)),

@@ -95,7 +95,7 @@ def test_copied_values_limits_and_coverage() -> None:
 
 def test_columns_without_a_negative_value_are_named() -> None:
     assert list(odd_column(changed("position"))) == []
-    assert list(odd_column(changed("position", y=np.abs))) == [
+    assert list(odd_column(changed("position", y=lambda y: np.abs(y - y.mean(axis=0))))) == [
         "no value of column x, y and z is negative: were signs lost?"
     ]
 

@@ -158,6 +158,8 @@ def test_turns_in_another_convention_are_asked_for_and_what_they_are_is_printed(
         (text([["Axis", *HEAD[1:7], "Value [mm]"]], [["XYZ"[i % 3], *ROWS[0][1:7], "1"] for i in range(9)]), {},
          "a column naming the point"),
         (text([["// export", "units: mm"]], ROWS), {}, "no header above 'P1, "),
+        (text([HEAD], [["P1", *["1 mm"] * 9]] * 3), {"columns": "a,b", "separator": "semicolon"}, "none of numbers"),
+        (text([["a", "b"]], [["P1", "1.5"]] * 3), {"columns": "a,b"}, "no known column (a, b)"),
         (text([["Point", *HEAD[1:]]], ROWS), {"rotation": "intrinsic xxy"}, "'extrinsic xyz', 'intrinsic zyx'"),
     ],
 )  # fmt: skip

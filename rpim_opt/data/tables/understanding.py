@@ -391,40 +391,48 @@ def _under_our_names(
     """
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
-    unitless: dict[str, str] = {}
-    turned = {each.stem for each in read.values()} & {"qw", "rx", "r11"}
+    stems: dict[str, Sequence[str]] = {**dict.fromkeys(text_columns(kind), ()), **known}
+    dimensions = {stem: list(filter(None, each)) for stem, each in stems.items()}
+    if not {each.stem for each in read.values()} & {"qw", "rx", "r11"}:  # an uncertainty of all axes is one of lengths
+        dimensions |= {stem: ["length"] for stem, each in dimensions.items() if len(each) > 1}
     for name, cells in table.items():
-        reading = read[name]
-        if reading.stem not in known and reading.stem not in text_columns(kind):
-            meant.append(Meant(name, "not used", "", "", reading.why or "not used by this measurement type"))
+        stem, _, reason, _ = read[name]
+        if stem not in dimensions:
+            meant.append(Meant(name, "not used", "", "", reason or "not used by this measurement type"))
             continue
-        dimensions = [dimension for dimension in known.get(reading.stem, []) if dimension]
-        if len(dimensions) > 1 and not turned:  # one uncertainty of all axes, where no orientation is there
-            dimensions = ["length"]
-        unit, why = _unit(name, reading, dimensions, units)
-        if unit and dimension_of(unit) not in dimensions:
-            accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units are in the row below the names"
-            raise InputError("the header", f"column '{name}' ({meaning(reading.stem)}) in {unit}", accepted)
-        if unit in FOREIGN:
-            ours, size = FOREIGN[unit]
-            cells = ["" if np.isnan(value) else repr(float(size * value)) for value in _values(cells, name)]
-            why += f"; {unit} is {size:g} {ours}"
-            unit = ours
-        if not unit and dimensions:
-            unitless[name] = dimensions[0]
-        new = f"{reading.stem}_{unit}" if unit else reading.stem
+        cells, unit, why = _in_our_unit(name, cells, read[name], dimensions[stem], units)
+        new = f"{stem}_{unit}" if unit else stem
         if new in columns:
             other = next(each.column for each in meant if each.name == new)
             accepted = f"one of them, such as --key '{name}'" if new == "label" else "one of them"
             raise InputError("the header", f"columns '{other}' and '{name}' for {new}", accepted)
         columns[new] = cells
-        words_of_column = kind.words.columns.get(reading.stem) or meaning(reading.stem)
-        meant.append(Meant(name, words_of_column, new, unit, f"{reading.why}; unit {why}" if why else reading.why))
+        words_of_column = kind.words.columns.get(stem) or meaning(stem)
+        meant.append(Meant(name, words_of_column, new, unit, f"{reason}; unit {why}" if why else reason))
+    unitless = {each.column: dimensions[each.name][0] for each in meant if dimensions.get(each.name)}
     if unitless:
         missing = ",".join(DISPLAY.get(dimension, dimension) for dimension in dict.fromkeys(unitless.values()))
         accepted = f"--units, such as {missing}, or names with a unit, such as q1_deg and x_mm"
         raise InputError("the header", f"columns without a unit ({', '.join(unitless)})", accepted)
+    if not columns:
+        accepted = "names with units, such as q1_deg and x_mm, in the header or as --columns"
+        raise InputError("the header", f"no known column ({listed(list(table))})", accepted)
     return columns, meant
+
+
+def _in_our_unit(
+    name: str, cells: Sequence[Any], read: Reading, dimensions: Sequence[str], units: Mapping[str, tuple[str, str]]
+) -> tuple[Sequence[Any], str, str]:
+    """Return the cells of a column in one of our units, this unit, and why it is meant."""
+    unit, why = _unit(name, read, dimensions, units)
+    if unit and dimension_of(unit) not in dimensions:
+        accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units are in the row below the names"
+        raise InputError("the header", f"column '{name}' ({meaning(read.stem)}) in {unit}", accepted)
+    if unit not in FOREIGN:
+        return cells, unit, why
+    ours, size = FOREIGN[unit]
+    values = ["" if np.isnan(value) else repr(float(size * value)) for value in _values(cells, name)]
+    return values, ours, f"{why}; {unit} is {size:g} {ours}"
 
 
 def meaning(stem: str) -> str:
@@ -481,7 +489,7 @@ def _rows_with_values(table: Understood, robot: Robot, kind: Measurement) -> Und
                 notes.append(f"rows {which} are ignored: {listed([labels[i] for i in rows])}.")
             out.update(rows)
     whole = table.take([i for i in range(len(labels)) if i not in out])
-    if table.columns and not whole.labels:
+    if not whole.labels:
         raise InputError("the table", "no row with values", "at least one")
     columns = dict(whole.columns)
     own = [str(cell).strip() for cell in columns.get("label", ())]
