@@ -18,7 +18,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.contact import Features, Touches, contrasted, of_rows
-from rpim_opt.problem.linear import LinearModel, Reweigh
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Reweigh
 from rpim_opt.problem.noise import Equations, Repeatability, Stack, equation_numbers
 from rpim_opt.problem.row_functions import (
     Functions,
@@ -622,6 +622,16 @@ def near_parallel(robot: Robot) -> tuple[str, ...]:
     )
 
 
+def _depends_on(base: list[str], robot: Robot, parameters: Parameters, data: Dataset) -> bool:
+    """Return whether measurements of a user's type depend on the base: distances do not, a fixture is placed by it."""
+    if any(b.measurement.points > 1 or b.measurement.start or b.measurement.touching for b in data.blocks):
+        return False
+    problem = CalibrationProblem(robot, parameters.identify([*base, "tool_*"]), data)
+    slopes = np.abs(problem.linearize(np.zeros(len(problem.parameters.free))).A)
+    of_base = np.isin(problem.parameters.free.names, base)
+    return bool(slopes[:, of_base].max() > RANK_TOLERANCE * slopes.max())
+
+
 def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
     """Return patterns of parameters; ``"auto"``: geometry, beta where it is needed, frames, own parameters of types."""
     if patterns != "auto":
@@ -637,6 +647,7 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
     tools = re.compile(r"tool_.*" if any(kind.turning for kind in kinds) else r"tool_(.*_)?[xyz]")
     names = [name for name in parameters.names if geometry.fullmatch(name)]
     names += near_parallel(robot)
-    if any(kind.registers for kind in kinds):  # distances do not tell where the robot stands
-        names += [name for name in parameters.names if name.startswith("base_")]
+    base = [name for name in parameters.names if name.startswith("base_")]
+    if any(kind.registers for kind in kinds) or (base and _depends_on(base, robot, parameters, data)):
+        names += base
     return names + [name for name in parameters.names if tools.fullmatch(name) or name in own]

@@ -71,7 +71,8 @@ class Measurement(Brief):
     differences to the other rows of the point, in the robot's own base frame. ``names`` are columns of names that a
     table of it may have besides, ``("point",)``, of which a touch has one; ``variants`` the type that it is where a
     table has a column of that name; ``parts`` types of tables that state less and can validate it: positions of poses.
-    ``registers`` and ``turning`` say whether rows tell where the robot's base is, and how the tool is turned.
+    ``registers`` and ``turning`` say whether the base can be registered by rows in closed form, and whether rows tell
+    how the tool is turned.
     ``shown_by(tables)`` is whether the columns of raw tables can only be of this type, before names are understood;
     ``words`` are how readers hear of it.
 
