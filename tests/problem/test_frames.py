@@ -206,9 +206,8 @@ def test_the_base_is_identified_where_values_of_a_users_own_type_depend_on_it() 
     tool = [arm.parameters.nominal[names.index(f"tool_{axis}")] for axis in ("x", "y", "z", "rx", "ry", "rz")]
     x, y, z = arm.data.blocks[0].y.T
     values = np.column_stack([np.sqrt(x**2 + y**2 + z**2), np.arctan2(y, x)])
-    sigma = 5e-5
     half = np.arange(len(x)) % 3 > 0
-    of = partial(ro.Dataset.of, sigma=[sigma, sigma], measurement=station)
+    of = partial(ro.Dataset.of, sigma=5e-5, measurement=station)
     result = ro.calibrate(ro.problem_from(arm.robot, of(arm.data.q[half], values[half]), tool=tool))
     free = result.problem.parameters.free
     base = [free.nominal[i] + result.x[i] for i, name in enumerate(free.names) if name.startswith("base_")]
