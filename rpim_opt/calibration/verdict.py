@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.convex.infeasible import name_of
+from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source

@@ -74,6 +74,16 @@ class Ready:
         return [self.maker, *self.arguments]
 
 
+def name_of(function: Any, k: int) -> str:
+    """Return the user's name of a constraint function."""
+    call = getattr(function, "stated", None)
+    if call:
+        maker, *arguments = call
+        return f"{maker}({', '.join(repr(a) for a in arguments)})"
+    name = getattr(function, "__name__", "<lambda>")
+    return f"constraint {k + 1}" if name == "<lambda>" else name
+
+
 def as_text(deviation: float, dimension: str) -> str:
     """Return a deviation [SI] as text in mm, mrad, or the parameter's own unit."""
     unit, si = display(dimension)

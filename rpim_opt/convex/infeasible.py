@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.exceptions import Conflict
-from rpim_opt.convex.constraints import Box, Parsed, as_text
+from rpim_opt.convex.constraints import Box, Parsed, as_text, name_of
 from rpim_opt.convex.expressions import cp, minimized, substituted
 from rpim_opt.convex.structure import Structure
 
@@ -99,16 +99,6 @@ def _units(structure: Structure, z: cp.Variable, boxes: Any = 0, statements: Any
             unit = [Condition(f"{name} ({i + 1})" if several else name, (d,)) for i, d in enumerate(demands)]
         units.append(unit)
     return units
-
-
-def name_of(function: Any, k: int) -> str:
-    """Return the user's name of a constraint function."""
-    call = getattr(function, "stated", None)
-    if call:
-        maker, *arguments = call
-        return f"{maker}({', '.join(repr(a) for a in arguments)})"
-    name = getattr(function, "__name__", "<lambda>")
-    return f"constraint {k + 1}" if name == "<lambda>" else name
 
 
 def advice(structure: Structure, status: str, found: Conflict | None) -> str:
