@@ -579,10 +579,12 @@ def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, m
     with out.open() as stream:
         assert {row["status"] for row in csv.DictReader(stream)} == {"above the limit"}
     assert run(monkeypatch, *arguments, "--largest", "1e-6", "--limit", "100") == 0
-    (tmp_path / "go.csv").write_text("x_mm;y_mm;z_mm\n600,125;100,250;400,500\n")  # thousands or decimals
+    (tmp_path / "go.csv").write_text("x_um;y_um;z_um\n600,125;100,250;400,500\n")  # thousands or decimals
     assert run(monkeypatch, *arguments) == 2
     assert "--decimal comma" in capsys.readouterr().err
-    assert run(monkeypatch, *arguments, "--decimal", "comma") == 0
+    assert run(monkeypatch, *arguments, "--decimal", "point") == 0
+    (tmp_path / "go.csv").write_text("x_mm;y_mm;z_mm\n600,125;100,250;400,500\n")  # no point is 600 m away
+    assert run(monkeypatch, *arguments) == 0
     (tmp_path / "go.csv").write_text("label,x_mm,y_mm,z_mm\nP1,9000,0,100\n")
     assert run(monkeypatch, *arguments) == 1  # unreachable, with or without a limit
     assert "1 of 1 commands miss their target" in capsys.readouterr().out

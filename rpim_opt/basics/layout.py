@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -15,7 +15,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
-from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
+from rpim_opt.basics.units import FOREIGN, UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6  # a row belongs to the data if it has this part of the numbers of the fullest row
 MOSTLY = 0.8  # a column is one of numbers if this part of its cells are
@@ -36,8 +36,10 @@ MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!
 """How tables say that there is no value."""
 BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
 """A name with its number and unit, in a header whose names and cells are separated by single blanks."""
-GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}(?:[.,]\d{3})+")
+GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 """What may be a whole number with its thousands apart, or one with three decimals."""
+BEYOND = {"angle": 20 * math.pi, "length": 50.0}
+"""Joint values and coordinates [SI] that no table has: ten turns, and farther than instruments stand."""
 PARTS = re.compile(r"x y z|(j|a|q|joint_?|axis_?)1 (?:\1\d )+\1\d")
 """What tables with a row a coordinate, or a joint, name in that row, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
@@ -175,18 +177,20 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     heads, above = _heads(grid, numeric, options)
     begins = {i: "".join(filter(str.isalpha, next(filter(None, grid.rows[i])))) for i in numeric}
     full = [i for i in numeric if begins[i].lower() not in SUMMARIES]
-    table = _columns([grid.rows[i] for i in full], heads, options)
-    full = full[: len(full) - _summaries(table.columns)]
-    notes = [*grid.notes, *_notes(grid, above, set(range(numeric[0], len(grid.rows))).difference(full), options)]
     units: dict[str, str] = {}
+    lines_of_units = []
     for row in grid.rows[: above[0] if above else 0]:
         stated = UNITS_LINE.fullmatch(" ".join(filter(None, row)))
         with suppress(InputError):  # a sentence that happens to begin so
             if stated:
                 units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
-                notes.append(f"units above the header: {stated[1]}.")
+                lines_of_units.append(f"units above the header: {stated[1]}.")
+    table = _columns([grid.rows[i] for i in full], heads, replace(options, units={**units, **options.units}))
+    full = full[: len(full) - _summaries(table.columns)]
+    left = set(range(numeric[0], len(grid.rows))).difference(full)
+    notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
     columns = {name: cells[: len(full)] for name, cells in table.columns.items()}
-    return RawTable(columns, table.groups, (*notes, *table.notes), units)
+    return RawTable(columns, table.groups, notes, units)
 
 
 def _summaries(columns: Columns) -> int:
@@ -351,12 +355,11 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], option
         if name:
             groups[full] = group
     numeric = {name: cells for name, cells in columns.items() if _is_numeric(cells)}
-    mark = _decimal_mark((cell for cells in numeric.values() for cell in cells), options.decimal)
+    mark, notes = _decimal_mark(numeric, options)
     grouping = "," if mark == "." else "."
     for name, cells in numeric.items():
         columns[name] = [cell.replace(grouping, "").replace(mark, ".") if is_numeral(cell) else cell for cell in cells]
-    why = "as requested" if options.decimal else "no comma can be a thousands separator"
-    return RawTable(columns, groups, (f"decimal commas: {why}.",) if mark == "," else ())
+    return RawTable(columns, groups, notes)
 
 
 def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
@@ -377,43 +380,56 @@ def _is_numeric(cells: Sequence[str]) -> bool:
     return numbers > 0 and numbers >= MOSTLY * sum(not is_missing(cell) for cell in cells)
 
 
-def _decimal_mark(cells: Iterable[str], stated: str) -> str:
-    """Return the decimal mark of a table, a comma or a point.
+def _decimal_mark(columns: Mapping[str, Sequence[str]], options: TableOptions) -> tuple[str, tuple[str, ...]]:
+    """Return the decimal mark of a table's numbers, a comma or a point, and notes on it.
 
     Where both stand in a number, the last one is it. Where commas alone do, one that cannot part thousands decides. A
-    stated mark holds unless a number contradicts it.
+    stated mark decides what the numbers leave open.
     """
-    stated = {"comma": ",", "point": "."}.get(stated, stated)
+    stated = {"comma": ",", "point": "."}.get(options.decimal, options.decimal)
     if stated not in ("", ",", "."):
         raise InputError("--decimal", f"'{stated}'", "comma or point")
+    grouping = "." if stated == "," else ","
     shown: dict[str, str] = {}  # the first cell with every mark
-    for cell in cells:
-        if not stated or not GROUPED.fullmatch(cell):
-            shown.setdefault(_mark(cell), cell)
-    shown.pop("", None)
-    doubtful = shown.pop("?", "")
-    if stated:
-        shown.pop(stated, None)
-        for cell in shown.values():
-            raise InputError("--decimal", f"'{stated}', and a number '{cell}'", "the decimal mark of the numbers")
-        return stated
+    doubtful: list[tuple[str, str]] = []  # numbers whose mark may separate thousands, with their columns
+    for name, cells in columns.items():
+        for cell in cells:
+            mark = _mark(cell)
+            if mark == grouping and GROUPED.fullmatch(cell):
+                doubtful.append((name, cell))
+            elif mark:
+                shown.setdefault(mark, cell)
     if len(shown) > 1:
-        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark, or set --decimal")
-    if not shown and doubtful:
-        found = f"'{doubtful}', whose mark may separate thousands or decimals"
+        raise InputError("the numbers", f"'{shown[',']}' and '{shown['.']}'", "one decimal mark")
+    if not shown:
+        beyond = [cell for name, cell in doubtful if _impossible(cell.replace(grouping, ""), name, options)]
+        shown = {grouping: beyond[0]} if beyond else {}
+    mark = next(iter(shown), stated)
+    if doubtful and not mark:
+        found = f"'{doubtful[0][1]}', whose mark may separate thousands or decimals"
         raise InputError("the numbers", found, "--decimal comma, or --decimal point")
-    return next(iter(shown), ".")
+    mark = mark or "."
+    if stated and mark != stated:
+        return mark, (f"--decimal {options.decimal} does not apply: found '{shown[mark]}'.",)
+    why = "as requested" if stated else "no comma can be a thousands separator"
+    return mark, (f"decimal commas: {why}.",) if mark == "," else ()
 
 
 def _mark(cell: str) -> str:
-    """Return the decimal mark of a cell, a question mark if it may separate thousands, or an empty text."""
+    """Return the last mark of a number, the other one if it is there more than once alone, or an empty text."""
     last = max(cell.rfind(","), cell.rfind("."))
     if last < 0 or not is_numeral(cell):
         return ""
     mark, other = (",", ".") if cell[last] == "," else (".", ",")
-    if other not in cell and cell.count(mark) > 1:  # 1.234.567
-        return other
-    return "?" if mark == "," and other not in cell and GROUPED.fullmatch(cell) else mark
+    return other if other not in cell and cell.count(mark) > 1 else mark  # 1.234.567
+
+
+def _impossible(number: str, name: str, options: TableOptions) -> bool:
+    """Return whether a number is beyond any joint value or coordinate, in its column's unit or all that are stated."""
+    own = split(name)[1]
+    units = [UNITS[FOREIGN.get(unit, (unit,))[0]] for unit in ([own] if own else options.units.values())]
+    sizes = [abs(float(number)) * unit.si > BEYOND[unit.dimension] for unit in units if unit.dimension in BEYOND]
+    return bool(sizes) and all(sizes)
 
 
 def _unit_of(cells: Sequence[str]) -> str:

@@ -56,9 +56,6 @@ def book(folder: Path) -> Path:
 REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
     "a sign that is two": (HEAD + ROWS, {"separator": "::"}, "--separator: found '::'"),
     "a decimal mark": (HEAD + ROWS, {"decimal": "'"}, "comma or point"),
-    "a decimal mark that numbers do not have": (
-        HEAD + ROWS.replace("401", "401.5"), {"decimal": ",", "separator": ","}, "the decimal mark of the numbers"
-    ),
     "nothing": ("\n\n", {}, "an empty file"),
     "an encoding that no text has": (HEAD + ROWS, {"encoding": "\ud800"}, "--encoding with the one that fits"),
     "an encoding of no name": (HEAD + ROWS, {"encoding": "\x00"}, "--encoding with the one that fits"),

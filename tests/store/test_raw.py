@@ -145,7 +145,6 @@ REFUSED = {
     "two decimal marks": (
         text([HEAD], [["P1", *["1,5"] * 6, *["1.5"] * 3]] * 2, ";"), [], ["'1,5' and '1.5'", "one decimal mark"]
     ),
-    "another mark than stated": (text([HEAD], ROWS, ";"), ["--decimal", ","], ["a number '", "--decimal"]),
     "decimal commas between commas": (text([HEAD], ROWS, comma=True), [], ["19 cells", "need quotes"]),
     "not the encoding": (text([["Größe", *HEAD[1:]]], ROWS), ["--encoding", "ascii"], ["the text", "--encoding"]),
     "no such separator": (text([HEAD], ROWS), ["--separator", "colon"], ["--separator", "semicolon"]),
@@ -236,9 +235,11 @@ def test_rows_that_were_left_out_are_named(monkeypatch, capsys, tmp_path, arm) -
         ("preamble", "3 lines above the header are ignored ('Export of cell 7' ...)."),
         ("Latin-1 with degrees", "read as cp1252: not UTF-8."),
         ("semicolon and decimal comma", "decimal commas: no comma can be a thousands separator."),
+        ("preamble", "--decimal comma does not apply: found '"),
     ):
         write, stated, _ = RAW[shape]
-        assert new(monkeypatch, arm, tmp_path / "cell", write(tmp_path), *options(stated), "--dry-run") == 0
+        more = ["--decimal", "comma"] if "--decimal" in expected else []
+        assert new(monkeypatch, arm, tmp_path / "cell", write(tmp_path), *options(stated), *more, "--dry-run") == 0
         assert expected in capsys.readouterr().out, shape
 
 
@@ -291,6 +292,22 @@ def test_new_measurements_are_read_as_raw_files_are(monkeypatch, capsys, tmp_pat
         documents.append(json.loads(capsys.readouterr().out)["identified"])
     assert run(monkeypatch, "compensate", str(out), raw, "--units", "deg,mm", "--json") in (0, 1)
     assert documents[0] == pytest.approx(documents[1])
+
+
+@pytest.mark.parametrize("decimal", ["", "comma", "point"])
+def test_every_file_has_its_own_decimal_mark(monkeypatch, capsys, tmp_path, calibrated, decimal) -> None:
+    """Joint values with three decimals each, ``-40,003``, which no joint has with thousands apart."""
+    _, out = calibrated
+    joints = [[*label, *row] for label, row in zip(NAMED, JOINTS, strict=True)]
+    joints = [row for row in joints if all(abs(float(cell)) >= 1 for cell in row[1:])][:8]
+    files = [tmp_path / "joints.txt", tmp_path / "points.txt"]
+    files[0].write_text(text([["Point", "A1", "A2", "A3", "A4", "A5", "A6"]], joints, ";", comma=True))
+    files[1].write_text(text([["Point", "X", "Y", "Z"]], beside(NAMED, POINTS), "\t"))
+    stated = ["--units", "deg,mm", *(["--decimal", decimal] if decimal else [])]
+    assert run(monkeypatch, "validate", str(out), *map(str, files), *stated, "--json") == 0, capsys.readouterr().err
+    document = json.loads(capsys.readouterr().out)
+    assert document["identified"]["count"] == len(joints)
+    assert document["identified"]["max_mm"] < 1.0
 
 
 def test_a_table_of_a_hundred_thousand_columns_is_refused_in_a_moment(monkeypatch, capsys, tmp_path, arm) -> None:
