@@ -253,7 +253,7 @@ def new(
     robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     tables: Tables = TABLES,
-    dry_run: Annotated[bool, Option("--dry-run", help="Interpret the tables and write nothing.")] = False,
+    dry_run: Annotated[bool, Option("--dry-run", help="Check everything and write nothing.")] = False,
     measurement: Kind = None,
     validation: Annotated[list[Path] | None, Option(help="A table for validation; several are joined.")] = None,
     hold_out: Annotated[Number, Option(help="Fraction of the configurations to hold out instead: 0.25.")] = None,
@@ -266,19 +266,15 @@ def new(
     as_json: bool = False,
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
-    with console.progress():
-        if dry_run:
-            found = ro.store.understand_tables(robot, data, measurement, tables.options, urdf_base, urdf_tip, dh)
-            return Answer(found, found.content())
-        with refused(folder):
-            made = ro.store.new_problem(
-                folder, robot, data, measurement=measurement, options=tables.options, validation=validation,
-                hold_out=hold_out, seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
-                understood=None if as_json else lambda found: console.show(f"{found}\n"),
-            )  # fmt: skip
+    with console.progress(), refused(folder):
+        made = ro.store.new_problem(
+            folder, robot, data, measurement=measurement, options=tables.options, validation=validation,
+            hold_out=hold_out, seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
+            understood=None if as_json else lambda found: console.show(f"{found}\n"), dry_run=dry_run,
+        )  # fmt: skip
     document = made.understood.content()
     document["notes"] += made.notes
-    return Answer(made, {"written": [made.folder], **document})
+    return Answer(made, {"written": [] if dry_run else [made.folder], **document})
 
 
 @command

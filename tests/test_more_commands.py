@@ -50,6 +50,7 @@ def test_numbers_units_and_the_base_are_checked_before_a_folder_is_made(
     assert run(monkeypatch, *arguments, "--units", "deg,m") == 0
     assert "implausibly far away: are the units right?" in capsys.readouterr().out
     file.write_text("\n".join([names.format(" [mm]"), *table[:-1], table[-1].rpartition(",")[0] + ",abc"]))
+    arguments[1] = str(tmp_path / "other")
     assert run(monkeypatch, *arguments, "--dry-run") == 2
     assert f"row P{len(rows) - 1}, column 'Z [mm]': found 'abc'" in capsys.readouterr().err
 

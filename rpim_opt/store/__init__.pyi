@@ -6,6 +6,5 @@ from .own_code import allow_code as allow_code
 from .problem_file import find_problem as find_problem
 from .problem_file import problems_folder as problems_folder
 from .raw import Understanding as Understanding
-from .raw import understand_tables as understand_tables
 from .result_file import load_result as load_result
 from .result_file import save_result as save_result

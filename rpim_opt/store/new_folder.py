@@ -50,15 +50,21 @@ CAMERA_CLEARLY = 3.0  # The camera is where the poses fit so many times better.
 
 
 class Started(NamedTuple):
-    """A new folder: its files with their rows, notes on what was guessed, and what was understood of the tables."""
+    """A new folder: its files with their rows, notes on what was guessed, and what was understood of the tables.
+
+    ``written`` is False after a dry run.
+    """
 
     folder: Path
     rows: Mapping[str, int]
     notes: tuple[str, ...]
     understood: Understanding
+    written: bool = True
 
     def __str__(self) -> str:
         lines = [f"{name}: {count} rows" for name, count in self.rows.items()]
+        if not self.written:
+            return "\n".join([f"Dry run, nothing written: {self.folder}", *lines, *self.notes])
         then = f"Check {self.folder / 'problem.toml'}, then run: rpim-opt inspect {self.folder}"
         return "\n".join([f"Created: {self.folder}", *lines, *self.notes, then])
 
@@ -79,22 +85,31 @@ def new_problem(
     target: str = "",
     dh: str = "",
     understood: Callable[[Understanding], None] | None = None,
+    dry_run: bool = False,
 ) -> Started:
-    """Make a problem folder that `load` reads, completely or not at all.
+    """Make a problem folder that `load` reads, completely or not at all; with ``dry_run`` check all and write nothing.
 
-    Arguments that are not named here are as for `understand_tables`. ``folder`` is a new one, or for one more chain
-    one whose problem file has chains of the same URDF. ``validation`` is a table or several, or ``hold_out`` the part
-    of the configurations that is drawn at random with ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem
-    on the origins of a URDF's joints; a chain that goes up the tree through joints that move and down again always is
-    one. ``target`` is what a camera sees: a table with point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is
-    called with what was understood of the tables, before anything is computed. Raises InputError for a folder that is
-    there already, and whatever of the robot or the data cannot be used.
+    ``folder`` is a new one, or for one more chain one whose problem file has chains of the same URDF. ``robot`` is the
+    name of a ready robot, or a file, ``data`` are text, Excel or Parquet files. ``measurement`` is what was measured,
+    by default poses where the tables have orientations, else positions; ``options`` are what is stated of the tables.
+    ``urdf_base`` and ``urdf_tip`` are links between which a URDF's robot is, ``dh`` the convention of a DH table,
+    ``"modified"`` or ``"standard"``, where it does not say it (`read_sheet`).
+
+    ``validation`` is a table or several, or ``hold_out`` the part of the configurations that is drawn at random with
+    ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem on the origins of a URDF's joints; a chain that goes
+    up the tree through joints that move and down again always is one. ``target`` is what a camera sees: a table with
+    point, x_mm, y_mm, or a grid ``7x5,30mm``. ``understood`` is called with what was understood of the tables, before
+    anything is computed. Raises InputError for a folder that is there already, and whatever of the robot or the data
+    cannot be used, or may mean two things.
 
     >>> import rpim_opt as ro
     >>> arm = ro.store.find_problem("paper_arm")
     >>> made = ro.store.new_problem("cell7", str(arm / "robot.toml"), arm / "identification.csv", hold_out=0.25)
     >>> made.rows
     {'identification.csv': 7, 'validation.csv': 2}
+    >>> tried = ro.store.new_problem("cell8", str(arm / "robot.toml"), arm / "identification.csv", dry_run=True)
+    >>> tried.written, tried.understood.count
+    (False, 9)
     """
     folder = Path(folder)
     source = find_source(robot)
@@ -118,12 +133,13 @@ def new_problem(
     tables = {identified: _rows(columns, ~held), validated: _rows(columns, held), seen: board.table}
     if later:
         other = understand_of(arm, later, kind.name, understanding.options)
-        rows_of(other, on_board(other.columns, board.board), arm, kind)
         tell(other)
+        rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[validated] = other.columns
     counts = {name: len(next(iter(each.values()), ())) for name, each in tables.items()}
     tables = {name: each for name, each in tables.items() if counts[name]}
     noise = usual_noise(kind)
+    assumed = {} if any(name.startswith(("sigma", "u95")) for name in columns) else noise
     supplied = [*paths, *later]
     alike = len({file.name for file in supplied}) < len(supplied)  # then their paths are noted
     with in_file(understanding.file):
@@ -132,28 +148,32 @@ def new_problem(
             ready=source.parent == READY, links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=board.stated,
             identification=identified, columns=how, data=paths[0].name, validation=validated, held_out=held.any(),
             seed=seed, validated_by=next((file.name for file in later), ""),
-            assumed=not any(name.startswith(("sigma", "u95")) for name in columns),
+            assumed=bool(assumed),
             raw={str(file) if alike else file.name: files.sha256_of(file) for file in supplied},
             ignored=_ignored_joints(arm, understanding),
             reading=replace(understanding.options, joints=arm.names).texts(),
         )  # fmt: skip
     contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
     contents["problem.toml"] = before + text.encode()
-    if before:
+    if before and not dry_run:
         files.write_files({folder / name: content for name, content in contents.items()})
-        of_chain = [SHARED]
-    else:
+    elif not dry_run:
         _write_whole(folder, contents, arm, source, bool(chain))
-        added = f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}."
-        of_chain = [added] if chain else []
-    notes = (f"Measurement {kind.name}: {how}.", guessed, *_remarks(arm, source, understanding, noise), *of_chain)
-    return Started(folder, {name: counts[name] for name in tables}, notes, replace(understanding, kind=kind))
+    added = f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}."
+    of_chain = [SHARED if before else added] if chain else []
+    notes = (*_remarks(arm, source, understanding, assumed), f"Measurement {kind.name}: {how}.", guessed, *of_chain)
+    counts = {name: counts[name] for name in tables}
+    return Started(folder, counts, notes, replace(understanding, kind=kind), not dry_run)
 
 
 def _remarks(arm: Described, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
     """Yield the assumed noise, where the flange frame of a converted table is, and joint values of no joint."""
-    assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
-    yield f"Assumed measurement noise (1 sigma) where no column states it: {assumed}, in [noise] of problem.toml."
+    if noise:
+        assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
+        yield (
+            f"Assumed measurement noise (1 sigma): {assumed}. State the instrument's own in [noise] of problem.toml: "
+            "noise beyond it is taken for the robot's repeatability."
+        )
     if arm.tool.any():  # of a URDF, or of a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         yield (
@@ -188,7 +208,8 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
     stated = folder / "problem.toml"
     known = files.read_toml(stated).get("chain", {}) if chain and stated.is_file() else {}
     if not known:
-        raise InputError("the folder", "an existing folder", "a new folder: nothing is overwritten", folder)
+        accepted = "a new folder, since nothing is overwritten; its own tables and problem.toml may be edited"
+        raise InputError("the folder", "an existing folder", accepted, folder)
     if chain in known:
         raise InputError("--chain", f"'{chain}', which exists", "a unique name for every chain", folder)
     if files.read_bytes(folder / ROBOT_OF_CHAINS) != files.read_bytes(robot):

@@ -26,7 +26,6 @@ from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
 from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.library import find_source, read_arm
 
 CLEARLY = 3.0  # The right reading of orientations leaves so many times less than another one.
 USUAL = "extrinsic xyz"
@@ -41,7 +40,7 @@ Files = Sequence[tuple[Path | None, RawTable]]
 
 @dataclass(frozen=True, eq=False)
 class Understanding:
-    """Interpretation of raw tables, as `understand_tables` returns it.
+    """Interpretation of raw tables.
 
     ``kind`` is what was measured, ``columns`` one table with our names (texts and numbers as the files have them),
     ``raw`` the same rows with theirs, ``tables`` what was understood of every file, ``notes`` how they were joined and
@@ -87,44 +86,6 @@ class Understanding:
         return {"columns": columns, "measurement": self.kind.name, "rows": self.count, "notes": notes}
 
 
-def understand_tables(
-    robot: str,
-    data: Sequence[str | Path],
-    measurement: str | None = None,
-    options: TableOptions | None = None,
-    urdf_base: str | None = None,
-    urdf_tip: str | None = None,
-    dh: str = "",
-) -> Understanding:
-    r"""Interpret raw tables of a robot: meaning, unit and reason for every column.
-
-    Several files are stacked where each is whole, and joined by a key where some have the joint values and others the
-    measured ones. Whether a quaternion's numbered components begin with w is checked against the nominal robot.
-
-    ``robot`` is the name of a ready robot, or a file, ``data`` are text, Excel or Parquet files. ``measurement`` is
-    what was measured, by default poses where the tables have orientations, else positions; ``options`` are what is
-    stated of the tables. ``urdf_base`` and ``urdf_tip`` are links between which a URDF's robot is, ``dh`` the
-    convention of a DH table, ``"modified"`` or ``"standard"``, where it does not say it (`read_sheet`). InputError for
-    what cannot be read, or may mean two things.
-
-    >>> from pathlib import Path
-    >>> import rpim_opt as ro
-    >>> _ = Path("joints.csv").write_text("Point,A1,A2,A3,A4,A5,A6\nP1,0,-90,10,20,30,40\nP2,5,-80,0,0,10,0\n")
-    >>> _ = Path("points.csv").write_text("Point ID;X [m];Y [m];Z [m]\nP2;0,125;0,2;1,5\nP1;0,5;0,25;1,75\n")
-    >>> options = ro.data.TableOptions(units={"angle": "deg"})
-    >>> found = ro.store.understand_tables("ur5e", ["joints.csv", "points.csv"], options=options)
-    >>> found.columns["q1_deg"], found.columns["x_m"]
-    (['5', '0'], ['0.125', '0.5'])
-    >>> found.notes
-    ('joined by label: 2 rows of 2 with joints and 2 measured.',)
-    """
-    arm = read_arm(find_source(robot), urdf_base, urdf_tip, dh)
-    understanding = understand_of(arm, data, measurement, options)
-    if not understanding.kind.by_camera:  # what it sees is another table
-        rows_of(understanding, understanding.columns, arm, understanding.kind)
-    return understanding
-
-
 def usual_noise(kind: Measurement) -> dict[str, float]:
     """Return standard deviations for data that state none, as ``[noise]`` has them."""
     usual = {"length": ("mm", 0.05), "angle": ("mrad", 0.5), "pixel": ("px", 0.2)}
@@ -157,7 +118,11 @@ def understand_of(
     options: TableOptions | None = None,
     targets: bool = False,
 ) -> Understanding:
-    """Interpret raw tables (files or data frames) as `understand_tables` does, or tables of targets."""
+    """Interpret raw tables (files or data frames) of measurements, or of targets.
+
+    Several files are stacked where each is whole, and joined by a key where some have the joint values and others the
+    measured ones. Whether a quaternion's numbered components begin with w is checked against the nominal robot.
+    """
     options = options or TableOptions()
     once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}  # once a sheet is once
     files = [(path, _upright(raw, arm)) for source in once.values() for path, raw in _sheets(source, options)]

@@ -83,11 +83,27 @@ def test_a_dry_run_says_every_column_and_writes_nothing(monkeypatch, capsys, tmp
     assert "coverage factor 2" in lines["U(95) X [mm]"]
     assert "joint 1" in lines["J1 [deg]"]
     assert "not used" in lines["RMS"]
-    assert said.splitlines()[-1] == f"{COUNT} rows, measurement position."
+    assert f"\n{COUNT} rows, measurement position.\n" in said
+    assert f"\nDry run, nothing written: {tmp_path / 'cell'}\nidentification.csv: {COUNT} rows\nMeasurement" in said
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run", "--json") == 0
     content = json.loads(capsys.readouterr().out)
     assert [each["name"] for each in content["columns"][:2]] == ["label", "q1_deg"]
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_a_dry_run_checks_the_table_for_validation(monkeypatch, capsys, tmp_path, arm) -> None:
+    path, later = tmp_path / "raw.csv", tmp_path / "later.csv"
+    path.write_text(text([HEAD], ROWS))
+    later.write_text(text([HEAD], ROWS[:5]))
+    more = ["--validation", str(later), "--dry-run"]
+    assert new(monkeypatch, arm, tmp_path / "cell", path, *more) == 0
+    said = capsys.readouterr().out
+    assert "5 rows, measurement position." in said
+    assert "validation.csv: 5 rows" in said
+    later.write_text(text([[*HEAD[:9], "X [mm]"]], ROWS))
+    assert new(monkeypatch, arm, tmp_path / "cell", path, *more) == 2
+    assert "columns 'X [mm]' and 'X [mm] #10' for x_mm" in capsys.readouterr().err
+    assert sorted(tmp_path.iterdir()) == [later, path]
 
 
 def test_commanded_joints_serve_where_none_were_measured_and_it_is_said(monkeypatch, capsys, tmp_path, arm) -> None:

@@ -34,6 +34,7 @@ MEANINGS = {
     "session": "session of the measurements", "to_marker": "reflector of the second point",
     "point": "touched or observed point", "rx": "measured roll (extrinsic xyz)",
     "ry": "measured pitch (extrinsic xyz)", "rz": "measured yaw (extrinsic xyz)",
+    "temperature": "robot's temperature: lengths grow with it",
     r"q(\d+)": r"joint \1", r"tau(\d+)": r"torque of joint \1", r"q([wxyz])": r"quaternion \1",
     r"r(\d)(\d)": r"rotation matrix \1,\2", "u95": "U95 of all axes", "sigma": "standard deviation of all axes",
     r"u95_(\w+)": r"U95 of \1", r"sigma_(\w+)": r"standard deviation of \1",
@@ -398,7 +399,8 @@ def _under_our_names(
     for name, cells in table.items():
         stem, _, reason, _ = read[name]
         if stem not in dimensions:
-            meant.append(Meant(name, "not used", "", "", reason or "not used by this measurement type"))
+            unused = reason and stem and "not used by this robot and measurement type"
+            meant.append(Meant(name, "not used", "", "", unused or reason or "an unknown name"))
             continue
         cells, unit, why = _in_our_unit(name, cells, read[name], dimensions[stem], units)
         new = f"{stem}_{unit}" if unit else stem
