@@ -321,8 +321,8 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         of_joint(2, lambda q: q + 3.5e-3 * np.random.default_rng(4).choice([-1, 1], COUNT)),
         "either of two positions in every row, joint 3 by 7 mrad",
     ),
-    "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg: that alone"),
-    "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg: that alone"),
+    "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg ("),
+    "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg ("),
 }
 
 
@@ -400,7 +400,7 @@ IN_TABLES |= {
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
     "mirrored, and joint 1 reversed": (
         both(values(lambda y: y * [1, -1, 1]), flipped(0)),
-        "the measured frame mirrored",
+        "left-handed measured frame with joint 1 reversed",
     ),
     "inches, joint 2 from 90 degrees and joint 3 reversed": (
         both(values(lambda y: y / 25.4), shifted(1, 90), flipped(2)),
