@@ -136,12 +136,14 @@ def test_a_reflector_that_is_not_the_tip_is_placed_in_the_tip_links_frame(made: 
     result = ro.load_result(made / "results")
     farther = TOOL @ numeric_link(d=0.1)
     (tmp_path / "arm.urdf").write_text(urdf_text(ARM.mdh, farther))
-    root, tip = ro.use.export_urdf(result, tmp_path / "arm.urdf", tmp_path / "out.urdf")
+    root, tip, uncertain = ro.use.export_urdf(result, tmp_path / "arm.urdf", tmp_path / "out.urdf")
     there = np.linalg.inv(farther) @ numeric_frame(ro.use.identified(result).tool)
     said = [float(number) for number in re.findall(r"[xyz] (-?[\d.]+)", tip)[:3]]
     np.testing.assert_allclose(said, 1e3 * there[:3, 3], atol=6e-4)
-    assert "in the instrument's frame" in root
-    assert "needs --tool" in str(ro.use.compensate(result, np.zeros((1, 6))))
+    assert root.startswith("URDF: base_link is at the identified base")
+    reflector, link = re.search(r"the reflector ([\d.]+) mm, smr ([\d.]+) mm and", uncertain).groups()
+    assert float(reflector) < float(link)
+    assert "state --tool" in str(ro.use.compensate(result, np.zeros((1, 6))))
 
 
 def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cell, tmp_path) -> None:
@@ -157,11 +159,11 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     export = ("export", "arm/results", "--urdf", str(cell / "arm.urdf"), "--out")
     capsys.readouterr()
     assert run(monkeypatch, *export, "corrected.urdf", "--tip-measured") == 0
-    stated = re.search(r"its tip link .* position ([\d.]+) mm, .* ([\d.]+) mrad \(k = 2", capsys.readouterr().out)
+    stated = re.search(r"\(k = 2.*: smr ([\d.]+) mm and ([\d.]+) mrad", capsys.readouterr().out)
     assert stated
     stated_place, stated_turn = map(float, stated.groups())
     assert run(monkeypatch, *export, "behind.urdf") == 0
-    assert "Positions of one reflector do not determine all of it" in capsys.readouterr().out
+    assert "Positions of one reflector do not determine all of its pose" in capsys.readouterr().out
     assert run(monkeypatch, "report", "arm/results", "--data", str(cell / "later.csv")) == 0
     page = Path("arm/results/report.html").read_text(encoding="utf-8")
     assert "Validation on new measurements" in page
@@ -547,6 +549,37 @@ def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
     found = ro.robot.forward_kinematics(read.robot, q)
     bridge = np.linalg.inv(there) @ found  # one constant tool, read as such
     assert np.abs(bridge - bridge[0]).max() < 1e-9
+
+
+def test_a_robot_from_ros_base_link_is_written_in_the_controllers_base(tmp_path: Path) -> None:
+    """A URDF's root base_link stands half a turn from base_link_inertia, where the controller's Base is."""
+    ur10 = ro.read_robot(Path(ro.__file__).parent / "robot" / "ready" / "ur10.toml")
+    conf, yaml = tmp_path / "calibration.conf", tmp_path / "kinematics.yaml"
+    conf.write_text(CONF)
+    yaml.write_text(YAML_PLAIN)
+    drawn = ro.robot.read_ur_kinematics(yaml).robot
+    change = 1e-3 * np.random.default_rng(0).normal(size=(6, 5))
+    change[0, :2], change[:, 4] = 0, 0
+    fixed = '<joint name="f" type="fixed"><parent link="base_link"/><child link="base_link_inertia"/>'
+    fixed = f'<link name="base_link"/>{fixed}<origin rpy="0 0 {np.pi!r}"/></joint>'
+    q = np.random.default_rng(1).uniform(-3, 3, (8, 6))
+    for nominal, reading in ((ur10, "calibration"), (drawn, "kinematics")):
+        true = replace(nominal, mdh=nominal.mdh + change)
+        want = ro.robot.forward_kinematics(replace(true, mdh=true.mdh * [1, 1, 1, 1, 0]), q)
+        for root in ("base_link", "base_link_inertia"):
+            arms = []
+            for each in (nominal, true):
+                inner = urdf_text(each.mdh, np.eye(4)).replace("base_link", "base_link_inertia")
+                (tmp_path / "ur.urdf").write_text(inner.replace("</robot>", f"{fixed}</robot>"))
+                arms.append(ro.read_urdf(tmp_path / "ur.urdf", root).robot)
+            assert (arms[0].mdh[2:4, 1] > 0).all() == (root == "base_link")
+            if reading == "calibration":
+                ro.robot.write_ur_calibration(conf, arms[1], arms[0], tmp_path / "new.conf")
+                again = ro.robot.read_ur_calibration(tmp_path / "new.conf", ur10)
+            else:
+                ro.robot.write_ur_kinematics(yaml, arms[1], tmp_path / "new.yaml")
+                again = ro.robot.read_ur_kinematics(tmp_path / "new.yaml")
+            assert np.abs(ro.robot.forward_kinematics(again.robot, q) - want).max() < 1e-9
 
 
 def test_another_payload_is_compensated_for(monkeypatch, capsys, tmp_path) -> None:

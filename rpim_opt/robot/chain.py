@@ -152,12 +152,9 @@ def require_same_arm(
     deviation[:, ::2] = np.abs(np.angle(np.exp(1j * deviation[:, ::2])))
     joint, column = np.unravel_index(np.argmax(deviation), deviation.shape)
     if deviation[joint, column] > ANOTHER_ARM:
-        found = f"{MDH[column]}{joint + 1} differs from the file by {deviation[joint, column]:.3g} m or rad"
-        accepted = "a robot identified from this file's nominal parameters"
-        if np.pi - deviation[joint, column] < ANOTHER_ARM:
-            accepted += "; for half a turn at the base: --urdf-base with the chain's first link (base_link_inertia), "
-            accepted += "in `new` and in `export`"
-        raise InputError("robot", found, accepted, file)
+        unit = "rad" if column % 2 == 0 else "m"
+        found = f"{MDH[column]}{joint + 1} differs from the file by {deviation[joint, column]:.3g} {unit}"
+        raise InputError("robot", found, "a robot identified from this file's nominal parameters", file)
 
 
 def without_beta(robot: Robot) -> Robot:

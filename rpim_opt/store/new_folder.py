@@ -174,7 +174,8 @@ def _remarks(arm: Described, source: Path, understanding: Understanding, noise: 
             f"Assumed measurement noise (1 sigma): {assumed}. State the instrument's own in [noise] of problem.toml: "
             "noise beyond it is taken for the robot's repeatability."
         )
-    if arm.tool.any():  # of a URDF, or of a DH table in another convention than the modified one
+    # of a URDF, or of a DH table in another convention than the modified one
+    if placed(arm.tool) != placed(np.zeros(6)):
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         yield (
             f"[tool], `known` and --tool refer to the flange frame after the last joint. In it {frame} is at "

@@ -302,8 +302,8 @@ def export_urdf(
         return write_all([(Path(target), partial(_write_tree, result, of, source))], note)
     arm = identified(result, marker)
     ends = remembered_ends(source, result.problem.robot)
-    root, tip = root or ends[0], tip or ends[1]
-    own = read_urdf(source, root, tip)
+    own = read_urdf(source, root or ends[0], tip or ends[1])
+    root, tip = remembered_ends(source, own.robot)
     p = result.problem.parameters
     known = reflectors(p.names)
     if tip_measured and marker is None and len(known) > 1:
@@ -313,17 +313,24 @@ def export_urdf(
     tool = arm.tool if of_tool and tip_measured else None
     notes = []
     if base is not None:
-        notes.append(f"URDF: its root is at the identified base, {placed(base)} in the instrument's frame.")
+        notes.append(f"URDF: {root} is at the identified base, {placed(base)} in the instrument's frame.")
     elif of_base:
         at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
-        notes.append(f"URDF: its root link keeps its pose from the file; in the instrument's frame it is at {at}.")
+        notes.append(
+            f"URDF: {root} is at {at} in the instrument's frame: replace an earlier pose of it by this one, which "
+            "belongs to the corrected origins."
+        )
     if tool is not None:
-        notes.append(f"URDF: its tip is at the identified tool, {placed(tool)} in the DH table's flange frame.")
+        moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
+        notes.append(
+            f"URDF: {tip} moved by {moved:.3g} mm (--tip-measured) to the identified reflector, {placed(tool)} in the "
+            "DH table's flange frame."
+        )
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
-        notes.append(f"URDF: its tip link keeps its pose from the file; {there}.")
-    notes += _tip_uncertainty(result, own.tool if tool is None else None, marker)
+        notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
+    notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker)
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, base, tool)
@@ -332,7 +339,7 @@ def export_urdf(
     return write_all([(Path(target), write)], note)
 
 
-def _tip_uncertainty(result: Calibration, tool: Array | None, marker: str | None) -> list[str]:
+def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None) -> list[str]:
     """Say how well the pose of the tip link is known, at ``tool`` in the flange frame or at the reflector."""
     problem = result.problem.sample()
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
@@ -344,10 +351,13 @@ def _tip_uncertainty(result: Calibration, tool: Array | None, marker: str | None
     if not np.isfinite([position, turn]).all():
         return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
     seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
-    rests = "" if seen else ". Positions of one reflector do not determine all of it; the rest is the prior's"
+    rests = "" if seen else ". Positions of one reflector do not determine all of its pose; the rest is the prior's"
+    measured = ""
+    if tool is not None:
+        measured = f"the reflector {2e3 * tool_uncertainty(result, q, marker=name)[0].max():.2g} mm, "
     return [
-        f"URDF: expanded uncertainty of its tip link in the instrument's frame: position {2e3 * position:.2g} mm, "
-        f"orientation {2e3 * turn:.2g} mrad (k = 2, largest of the measured configurations){rests}."
+        "URDF: expanded uncertainty in the instrument's frame (k = 2, largest of the measured configurations): "
+        f"{measured}{tip} {2e3 * position:.2g} mm and {2e3 * turn:.2g} mrad{rests}."
     ]
 
 

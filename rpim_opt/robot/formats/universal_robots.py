@@ -6,6 +6,7 @@ Both describe six revolute joints; identified parameters replace the numbers in 
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -41,6 +42,18 @@ def _number(text: bytes, where: str) -> float:
         found = text.decode(errors="replace")[:40]
         raise InputError(where, f"'{found}'", f"a finite number, at most {LARGEST:g}")
     return value
+
+
+def _in_base(robot: Robot) -> Robot:
+    """Return the same arm in the controller's Base, where it is in ROS's ``base_link``, half a turn from there.
+
+    Rot(z, pi) T Rot(z, -pi) is the link T with the opposite alpha, a and beta; half a turn stays after the last joint.
+    """
+    if not (robot.mdh[2:4, 1] > 0).all():
+        return robot
+    mdh = robot.mdh * [-1.0, -1.0, 1.0, 1.0, -1.0]
+    mdh[-1, 2] += np.pi
+    return replace(robot, mdh=mdh)
 
 
 # calibration.conf
@@ -89,24 +102,22 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     The betas are turned into common normals first, as the controller's parameters are. Not tried on a controller:
     what else it checks (the file has checksums of the joints) is not documented. Keep the original.
 
-    ``robot`` is in the controller's Base; ``source``, its own file, may be the target, too. Refused are alpha1 or a1
-    that deviate (the base has to hold them), beta6, and axes too nearly parallel.
+    ``robot`` is in the controller's Base, or with ``nominal`` in ROS's ``base_link``; ``source``, its own file, may be
+    the target, too. Refused are alpha1 or a1 that deviate (the base has to hold them), beta6, and axes too nearly
+    parallel.
     """
     path = Path(source)
     if not path.exists():
         raise InputError("the file", "nothing", "the robot's own file, copied from its controller")
     data = read_bytes(path)
     old, places = _deltas(data)
+    robot, nominal = _in_base(robot), _in_base(nominal)
     require_same_arm(robot, nominal.mdh, REVOLUTE, path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
         raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1")
     if not (nominal.mdh[2:4, 1] < 0).all():
         found = f"a2 = {1e3 * nominal.mdh[2, 1]:.1f} mm and a3 = {1e3 * nominal.mdh[3, 1]:.1f} mm"
-        accepted = (
-            "the controller's table, in which both are negative: new --robot ur10e (the model's name), or a URDF "
-        )
-        accepted += "with --urdf-base base_link_inertia"
-        raise InputError("robot", found, accepted)
+        raise InputError("robot", found, "a Universal Robot: a2 and a3 of its controller are negative")
     change = without_beta(robot).mdh - nominal.mdh
     behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
     new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
@@ -172,8 +183,10 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     The driver compares the hash with the controller's own calibration; it is that of the robot, not of the numbers.
 
     ``source`` is the original, or ur_description's default_kinematics.yaml of the model; its `read_ur_kinematics` has
-    to be the robot whose parameters were identified. Refused are another robot, and a beta after the last joint.
+    to be the robot whose parameters were identified, in the controller's Base or in ROS's ``base_link``. Refused are
+    another robot, and a beta after the last joint.
     """
+    robot = _in_base(robot)
     path = Path(source)
     data = read_bytes(path)
     chain, places = _yaml_chain(data)

@@ -123,7 +123,7 @@ def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
 @of_file
 def remembered_ends(path: str | Path, robot: Robot) -> tuple[str | None, str | None]:
     """Return the links of a file between which a robot is, by its source as `read_urdf` states it; None twice else."""
-    ends = re.fullmatch(r".*, (\S+) to (\S+)", robot.source)
+    ends = re.fullmatch(r".*, (.+) to (.+)", robot.source)
     return (ends[1], ends[2]) if ends and set(ends.groups()) <= set(_read(Path(path)).links) else (None, None)
 
 
