@@ -34,7 +34,7 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_source, read_arm
 from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of
-from rpim_opt.store.raw import Understanding, rows_of, understand_of, usual_noise
+from rpim_opt.store.raw import Understanding, in_time_order, rows_of, understand_of, usual_noise
 
 TABLES = ("identification.csv", "validation.csv", "target.csv")  # of a new folder
 ROBOT_OF_CHAINS = "robot.urdf"
@@ -120,7 +120,7 @@ def new_problem(
     arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
     paths, later = _files(data), _files(validation or ())
     tell = understood or (lambda understanding: None)
-    understanding = understand_of(arm, paths, measurement, options)
+    understanding = in_time_order(understand_of(arm, paths, measurement, options))
     tell(understanding)
     identified, validated, seen = (f"{chain}_{name}" if chain else name for name in TABLES)
     board = stated_target(target, seen)
@@ -132,7 +132,7 @@ def new_problem(
     held = _held_out(rows, hold_out, seed)
     tables = {identified: _rows(columns, ~held), validated: _rows(columns, held), seen: board.table}
     if later:
-        other = understand_of(arm, later, kind.name, understanding.options)
+        other = in_time_order(understand_of(arm, later, kind.name, understanding.options))
         tell(other)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[validated] = other.columns

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from itertools import permutations
 from pathlib import Path
@@ -20,7 +21,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.formats.registry import read_raw
-from rpim_opt.data.tables.joining import together
+from rpim_opt.data.tables.joining import seconds, time_column, together
 from rpim_opt.data.tables.names import ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Understood, understand
@@ -29,6 +30,7 @@ from rpim_opt.robot.chain import Described
 
 CLEARLY = 3.0  # The right reading of orientations leaves so many times less than another one.
 USUAL = "extrinsic xyz"
+SINCE_1970 = 1e8  # times [s] that are larger; others may begin anew in every file
 READINGS = {
     "quaternion": ORDERS,
     "rotation": (USUAL, "vector", *(f"intrinsic {''.join(order)}" for order in permutations("xyz") if order[0] != "z"),
@@ -186,12 +188,36 @@ def _whole(
 ) -> Understanding:
     with in_file(files[0][0] if len(files) == 1 else None):
         whole = together(tables, arm.robot, kind, options.key, options.within)
-    shown = []  # in what is shown the columns by which rows were joined are not left out
-    join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
+    shown = _with_meaning(tables, whole.keys, "joins the files", "rows of equal keys or of the nearest times")
+    return Understanding(kind, whole.columns, whole.raw, shown, whole.notes, options, str(files[0][0] or ""))
+
+
+def in_time_order(found: Understanding) -> Understanding:
+    """Return the rows in the order of the first column of dates, or of times since 1970; as they are without one."""
+    unused = [each.column for table in found.tables for each in table.meant if not each.name]
+    for name in filter(lambda column: time_column([column.lower()]), unused):
+        with suppress(InputError, KeyError):  # no times, or not of all rows
+            times = seconds(name, found.raw[name.lower()])
+            if times.min() > SINCE_1970:
+                order = np.argsort(times, kind="stable").tolist()
+                labelled = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
+                columns, raw = ({n: [c[i] for i in order] for n, c in each.items()} for each in (labelled, found.raw))
+                tables = _with_meaning(found.tables, [name.lower()], "order of the rows", "times of all rows")
+                notes = (*found.notes, f"rows are in the order of '{name}'.")
+                return replace(found, columns=columns, raw=raw, tables=tables, notes=notes)
+    return found
+
+
+def _with_meaning(
+    tables: Sequence[Understood], columns: Sequence[str], meaning: str, why: str
+) -> tuple[Understood, ...]:
+    """Return tables in which columns, in lower case, that have no other meaning have this one."""
+    shown = []
     for each in tables:
-        joining = {m for m in each.meant if m.column.lower() in whole.keys and m.meaning == "not used"}
-        shown.append(replace(each, meant=tuple(m._replace(**join) if m in joining else m for m in each.meant)))
-    return Understanding(kind, whole.columns, whole.raw, tuple(shown), whole.notes, options, str(files[0][0] or ""))
+        new = {m for m in each.meant if m.column.lower() in columns and m.meaning == "not used"}
+        meant = tuple(m._replace(meaning=meaning, why=why) if m in new else m for m in each.meant)
+        shown.append(replace(each, meant=meant))
+    return tuple(shown)
 
 
 def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:

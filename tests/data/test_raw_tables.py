@@ -223,8 +223,8 @@ def two(folder: Path, joints: str = JOINTS, values: str = VALUES) -> list[Unders
 
 def test_two_tables_are_joined_by_what_both_have(tmp_path: Path) -> None:
     found = together(two(tmp_path), ARM, position)
-    assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([402, 401])
-    assert list(found.columns["q1_deg"]) == ["3", "1"]
+    assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([401, 402])
+    assert list(found.columns["q1_deg"]) == ["1", "3"]
     other_names = VALUES.replace("b,", "c,").replace("a,4", "d,4")
     by_row = together(two(tmp_path, values=other_names), ARM, position, "row")
     assert list(by_row.columns["q1_deg"]) == ["1", "3"]
@@ -234,8 +234,8 @@ def test_a_common_column_counts_beside_a_pair_of_other_names(tmp_path: Path) -> 
     joints = "stamp,Alpha,J1 [deg],J2 [deg]\n7,a,1,2\n9,b,3,4\n"
     values = "stamp,Beta,X [mm],Y [mm],Z [mm]\n9,b,402,6,7\n7,a,401,5,6\n"
     found = together(two(tmp_path, joints, values), ARM, position)
-    assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([402, 401])
-    assert list(found.columns["q1_deg"]) == ["3", "1"]
+    assert [float(x) for x in found.columns["x_mm"]] == pytest.approx([401, 402])
+    assert list(found.columns["q1_deg"]) == ["1", "3"]
 
 
 @pytest.mark.parametrize(
@@ -259,7 +259,7 @@ def test_the_column_of_the_times_may_have_any_name(tmp_path: Path) -> None:
     values = "stamp,X [mm],Y [mm],Z [mm]\n1.001,402,6,7\n"
     found = together(two(tmp_path, joints, values), ARM, position, "stamp", within=0.01)
     assert list(found.columns["q1_deg"]) == ["3"]
-    for key, said in (("clock", "no column 'clock'"), ("", "no column of times")):
+    for key, said in (("clock", "'clock', no column of the files"), ("", "no column of times")):
         with pytest.raises(ro.InputError, match=said):
             together(two(tmp_path, JOINTS, VALUES), ARM, position, key, within=0.01)
 

@@ -60,7 +60,7 @@ def test_a_raw_file_becomes_the_clean_tables_problem(monkeypatch, capsys, tmp_pa
     data = ro.load(tmp_path / "cell").problem.data
     assert len(data) == len(Q)
     order = list(range(len(Q)))
-    if data.label[0].startswith("P"):  # a joined table has the order of the measured values
+    if data.label[0].startswith("P"):  # a joined table has the order of one of its files
         order = [LABELS.index(label) for label in data.label]
     (block,) = data.blocks
     assert block.measurement.name == kind
@@ -218,10 +218,13 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     joints.write_text(text([HEAD[:7]], [row[:7] for row in ROWS]))
     points.write_text(text([HEAD[7:]], POINTS))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
-    assert "no column in both first.csv and second.csv" in capsys.readouterr().err
+    assert (
+        "no column in both first.csv and second.csv; Point of first.csv: P1, P2, P3 and 33 more"
+        in capsys.readouterr().err
+    )
     points.write_text(text([["Point", *HEAD[7:]]], [[f"Q{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
-    assert "no common value in first.csv and second.csv, accepted: --key with a column" in capsys.readouterr().err
+    assert "no common value in first.csv (P1, P2, P3 and 33 more) and second.csv (Q0, Q1, Q2" in capsys.readouterr().err
     points.write_text(text([["Point", *HEAD[7:]]], [[f"P{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
     said = capsys.readouterr().out
@@ -408,6 +411,25 @@ def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, ar
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints]) == 2
     assert "columns 'ID' and 'Point Name' for label" in capsys.readouterr().err
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "Point Name") == 0
+
+
+@pytest.mark.parametrize("key", ["", "Target", "Punkt"])
+def test_names_that_differ_by_zeros_are_joined_in_the_order_of_time(monkeypatch, capsys, tmp_path, arm, key) -> None:
+    """A tracker sorts its points as text, P1, P10, P11, P2; the last of the robot's was measured first."""
+    files = [tmp_path / "robot.csv", tmp_path / "tracker.csv"]
+    files[0].write_text(text([["Punkt", *HEAD[1:7]]], [[f"P{i:03d}", *row] for i, row in enumerate(JOINTS)]))
+    rows = [[f"p{i}", *row, f"2026-05-31 12:{59 - i}:00"] for i, row in enumerate(POINTS)]
+    files[1].write_text(text([["Target", *HEAD[7:], "Timestamp"]], sorted(rows)))
+    more = ["--key", key] if key else []
+    assert new(monkeypatch, arm, tmp_path / "cell", files, *more) == 0
+    said = capsys.readouterr().out
+    assert "names are joined that differ by case or leading zeros alone: 'p0' as 'P000'." in said
+    assert "rows are in the order of 'Timestamp'." in said
+    data = ro.load(tmp_path / "cell").problem.data
+    assert list(data.label) == [f"P{i:03d}" for i in reversed(range(COUNT))]
+    np.testing.assert_allclose(1e3 * data.blocks[0].y, P[::-1], atol=1e-4)
+    assert new(monkeypatch, arm, tmp_path / "other", files, "--key", "Stamp") == 2
+    assert "--key: found 'Stamp', no column of the files, accepted: Punkt, " in capsys.readouterr().err
 
 
 def test_a_file_that_is_stated_twice_is_read_once(monkeypatch, capsys, tmp_path, arm) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import listed
 from rpim_opt.basics.units import numeral, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
@@ -39,12 +39,17 @@ SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 
 class Key(NamedTuple):
-    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
+    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones.
+
+    Keys that differ by case and leading zeros alone have the spelling of the joints' table, for which ``spelled`` is an
+    example, ``'P1' as 'P001'``.
+    """
 
     how: str
     columns: tuple[str, ...]
     left: list[str]
     right: list[str]
+    spelled: str = ""
 
 
 class Match(NamedTuple):
@@ -74,6 +79,9 @@ def together(
         lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
         found = f"{lost or 'some tables'} without joint or measured values"
         raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
+    columns = [each.column for table in tables for each in table.meant]
+    if key.lower() not in ("", "row", "label", "time", *map(str.lower, columns)):
+        raise InputError("--key", f"'{key}', no column of the files", choices(key, columns))
     joints, values = _stacked(moving), _stacked(seen)
     match = _by_key(joints, values, key) if within is None else _by_time(joints, values, key, within)
     left, right = joints.take(match.left), values.take(match.right)
@@ -133,11 +141,15 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
         within = _clock_tolerance(joints, values)
         if within and not key:
             return _by_time(joints, values, key, within)
-        found = f"no common value in {joints.file} and {values.file}"
+        names = [f"{side.file} ({listed(keys, 3)})" for side, keys in ((joints, chosen.left), (values, chosen.right))]
+        found = f"no common value in {' and '.join(names)}"
         raise InputError(f"the key {chosen.how}", found, f"--key with a column of common values, {OTHER_KEYS}")
+    right.sort(key=lambda i: place[chosen.right[i]])
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
+    if chosen.spelled:
+        notes.append(f"names are joined that differ by case or leading zeros alone: {chosen.spelled}.")
     lonely = [name for name in chosen.left if name not in set(names)]
     lonely += [name for name in chosen.right if name not in place]
     if lonely:
@@ -148,11 +160,11 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
 def _key(joints: Understood, values: Understood, key: str) -> Key:
     """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
     pairs = [
-        Key(f"{name} = {other}", (name.lower(), other.lower()), own, others)
+        _keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others)
         for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
-        if len(set(own) & set(others)) >= SAME * min(len(own), len(others))
-        and (key in ("", "row") or key.lower() in (name.lower(), other.lower()))
+        if key in ("", "row") or key.lower() in (name.lower(), other.lower())
     ]
+    pairs = [pair for pair in pairs if len({*pair.left} & {*pair.right}) >= SAME * min(len(pair.left), len(pair.right))]
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
     pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
     if key == "row":
@@ -160,17 +172,34 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     if key in ("", "label") and "label" in joints.columns:
         labels = _normal(joints.columns["label"])
         for column in ("label", "configuration"):
-            others = _normal(values.columns.get(column, ()))
-            if set(labels) & set(others) and not (telling and counts_rows(labels)):
-                return Key("label", (), labels, others)
+            chosen = _keyed("label", (), labels, _normal(values.columns.get(column, ())))
+            if {*labels} & {*chosen.right} and not (telling and counts_rows(labels)):
+                return chosen
     common = [name for name in joints.raw if name in values.raw]
     name = common[0] if not key and len(common) == 1 and not (telling and pair) else key.lower()
     if name in common:
-        return Key(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
+        return _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
     if pair:
         return pair
-    found = f"'{key}'" if key else f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
-    raise InputError("--key", found, f"a common column, {OTHER_KEYS}")
+    both = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
+    found = f"'{key}', whose values no column of the other file has" if key else both
+    sides = [(side.file, name, keys) for side in (joints, values) for name, keys in _naming(side).items()]
+    found += "".join(f"; {name} of {file}: {listed(keys, 3)}" for file, name, keys in sides)
+    raise InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
+
+
+def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
+    """Return a key; names that differ by case and leading zeros alone are the same where no two of one side are."""
+    spelling = {_bare(name): name for name in left}
+    if len(spelling) < len({*left}) or len({*map(_bare, right)}) < len({*right}):
+        return Key(how, columns, left, right)
+    named = [spelling.get(_bare(name), name) for name in right]
+    changed = (f"'{old}' as '{new}'" for old, new in zip(right, named, strict=True) if old != new)
+    return Key(how, columns, left, named, next(changed, ""))
+
+
+def _bare(name: str) -> str:
+    return re.sub(r"(?<![\d.,])0+(?=\d)", "", name.casefold())
 
 
 def _naming(table: Understood) -> dict[str, list[str]]:
@@ -256,13 +285,12 @@ def _clock_tolerance(joints: Understood, values: Understood) -> float:
 
 
 def _times(table: Understood, key: str) -> tuple[str, Array]:
-    """Return the column of a table's times, and the times [s] of its rows."""
-    name = time_column(table.raw) if key.lower() in ("", "time") else key.lower()
-    if name is None or name not in table.raw:
-        lacks = f"no column '{key}'" if key else "no column of times"
-        where = f"--time-tolerance, {table.file}"
+    """Return the column of a table's times, the stated one if it has it, and the times [s] of its rows."""
+    name = key.lower() if key.lower() in table.raw else time_column(table.raw)
+    if name is None:
         columns = ", ".join(each.column for each in table.meant)
-        raise InputError(where, f"{lacks} among {columns}", "one called time, or --key with it")
+        found = f"no column of times among {columns}"
+        raise InputError(f"--time-tolerance, {table.file}", found, "one called time, or --key with it")
     return name, seconds(name, table.raw[name])
 
 
