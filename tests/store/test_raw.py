@@ -345,11 +345,27 @@ def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys,
     said = capsys.readouterr().out
     assert f"joined by the nearest time: {COUNT} rows of {10 * COUNT} with joints and {COUNT} measured" in said
     assert "times differ by 0.003 s at most, +0.003 s on average" in said
+    assert "the robot moved" not in said
     assert "joins the files" in said
     assert "not used" not in said
     data = ro.load(tmp_path / "cell").problem.data
     np.testing.assert_allclose(np.degrees(data.q), [[float(cell) for cell in row] for row in JOINTS], atol=1e-9)
     assert list(data.label) == [name[0] for name in NAMED]
+
+
+def test_a_robot_that_moves_as_it_is_measured_is_named(monkeypatch, capsys, tmp_path, arm) -> None:
+    """Joint 1 turns for 30 s at 20 degrees a second; measured is 0.02 s after a row of the log."""
+    files = [tmp_path / "joints.csv", tmp_path / "points.csv"]
+    moments = np.arange(COUNT) + 0.52
+    log = [[f"{t:.2f}", f"{20 * min(t, 30):.4f}", *["0"] * 5] for t in np.arange(0, COUNT + 1, 0.1)]
+    files[0].write_text(text([["time [s]", *HEAD[1:7]]], log))
+    points = [[name[0], f"{t:.2f}", *point] for name, t, point in zip(NAMED, moments, POINTS, strict=True)]
+    files[1].write_text(text([["Point", "time [s]", *HEAD[7:]]], points))
+    new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.1", "--dry-run")
+    said = capsys.readouterr().out
+    assert (
+        f"the robot moved at 30 of {COUNT} joined rows: between measurement and joint values by up to 0.4 deg" in said
+    )
 
 
 def test_rows_without_a_partner_in_time_are_counted(monkeypatch, capsys, tmp_path, arm) -> None:

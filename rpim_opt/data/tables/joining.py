@@ -34,6 +34,8 @@ SAME = 0.8
 OTHER_KEYS = "--key row for rows in the same order, or --time-tolerance for the nearest time"
 SIMULTANEOUS = 0.01
 """Times that differ by less than this part of the shortest time between rows are those of one row."""
+LOG, MOVED = 2, 0.01
+"""Rows of joints a measured one from which on they are a log, and the change of a joint [deg] that is named."""
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 """From which number on a time without a unit counts so since 1970: seconds would be in the year 5000."""
 
@@ -268,11 +270,30 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
         f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
     ]
+    moved = _motion(joints, there, left, then[right]) if len(there) > LOG * len(right) else np.zeros(1)
+    if moved.max() > MOVED:
+        count = np.count_nonzero(moved > MOVED)
+        notes.append(
+            f"the robot moved at {count} of {len(right)} joined rows: between measurement and joint values by up to "
+            f"{moved.max():.2g} degrees."
+        )
     lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:
         several = f"{len(lonely)} measured rows without a match within {within:g} s, ignored"
         notes.append(f"{several}: {listed(lonely)}.")
     return Match(left.tolist(), right.tolist(), [labels[i] for i in right], notes, clocks)
+
+
+def _motion(joints: Understood, times: Array, rows: np.ndarray, moments: Array) -> Array:
+    """Return the largest change (K,) [deg] of a revolute joint from a row's time to its moment, linear between rows."""
+    order = np.argsort(times)
+    largest = np.zeros(len(rows))
+    for name, cells in joints.columns.items():
+        stem, unit = split_unit(name)
+        if re.fullmatch(r"q\d+", stem) and unit and unit.dimension == "angle":
+            values = np.degrees(unit.si * np.array([numeral(str(cell)) for cell in cells]))
+            largest = np.fmax(largest, np.abs(np.interp(moments, times[order], values[order]) - values[rows]))
+    return largest
 
 
 def _clock_tolerance(joints: Understood, values: Understood) -> float:
