@@ -191,7 +191,9 @@ class Tables(NamedTuple):
         None
     )
     quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = ""
-    rotation: Annotated[str, Option(help="Meaning of rx, ry, rz: vector, 'extrinsic xyz', 'intrinsic zyx'.")] = ""
+    rotation: Annotated[
+        str, Option(help="Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector.")
+    ] = ""
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = ""
     constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = ""
     encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = ""
@@ -574,7 +576,7 @@ def compensate(
     console.require_positive("--limit", limit)
     mass, centre = console.carried(payload)
     with _loaded(result) as (loaded, say):
-        read, left_out = ro.use.read_targets(loaded, targets, tables.options)
+        read, understood = ro.use.read_targets(loaded, targets, tables.options)
         say("compensating")
         compensation = ro.use.compensate(
             loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
@@ -584,7 +586,8 @@ def compensate(
         )  # fmt: skip
     document = {**compensation.content(), "limit_mm": limit}
     code = int(bool(compensation.missed))
-    return _with_table(compensation, compensation.csv(), out, document, code=code, left_out=left_out)
+    more = {"code": code, "left_out": understood.left_out, "notes": understood.notes}
+    return _with_table(compensation, compensation.csv(), out, document, **more)
 
 
 @command

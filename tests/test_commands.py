@@ -618,6 +618,9 @@ def test_a_saved_result_compensates_as_the_live_one(monkeypatch, capsys, cell, m
     assert run(monkeypatch, *arguments, "--decimal", "point") == 0
     (tmp_path / "go.csv").write_text("x_mm;y_mm;z_mm\n600,125;100,250;400,500\n")  # no point is 600 m away
     assert run(monkeypatch, *arguments) == 0
+    (tmp_path / "go.csv").write_text("x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg\n600,100,400,0,90,0\n")
+    run(monkeypatch, *arguments)
+    assert "Orientation of targets: rx_deg: roll (extrinsic xyz), ry_deg: pitch" in capsys.readouterr().out
     (tmp_path / "go.csv").write_text("label,x_mm,y_mm,z_mm\nP1,9000,0,100\n")
     assert run(monkeypatch, *arguments) == 1  # unreachable, with or without a limit
     assert "1 of 1 commands miss their target" in capsys.readouterr().out

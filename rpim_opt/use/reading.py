@@ -44,8 +44,8 @@ class Targets(NamedTuple):
 
 def read_targets(
     result: Calibration, source: Any, options: TableOptions | None = None
-) -> tuple[Targets, tuple[str, ...]]:
-    """Return the targets of a table, whose columns are recognized by name, and the names of ignored columns.
+) -> tuple[Targets, Understanding]:
+    """Return the targets of a table, whose columns are recognized by name, and what was understood of it.
 
     Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
     ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses, or both: joint values are then where to
@@ -85,7 +85,12 @@ def read_targets(
             raise InputError("column approach1", "directions of approach", accepted)
     torque = None if block.torque is None else block.torque[:, 0]
     targets = Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
-    return targets, understanding.left_out
+    every = [each for table in understanding.tables for each in table.meant]
+    turned = [each for each in every if each.name.startswith(("rx", "ry", "rz", "qw,"))]
+    if turned:
+        meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
+        understanding = replace(understanding, notes=(*understanding.notes, f"Orientation of targets: {meant}."))
+    return targets, understanding
 
 
 class Measured(NamedTuple):
