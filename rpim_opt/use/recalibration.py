@@ -12,10 +12,11 @@ from scipy.special import fdtrc, logsumexp
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import joined, table
+from rpim_opt.basics.text import joined, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
+from rpim_opt.calibration.held_out import compared, displaced
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import refuse_misread
@@ -29,6 +30,8 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import knowing_sessions
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.chain import placed, same_place
+from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
 
@@ -42,6 +45,7 @@ SPARED = 0.25  # part of the readings that may be wrong
 STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
 RIVAL = 0.05  # probability from which on another cause is named beside the most probable one
 SHOWN = 5  # causes that are shown
+BASE = "base_"
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
 
 
@@ -58,7 +62,7 @@ class Fit(NamedTuple):
         return self.probability >= FALSE_ALARM
 
     def __str__(self) -> str:
-        return f"chi-squared {self.squares:.1f} of {self.equations}, p-value {self.probability:.2g}"
+        return f"chi-squared {three_digits(self.squares)} of {self.equations}, p-value {self.probability:.2g}"
 
 
 class Cause(NamedTuple):
@@ -102,6 +106,7 @@ class Update:
     (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
     readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
     evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
+    ``registered`` says that the instrument or the base moved so far that the base was registered again; else empty.
     """
 
     result: Calibration
@@ -111,6 +116,7 @@ class Update:
     causes: tuple[Cause, ...]
     moved: tuple[Moved, ...]
     readings: int
+    registered: str = ""
 
     @property
     def changed(self) -> bool:
@@ -147,12 +153,14 @@ class Update:
             lines = [f"No change of the robot is detectable from {count}: {self.before}."]
         else:
             lines = [f"{count} lie outside the prediction intervals of the last calibration: {self.before}."]
+        lines = [*filter(None, [self.registered]), *lines]
         for cause in self.changes:
             end = ", excluded" if cause.kind == "reading" else ""
-            figures = f"chi-squared falls by {cause.gain:.1f}, posterior probability {cause.probability:.2g}"
+            figures = f"chi-squared falls by {three_digits(cause.gain)}, posterior probability {cause.probability:.2g}"
             lines.append(f"  {cause.kind} {cause.name}: {figures}{end}.")
-        if self.moved:
-            lines.append(f"Changed since then: {joined([str(each) for each in self.moved])}.")
+        moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
+        if moved:
+            lines.append(f"Changed since then: {joined(moved)}.")
         rivals = [c.name for c in self.causes[1:] if self.changes and c.probability > RIVAL]
         if rivals:
             lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
@@ -163,7 +171,7 @@ class Update:
                 "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "
                 "robot; if so, calibrate it without the previous result."
             )
-        rows = [[c.name, c.kind, f"{c.gain:.1f}", f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
+        rows = [[c.name, c.kind, three_digits(c.gain), f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
         head = ["may have changed", "kind", "chi-squared falls by", "p-value", "posterior"]
         verdict = [] if self.result.verdict.delivered else [str(self.result.verdict)]
         return "\n".join([*lines, *verdict, "", table(head, rows[:SHOWN]), "", self.result.message])
@@ -187,10 +195,10 @@ def update(
 
     The result has a squared penalty or none. ``data`` are new measurements of the same robot, in the same instrument's
     frame unless ``reset`` says otherwise: patterns of parameters of which the earlier result says nothing,
-    ``("base_*",)`` where the instrument moved. ``prior_inflation`` is a factor on the earlier standard deviations,
-    where everything may have drifted a little; ``source`` says where the data come from; ``progress`` is called with
-    each step in words. InputError for a result without covariance (lasso), data in blocks, and readings that cannot be
-    this robot's.
+    ``("base_*",)`` where the instrument moved, which is done by itself where it moved far. ``prior_inflation`` is a
+    factor on the earlier standard deviations, where everything may have drifted a little; ``source`` says where the
+    data come from; ``progress`` is called with each step in words. InputError for a result without covariance (lasso),
+    data in blocks, and readings that cannot be this robot's.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -208,6 +216,9 @@ def update(
     matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
     released = tuple(np.array(free.names)[matches].tolist())
     say("comparing with the last calibration")
+    elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
+    if elsewhere:
+        released = tuple(name for name in free.names if name.startswith(BASE))
     # a frame that was reset may be anywhere: then it is registered anew
     start = None if released else previous_deviations(result, problem)
     changes: list[Cause] = []
@@ -241,10 +252,7 @@ def update(
             same = f"those of the same robot ({robots}) in the same units and instrument's frame"
             found = f"readings {1e3 * missed:.3g} mm off, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
-    was, now = (  # values: of a frame that was registered again, deviations refer to another orientation
-        dict(zip(each.problem.parameters.names, each.problem.parameters.values_at(each.x), strict=True))
-        for each in (result, updated)
-    )
+    was, now = _values(result), _values(updated)
     moved = []
     for name in [name for name in released if name in result.problem.parameters.free.names]:
         i = free.names.index(name)
@@ -266,7 +274,33 @@ def update(
         excluded=excluded, simulated=record.simulated, noise_assumed=record.noise_assumed,
         requirement=record.requirement, earlier=(*record.earlier, last), reading=record.reading, terms=record.terms,
     )  # fmt: skip
-    return Update(replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data))
+    return Update(
+        replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data), elsewhere
+    )
+
+
+def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
+    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else.
+
+    Evidence is linear in the deviations: of a base that turned far, it is none.
+    """
+    base = [name for name in problem.parameters.free.names if name.startswith(BASE)]
+    if not base or not displaced(result, problem.data, compared(result, problem.data)):
+        return ""
+    registered = _recalibrated(result, problem, base, inflation, None)
+    was, now = (np.array([_values(each)[BASE + axis] for axis in FRAME]) for each in (result, registered))
+    if same_place(was, now):
+        return ""
+    return (
+        f"The instrument or the base moved: the base is at {placed(now)} in the instrument's frame, and was at "
+        f"{placed(was)}. It was registered again, as with --reset 'base_*'."
+    )
+
+
+def _values(result: Calibration) -> dict[str, float]:
+    """Return all parameters' values [SI]; deviations of a frame registered again refer to another orientation."""
+    p = result.problem.parameters
+    return dict(zip(p.names, p.values_at(result.x).tolist(), strict=True))
 
 
 # --- the previous result as a prior ------------------------------------------------------------------------

@@ -67,7 +67,7 @@ def test_an_update_says_what_came_out() -> None:
     assert str(wrong).startswith(
         "The robot has not changed, but readings are wrong. With the previous calibration: chi-squared"
     )
-    assert "reading c1: chi-squared falls by 40.0, posterior probability 0.9, excluded." in str(wrong)
+    assert "reading c1: chi-squared falls by 40, posterior probability 0.9, excluded." in str(wrong)
     assert not wrong.changed
     moved = replace(found, before=unlikely(found.before), changes=(JOINT,), causes=(JOINT, RIVAL))
     assert str(moved).startswith("The robot has changed. With the previous calibration: chi-squared")

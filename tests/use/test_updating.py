@@ -142,6 +142,19 @@ def test_a_base_that_moved_is_one_cause() -> None:
     assert rms(found.result, robot.now) < 3 * SIGMA * 1e3
 
 
+def test_a_base_far_away_is_registered_again_and_no_joint_is_blamed() -> None:
+    """Evidence is linear: after a quarter turn of the instrument it named joints, and the base after them."""
+    robot = happened(8, base_x=1.5, base_y=-0.8, base_rx=0.6, base_rz=1.5)
+    result = ro.calibrate(robot.problem)
+    found = ro.use.update(result, robot.after)
+    assert not found.changes
+    assert {each.name[:5] for each in found.moved} == {"base_"}
+    assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
+    assert str(found).startswith("The instrument or the base moved: the base is at x 1")
+    assert "Changed since then" not in str(found)
+    assert np.allclose(found.result.x, ro.use.update(result, robot.after, reset=("base_*",)).result.x)
+
+
 def test_an_instrument_that_was_set_up_anew(crashed: Robot) -> None:
     robot = happened(8, base_x=1.5, base_y=-0.8, base_rz=1.0)
     found = ro.use.update(ro.calibrate(robot.problem), robot.after, reset=("base_*",))
