@@ -7,16 +7,23 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
-from scipy.special import bdtr, bdtrc, fdtri
+from scipy.special import bdtrc, fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.basics.units import display
-from rpim_opt.calibration.covariance import UNLIKELY
 from rpim_opt.calibration.diagnosis import SLACK
-from rpim_opt.calibration.held_out import FEWEST, compared, displaced, excluded_by_fit, headline_errors, of_positions
+from rpim_opt.calibration.held_out import (
+    FEWEST,
+    compared,
+    displaced,
+    excluded_by_fit,
+    headline_errors,
+    of_positions,
+    required_coverage,
+)
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
@@ -24,7 +31,7 @@ from rpim_opt.calibration.verdict import Verdict as Delivery
 from rpim_opt.calibration.verdict import refuse_misread, rms
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import CONFIDENCE, Requirement
+from rpim_opt.data.record import Requirement
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
@@ -363,7 +370,7 @@ def _held_out(
     held, excluded, moved = result.record.held_out, [], ""
     if apart is not None:
         held = compared(result, apart)
-        moved = displaced(result, apart, held)
+        moved = "".join(displaced(result, apart, held))
     elif held is not None:
         excluded = excluded_by_fit(result)
         known = {label: row for row, label in enumerate(result.problem.data.label)}
@@ -402,12 +409,12 @@ def _held_out(
     sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm, of "
     sentence += f"which the instrument may contribute {1e3 * instrument[inside].max(initial=0.0):.3f} mm"
     if held.coverage is not None:
-        # coordinates of a row are not independent of each other: a row counts once
-        least = float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
+        least = required_coverage(rows)
         share = f"{100 * held.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
         sentence += f"; {share} (at least {100 * least:.0f} % are required for this number of rows)"
         if held.coverage < least:
-            lacking.append(f"Missing: valid prediction intervals. Only {share}.")
+            why = "" if beyond else moved
+            lacking.append(f"Missing: valid prediction intervals. Only {share}. {why}".rstrip())
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
     if excluded:

@@ -6,13 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 from scipy.spatial.transform import Rotation
-from scipy.special import fdtri
+from scipy.special import bdtr, fdtrc, fdtri
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import sessions_spread
 from rpim_opt.bayes.outliers import by_block
-from rpim_opt.calibration.covariance import coverage_factor, noise_covariances, row_freedom
+from rpim_opt.calibration.covariance import UNLIKELY, coverage_factor, noise_covariances, row_freedom
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import pose
@@ -62,29 +62,46 @@ def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = No
     return replace(held, coverage=float(covered.mean()) if len(covered) else None)
 
 
-def displaced(result: Calibration, data: Dataset, held: HeldOut) -> str:
-    """Say that measurements are displaced together, by the motion that registers them; empty where they are not.
+def required_coverage(rows: int) -> float:
+    """Return the share of coordinates in 95 % intervals that so many rows fall below with probability 0.01.
 
-    It is said where rows are outside their prediction intervals and the motion takes more than half of the RMS error,
-    for its six degrees of freedom.
+    Coordinates of a row are not independent of each other: a row counts once.
+    """
+    return float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
+
+
+def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
+    """Say that measurements are displaced together, by the motion that registers them: as mistake or as remark.
+
+    It is said where rows are outside their prediction intervals, or too many coordinates are. A mistake is a motion
+    that takes more than half of the RMS error, for its six degrees of freedom, of rows that are outside; a remark one
+    whose part of the squared errors chance would give with probability 0.01 (Fisher's F). Both are empty otherwise.
     """
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
-    if len(rows) < FEWEST or not (held.sigmas > held.allowed)[rows].any():
-        return ""
+    far = bool((held.sigmas > held.allowed)[rows].any())
+    lacking = held.coverage is not None and held.coverage < required_coverage(len(data))
+    if len(rows) < FEWEST or not (far or lacking):
+        return "", ""
     try:
         again, motion = registered(result, data)
     except InputError:  # points on a line
-        return ""
-    before = float(np.sqrt(3 * np.mean(vectors[rows] ** 2)))
-    after = float(np.sqrt(3 * np.sum(result.error_vectors(again)[rows] ** 2) / (3 * len(rows) - 6)))
-    if after > before / 2:
-        return ""
-    return (
-        f"Likely: the instrument or the base moved. The measurements are {motion}; registered again, their RMS error "
-        f"is {1e3 * after:.3g} mm instead of {1e3 * before:.3g} mm. `validate` and `accept` do so with --register, "
-        "`update --reset 'base_*'` recalibrates. If neither moved, the robot has one common error there."
+        return "", ""
+    squares, left = (float(np.sum(each[rows] ** 2)) for each in (vectors, result.error_vectors(again)))
+    freedom = 3 * len(rows) - 6
+    before, after = np.sqrt(squares / len(rows)), np.sqrt(3 * left / freedom)
+    said = (
+        f"The measurements are {motion}; registered again, their RMS error is {1e3 * after:.3g} mm instead of "
+        f"{1e3 * before:.3g} mm."
     )
+    if far and after <= before / 2:
+        return (
+            f"Likely: the instrument or the base moved. {said} `validate` and `accept` do so with --register, "
+            "`update --reset 'base_*'` recalibrates. If neither moved, the robot has one common error there."
+        ), ""
+    if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:
+        return "", f"{said} If the instrument was set up again since the calibration, use --register."
+    return "", ""
 
 
 def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:

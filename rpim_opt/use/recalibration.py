@@ -285,7 +285,7 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     Evidence is linear in the deviations: of a base that turned far, it is none.
     """
     base = [name for name in problem.parameters.free.names if name.startswith(BASE)]
-    if not base or not displaced(result, problem.data, compared(result, problem.data)):
+    if not base or not displaced(result, problem.data, compared(result, problem.data))[0]:
         return ""
     registered = _recalibrated(result, problem, base, inflation, None)
     was, now = (np.array([_values(each)[BASE + axis] for axis in FRAME]) for each in (result, registered))

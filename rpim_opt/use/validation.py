@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table, three_digits
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import compared, displaced, registered
+from rpim_opt.calibration.held_out import compared, displaced, registered, required_coverage
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import REACH, arm_length, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
@@ -106,7 +106,10 @@ class Validation(HeldOut):
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
         covered = ""
         if self.coverage is not None:
-            covered = f" {100 * self.coverage:.0f} % of the coordinates are within their 95 % prediction intervals."
+            covered = f" {100 * self.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
+            least = required_coverage(len(self.label))
+            missing = f": of this number of rows at least {100 * least:.0f} % are expected"
+            covered += f"{missing if self.coverage < least else ''}."
         named = [
             f"{self.label[i]} ({self.sigmas[i]:.1f} standard deviations, {1e3 * self.error[i]:.3f} mm)"
             for i in self.beyond
@@ -150,6 +153,8 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
     held = compared(result, data)
     touched = touch_errors(data, held.nominal, held.error)
     remarks += shared_rows(problem.data, data)
+    moved, hint = displaced(result, data, held)
+    remarks += [hint] if hint else []
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")
     if touched:
@@ -161,7 +166,7 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         outside=result.outside(data),
         touched=touched,
         remarks=tuple(remarks),
-        mistake=misread(result, data) or displaced(result, data, held) or _elsewhere(result, held.error),
+        mistake=misread(result, data) or moved or _elsewhere(result, held.error),
         no_intervals=result.no_intervals,
     )
 

@@ -209,13 +209,22 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     # less than the nominal robot's errors, many times the prediction intervals
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.0005, -0.0006, 0.0002])),))
     assert "displaced as a whole by 0.80" in ro.use.validate(result, moved).mistake
-    accepted = ro.calibration.accept(result, ro.data.Requirement(limit=1e-2), moved)
+    requirement = ro.data.Requirement(limit=1e-2)
+    accepted = ro.calibration.accept(result, requirement, moved)
     assert accepted.verdict == "inconclusive"
     assert "the instrument or the base moved" in str(accepted)
     assert not ro.use.validate(result, instance.validation).mistake
     rejected = ro.calibration.accept(result, ro.data.Requirement(limit=2e-4), moved)
     assert rejected.verdict == "rejected"
     assert "the instrument or the base moved" in str(rejected)  # a good robot is not rejected without a hint
+    # by less than a row's interval: too few coordinates are inside theirs
+    moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([6e-5, -6e-5, 6e-5])),))
+    found, accepted = ro.use.validate(result, moved), ro.calibration.accept(result, requirement, moved)
+    assert not found.mistake
+    assert "% are expected. The measurements are displaced as a whole by 0.1 mm" in " ".join(str(found).split())
+    assert accepted.verdict == "inconclusive"
+    assert accepted.reasons[-1].endswith("If the instrument was set up again since the calibration, use --register.")
+    assert not ro.use.validate(result, moved, register=True).remarks[1:]
 
 
 @pytest.mark.parametrize("name", ["position", "pose"])
