@@ -154,10 +154,6 @@ def read_measurements(
 def _measured_in(understanding: Understanding, calibrated: Measurement) -> Measurement:
     """Return the type that columns show: the calibrated one, or a part: poses may be validated by positions."""
     stems = {split_unit(name)[0] for name in understanding.columns}
-    if not stems and understanding.left_out:
-        known = f"only unknown columns {', '.join(understanding.left_out)}"[:200]
-        accepted = f"joints' values and {', '.join(calibrated.columns)}"
-        raise InputError("the header", known, accepted, understanding.file)
     if any(stems >= set(form) for form in (calibrated.columns, *(form for form, _ in calibrated.forms))):
         return calibrated
     return next((part for part in calibrated.parts if stems >= set(part.columns)), calibrated)

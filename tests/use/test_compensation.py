@@ -486,7 +486,8 @@ def test_bad_input_is_answered_in_a_sentence(tmp_path: Path) -> None:
             ro.use.compensate(result, **arguments)
     table = tmp_path / "targets.csv"
     for text, message in {
-        "load,speed\n1,2\n": f"{table.name}, the header: found no targets",
+        "load,speed\n1,2\n": rf"{table.name}, the header: found no known column \(load, speed\)",
+        "label,speed\n1,2\n": f"{table.name}, the header: found no targets",
         "q1_deg,q2_deg\n1,2\n": "'q3'",
         "x_mm,y_mm\n1,2\n": "'z'",
         "x_mm,y_mm,z_mm,qw,qx,qy,qz\n0,0,0,2,0,0,0\n": "row 1: found a quaternion of norm 2",
