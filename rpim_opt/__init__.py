@@ -22,7 +22,8 @@ __all__ = sorted(set(_names) - set(_NAMESPACES))
 def __getattr__(name: str) -> Any:
     if name in _names:
         return _attach(name)
-    raise AttributeError(f"module 'rpim_opt' has no attribute '{name}'{_hint(name)}")
+    # without an object Python adds no guess of its own behind ours
+    raise AttributeError(f"module 'rpim_opt' has no attribute '{name}'{_hint(name)}", name=name, obj=None)
 
 
 def _hint(name: str) -> str:

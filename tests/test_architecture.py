@@ -257,6 +257,7 @@ def test_a_name_that_is_not_at_the_top_says_where_it_is(name: str, advice: str) 
     with pytest.raises(AttributeError) as caught:
         getattr(ro, name)
     assert str(caught.value) == f"module 'rpim_opt' has no attribute '{name}'{advice}"
+    assert caught.value.obj is None  # else Python's own guess follows
 
 
 def test_every_module_says_what_it_is_for() -> None:

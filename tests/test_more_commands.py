@@ -49,6 +49,9 @@ def test_numbers_units_and_the_base_are_checked_before_a_folder_is_made(
     file.write_text("\n".join([names.format(""), *table]))
     assert run(monkeypatch, *arguments, "--units", "deg,m") == 0
     assert "implausibly far away: are the units right?" in capsys.readouterr().out
+    file.write_text("\n".join([names.format(" [um]"), *table]))
+    assert run(monkeypatch, *arguments[:1], str(tmp_path / "small"), *arguments[2:], "--dry-run") == 0
+    assert "mm RMS, those of the nominal flange by" in capsys.readouterr().out
     file.write_text("\n".join([names.format(" [mm]"), *table[:-1], table[-1].rpartition(",")[0] + ",abc"]))
     arguments[1] = str(tmp_path / "other")
     assert run(monkeypatch, *arguments, "--dry-run") == 2

@@ -155,7 +155,7 @@ class Robot(Brief):
 
         mdh = _frozen(self.mdh)
         right = mdh.ndim == 2 and mdh.shape[1] == 5 and len(mdh) > 0 and bool(np.isfinite(mdh).all())
-        require(right, "mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5)")
+        require(right, "mdh", f"shape {mdh.shape}", "finite numbers of shape (dof, 5); beta may be 0")
         n = len(mdh)
         largest = np.abs(mdh).max()
         require(largest <= FARTHEST, "mdh", f"{largest:g}", f"magnitudes of at most {FARTHEST:g} m or rad")

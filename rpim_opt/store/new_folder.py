@@ -45,6 +45,7 @@ SHARED = (
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
+UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
 CAMERA_CLEARLY = 3.0  # The camera is where the poses fit so many times better.
 
@@ -402,6 +403,15 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
         close = [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]
         stated = toml(close[0] if close else down.round(3).tolist())
         how += f" If the instrument's z points up, the robot is mounted otherwise than assumed: mounting = {stated}."
+    blocks = [block for block in rows.blocks if block.measurement.registers]
+    seen = np.vstack([block.y[:, :3] for block in blocks])
+    flange = np.vstack([forward_kinematics(arm.robot, block.q[:, 0])[:, :3, 3] for block in blocks])
+    measured, nominal = (1e3 * float(np.linalg.norm(points.std(axis=0))) for points in (seen, flange))
+    if not nominal / UNLIKE < measured < nominal * UNLIKE:
+        how += (
+            f" The measured points spread by {measured:.3g} mm RMS, those of the nominal flange by {nominal:.3g} mm: "
+            "are the units right?"
+        )
     return None, how
 
 

@@ -188,6 +188,13 @@ def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:
     assert ro.problem.inspect(arm).observability.rank == ro.problem.observe(arm).rank
 
 
+def test_a_problem_from_an_array_alone_says_what_a_robot_is() -> None:
+    problem = ro.load("position").problem
+    table: Any = problem.robot.mdh
+    with pytest.raises(ro.InputError, match=r"robot: found ndarray, accepted: a Robot, such as ro.robot.Robot\("):
+        ro.problem_from(table, problem.data)
+
+
 def test_the_base_is_identified_where_values_of_a_users_own_type_depend_on_it() -> None:
     """No closed form registers it: it begins at zero, 1.9 m and 109 degrees away."""
 

@@ -19,7 +19,7 @@ MDH = ARM.mdh
 @pytest.mark.parametrize(
     ("arguments", "said"),
     [
-        ({"mdh": MDH[:, :4]}, "shape (6, 4), accepted: finite numbers of shape (dof, 5)"),
+        ({"mdh": MDH[:, :4]}, "shape (6, 4), accepted: finite numbers of shape (dof, 5); beta may be 0"),
         ({"mdh": MDH[0]}, "shape (5,)"),
         ({"mdh": MDH[:0]}, "shape (0, 5)"),
         ({"mdh": MDH * np.nan}, "finite numbers"),

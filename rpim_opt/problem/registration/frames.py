@@ -172,6 +172,9 @@ def problem_from(
     if isinstance(robot, Described):
         tool = robot.tool if tool is None else tool
         robot = robot.robot
+    if not isinstance(robot, Robot):
+        accepted = "a Robot, such as ro.robot.Robot('arm', mdh), a file, or the name of a ready robot"
+        raise InputError("robot", type(robot).__name__, accepted)
     joints = {block.q.shape[-1] for block in data.blocks}
     if joints - {robot.joint_map.shape[1]}:
         found = f"{', '.join(map(str, sorted(joints)))} joint values per row"
