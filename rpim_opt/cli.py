@@ -365,7 +365,8 @@ def report(
 ) -> Answer:
     """Write the calibration report: one self-contained HTML page, ready to be signed.
 
-    With --data it has a section of their validation; verdict and acceptance stay those of the result.
+    With --data it has a section of their validation, with the acceptance test by them where the result has a limit
+    (calibrate --limit); verdict and acceptance of the page stay those of the result.
     """
     with _loaded(result) as (loaded, say):
         _require_data(register, data)

@@ -56,7 +56,8 @@ def write_report(
     flagged rows, convergence); provenance; and in an appendix the evidence for the regularization weight. Every text
     of a user's file is shown as text. ``validation`` are measurements that were not used for identification, by default
     those of the calibration's record; ``new`` are `ro.use.validate`'s results of further ones, by the names of their
-    tables, for a section of their own. InputError where they do not belong to the problem, or none is of a length.
+    tables, for a section of their own, with the acceptance test by them where the result has a limit. InputError where
+    they do not belong to the problem, or none is of a length.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
@@ -83,7 +84,7 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     heading = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     lacking = judged(result)
     composition = [] if lacking is None else lacking.sentences()
-    warnings = summary.warnings(result)
+    warnings = summary.warnings(result, checked=bool(new))
     if lacking is not None and lacking.alarming:  # said at the top; otherwise it is a diagnosis
         warnings = [" ".join(composition), *warnings]
         composition = []
@@ -188,6 +189,12 @@ def _new_measurements(content: Content) -> Iterator[Block]:
         for head, rows in validation.tables():
             yield "table", Table(name, head, rows)
         yield "text", validation.sentences()
+        if np.isfinite(validation.error).any():
+            yield "figures", [_error_figure(content.result, "new", validation.data)]
+        if content.accepted is not None and not validation.mistake:
+            found = accept(content.result, data=validation.data)
+            checked = [] if found.held_out is None else [found.held_out["sentence"]]
+            yield "text", [f"Acceptance test by these rows. {found.sentences()[0]}", *checked, *found.reasons]
 
 
 def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
@@ -249,7 +256,7 @@ def _budget(map_: Workspace, result: Calibration) -> Table:
         rows.append(cells)
     head = ["contributor", "u [mm], maximum U", "share of u²", "u [mm], region (RMS)", "share of u²"]
     factor = map_.largest / np.sqrt(whole[-1])
-    title = f"Uncertainty budget of the position reached (GUM, u over all three axes; maximum U = {factor:.2f} u)"
+    title = f"Uncertainty budget of the position reached (GUM; u over all three axes, U is {factor:.2f} u)"
     return Table(title, head, rows)
 
 
@@ -404,7 +411,7 @@ def _provenance(content: Content) -> Iterator[Block]:
         robots.append(" - ".join(filter(None, [named, f"{robot.dof} joints", robot.source])))
     facts = {
         "Source": record.source or "not stated",
-        "Measurements": "simulated" if record.simulated else "as stated in the source; not marked as simulated",
+        "Measurements": "simulated" if record.simulated else "not marked as simulated",
         "Robot": "; ".join(robots),
         "Formulation": f"{result.formulation.name}: {_formulation(result)}",
         "Made": record.made,

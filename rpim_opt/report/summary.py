@@ -152,8 +152,8 @@ def identifiability(result: Calibration) -> str:
     return f"{text} from {model.equations} equations{apart}."
 
 
-def warnings(result: Calibration) -> list[str]:
-    """Return the warnings, the most serious first."""
+def warnings(result: Calibration, checked: bool = False) -> list[str]:
+    """Return the warnings, the most serious first; ``checked`` says that new measurements stand beside the result."""
     lines = [line for line in words.remarks(result) if line != result.message]
     excluded = result.record.excluded
     if excluded:
@@ -165,7 +165,7 @@ def warnings(result: Calibration) -> list[str]:
         repeated = sum(q.tobytes() in known for q in validation.q)
         if repeated:
             lines.append(f"{repeated} validation rows repeat identification configurations and validate nothing.")
-    elif result.record.held_out is None:
+    elif result.record.held_out is None and not checked:
         lines.append("Without validation data, the accuracy at other configurations is not verified.")
     lines += words.contact_remarks(result.problem.sample())
     lines += words.camera_remarks(result)

@@ -284,6 +284,18 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     assert ("mm, above the limit" in "".join(read.charts())) == (verdict != "Accepted")
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_new_measurements_verify_a_result_and_are_held_against_its_limit() -> None:
+    result, later = ro.calibrate(ro.load("position").problem), ro.load("position").validation
+    assert "Without validation data" in page(result)
+    new = {"later.csv": ro.use.validate(result, later)}
+    assert "Without validation data" not in page(result, new)
+    text = " ".join(Reader(page(required(result, 1e-3), new)).words.split())
+    assert "Inconclusive" in text[: text.index("Validation on new measurements")]  # the result has no held-out rows
+    assert "Acceptance test by these rows. Accepted: limit 1 mm" in text
+    assert "Held out: 40 rows" in text
+
+
 def test_a_robot_is_delivered_where_nothing_is_demanded(arm_page) -> None:
     read = Reader(arm_page)
     assert "Delivered: the fit gives no reason" in " ".join(read.words.split()).replace(" :", ":")

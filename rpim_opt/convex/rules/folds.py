@@ -108,7 +108,7 @@ def two_step(program: Program) -> Selection:
         score = np.sqrt(_of_squares(program)(fine) / len(program.model.b))
     else:
         score = held_out_error(program, _drawn(program, FOLDS))(fine)
-    note = "the paper's two steps: residual norm, then held-out error"
+    note = "two steps: coarse L-curve, then held-out error"
     edge = "; the held-out error is smallest at an edge of the ten weights, so a wider range of weights may be better"
     return choice("two_step", fine, score, int(np.nanargmin(score)), note, at_edge=note + edge)
 
