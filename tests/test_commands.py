@@ -483,7 +483,7 @@ def test_a_robot_that_does_not_stand_upright_is_told_its_mounting(tmp_path, turn
     options = TableOptions(units=parse_units("rad,m"))
     made = ro.store.new_problem(tmp_path / "cell", tmp_path / "arm.toml", tmp_path / "a.csv", options=options)
     assert '# mounting = "floor" ' in (tmp_path / "cell" / "problem.toml").read_text()
-    noted = re.search(r"z points up, .*: mounting = (.*)\.$", made.notes[1])
+    noted = re.search(r"z points up, .*: mounting = (.*)\.$", "\n".join(made.notes), re.MULTILINE)
     assert (noted[1] if noted else "") == said
 
 

@@ -34,7 +34,7 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_source, read_arm
 from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of
-from rpim_opt.store.raw import Understanding, in_time_order, rows_of, understand_of, usual_noise
+from rpim_opt.store.raw import CLEARLY, Understanding, in_time_order, rows_of, understand_of, usual_noise
 
 TABLES = ("identification.csv", "validation.csv", "target.csv")  # of a new folder
 ROBOT_OF_CHAINS = "robot.urdf"
@@ -47,7 +47,6 @@ TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
 FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
 UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
-CAMERA_CLEARLY = 3.0  # The camera is where the poses fit so many times better.
 
 
 class Started(NamedTuple):
@@ -128,8 +127,6 @@ def new_problem(
     kind, how = _kind(arm, understanding, board, measurement)
     rows = rows_of(understanding, on_board(understanding.columns, board.board), arm, kind)
     columns = understanding.columns
-    if "label" not in columns:  # a row keeps its number where others are held out
-        columns = {"label": rows.label, **columns}
     held = _held_out(rows, hold_out, seed)
     tables = {identified: _rows(columns, ~held), validated: _rows(columns, held), seen: board.table}
     if later:
@@ -317,7 +314,7 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
         misfit[name] = float(np.sqrt(np.mean(squares)))
     best, other = sorted(misfit, key=lambda name: misfit[name])
     figures = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
-    if not misfit[other] > CAMERA_CLEARLY * misfit[best]:
+    if not misfit[other] > CLEARLY * misfit[best]:
         raise InputError(
             "the camera", f"no clear mounting ({best} leaves {figures})", f"--measurement {best} or {other}"
         )

@@ -24,11 +24,11 @@ from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.joining import seconds, time_column, together
 from rpim_opt.data.tables.names import ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.data.tables.understanding import Understood, understand
+from rpim_opt.data.tables.understanding import Meant, Understood, understand
 from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 
-CLEARLY = 3.0  # The right reading of orientations leaves so many times less than another one.
+CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.
 USUAL = "extrinsic xyz"
 SINCE_1970 = 1e8  # times [s] that are larger; others may begin anew in every file
 READINGS = {
@@ -188,36 +188,34 @@ def _whole(
 ) -> Understanding:
     with in_file(files[0][0] if len(files) == 1 else None):
         whole = together(tables, arm.robot, kind, options.key, options.within)
-    shown = _with_meaning(tables, whole.keys, "joins the files", "rows of equal keys or of the nearest times")
+    join = {"meaning": "joins the files", "why": "rows of equal keys or of the nearest times"}
+    shown = _with_meaning(tables, whole.keys, **join)
     return Understanding(kind, whole.columns, whole.raw, shown, whole.notes, options, str(files[0][0] or ""))
 
 
 def in_time_order(found: Understanding) -> Understanding:
-    """Return the rows in the order of the first column of dates, or of times since 1970; as they are without one."""
+    """Return labelled rows in the order of the first column of dates, or of times since 1970, if there is one."""
+    columns = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
     unused = [each.column for table in found.tables for each in table.meant if not each.name]
     for name in filter(lambda column: time_column([column.lower()]), unused):
         with suppress(InputError, KeyError):  # no times, or not of all rows
             times = seconds(name, found.raw[name.lower()])
             if times.min() > SINCE_1970:
                 order = np.argsort(times, kind="stable").tolist()
-                labelled = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
-                columns, raw = ({n: [c[i] for i in order] for n, c in each.items()} for each in (labelled, found.raw))
-                tables = _with_meaning(found.tables, [name.lower()], "order of the rows", "times of all rows")
+                columns, raw = ({n: [c[i] for i in order] for n, c in each.items()} for each in (columns, found.raw))
+                tables = _with_meaning(found.tables, [name.lower()], meaning="order of the rows", why="times")
                 notes = (*found.notes, f"rows are in the order of '{name}'.")
                 return replace(found, columns=columns, raw=raw, tables=tables, notes=notes)
-    return found
+    return replace(found, columns=columns)
 
 
-def _with_meaning(
-    tables: Sequence[Understood], columns: Sequence[str], meaning: str, why: str
-) -> tuple[Understood, ...]:
-    """Return tables in which columns, in lower case, that have no other meaning have this one."""
-    shown = []
-    for each in tables:
-        new = {m for m in each.meant if m.column.lower() in columns and m.meaning == "not used"}
-        meant = tuple(m._replace(meaning=meaning, why=why) if m in new else m for m in each.meant)
-        shown.append(replace(each, meant=meant))
-    return tuple(shown)
+def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: str) -> tuple[Understood, ...]:
+    """Return tables in which columns, in lower case, that have no other meaning have a new one."""
+
+    def told(each: Meant) -> Meant:
+        return each._replace(**new) if each.column.lower() in columns and each.meaning == "not used" else each
+
+    return tuple(replace(table, meant=tuple(map(told, table.meant))) for table in tables)
 
 
 def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:

@@ -192,6 +192,8 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
 
 def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
     """Return a key; names that differ by case and leading zeros alone are the same where no two of one side are."""
+    if not all(any(map(str.isalpha, "".join(names[:1]))) for names in (left, right)):
+        return Key(how, columns, left, right)  # numbers and dates
     spelling = {_bare(name): name for name in left}
     if len(spelling) < len({*left}) or len({*map(_bare, right)}) < len({*right}):
         return Key(how, columns, left, right)
