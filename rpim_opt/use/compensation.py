@@ -110,8 +110,13 @@ class Compensation:
                 rows.append(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded})")
             if rows:
                 lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
-        if self.missed:
-            lines.append(f"{len(self.missed)} of {len(self.q)} commands miss their target; do not execute these rows.")
+        uncertain = int(self.uncertain.sum())
+        for count, what in (
+            (len(self.missed) - uncertain, "miss their target"),
+            (uncertain, "reach their target by the model, with an uncertainty that is above the limit"),
+        ):
+            if count:
+                lines.append(f"{count} of {len(self.q)} commands {what}; do not execute these rows.")
         far = [i for i in np.argsort(-np.nan_to_num(self.beside)) if self.beside[i] > BESIDE]
         if far:
             lines.append(
@@ -131,6 +136,11 @@ class Compensation:
         if not np.isfinite(self.limit):
             far |= self.position_error > EXPANDED * self.std
         return [self.label[i] for i in np.flatnonzero(far)]
+
+    @property
+    def uncertain(self) -> np.ndarray:
+        """Which rows (N,) are above the limit by their uncertainty alone."""
+        return (np.array(self.status) == ABOVE) & (self.position_error <= self.limit)
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -269,9 +279,23 @@ def compensate(
     status = np.where(above, ABOVE, whole["status"])
     status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
-    return Compensation(
+    found = Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
     )
+    rows = found.uncertain
+    if tool is None or not rows.any():
+        return found
+    first = reflectors(cell.problem.parameters.names)[0]
+    measured = _Cell.of(result, robot, arm, kind, None, first, base, targets.torque is not None)
+    loads = [None if each is None else each[rows] for each in (targets.torque, targets.payload)]
+    expanded = EXPANDED * measured.uncertainty(found.q[rows], *loads)[0].max()
+    if expanded > limit:
+        return found
+    why = (
+        f" The reflector's U is at most {1e3 * expanded:.3f} mm there: its positions do not determine another point of "
+        "the flange as well. Measure a second reflector, or state what is known (`known` in [prior], d6 or the tool)."
+    )
+    return replace(found, point=cell.point + why)
 
 
 def tool_uncertainty(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import re
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -522,9 +523,13 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     above = 2 * found.std + found.position_error > limit
     assert found.missed == [label for label, far in zip(found.label, above, strict=True) if far]
     assert 0 < len(found.missed) < 10
-    assert f"{found.missed[0]} (0.000 mm off, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in str(
-        found
-    )
+    said = str(found)
+    assert f"{found.missed[0]} (0.000 mm off, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in said
+    assert f"{above.sum()} of 10 commands reach their target by the model" in said
+    assert "miss their target" not in said
+    (stated,) = re.findall(r"The reflector's U is at most ([\d.]+) mm there", said)
+    rows = [found.label.index(label) for label in found.missed]
+    assert float(stated) == pytest.approx(2e3 * ro.use.compensate(result, found.q[rows]).std.max(), abs=1e-3)
 
 
 def test_orientations_have_no_uncertainty_where_they_do_not_count() -> None:
