@@ -520,6 +520,10 @@ def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch,
         said = capsys.readouterr().out
         assert f"{path.name}: {convention} DH" in said
         assert ("which place axis 1 in the base" in said) == (convention == "standard")
+        assert path.read_text().startswith("joint,theta_deg,d_mm,a_mm,alpha_deg,beta_deg,") == (
+            convention == "standard"
+        )
+        assert re.search(r"without base and tool: base x .* reflector x 30\.", said)
         read = read_arm(path)
         base = numeric_link(*robot.mdh[0, :2]) if convention == "standard" else np.eye(4)
         found = base @ numeric_frame(read.base) @ ro.robot.forward_kinematics(read.robot, q) @ numeric_frame(read.tool)

@@ -233,14 +233,16 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
 
 def _write_table(result: Calibration, marker: str | None, dh: str, target: Path) -> list[str]:
     """Write a DH table; say in which convention."""
-    robot = identified(result, marker).robot
+    arm = identified(result, marker)
+    robot = arm.robot
     write_robot(robot, target, dh)
     convention = CONVENTIONS[dh.lower()]
     alpha, a = 1e3 * robot.mdh[0, :2]
     apart = ""
     if convention == "standard" and (alpha or a):
         apart = f" Not in it: alpha1 = {alpha:.4g} mrad and a1 = {a:.4g} mm, which place axis 1 in the base."
-    return [f"{target.name}: {CONVENTION[convention]}.{apart}"]
+    ends = f"base {placed(arm.base)} in the instrument's frame, reflector {placed(arm.tool)} in the flange frame"
+    return [f"{target.name}: {CONVENTION[convention]}.{apart}", f"{target.name} is without base and tool: {ends}."]
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:

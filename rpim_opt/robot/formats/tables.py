@@ -38,6 +38,7 @@ INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
 SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
          "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper"}  # fmt: skip
 """Other names of columns."""
+SHEET_ORDER = ("theta", "d", "a", "alpha", "beta")  # of a data sheet in the standard convention
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
@@ -263,6 +264,7 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
     Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere. ``convention`` is
     stated in the file; ``"standard"`` (or another word for it) writes a CSV from axis 1 to the same last frame: without
     alpha1 and a1, which place axis 1 in the base, and with zeros for a and alpha of the last row, which are the tool's.
+    Its columns are those of a data sheet, joint, theta, d, a, alpha, in mm and degrees with 15 digits.
 
     The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV, which
     has no place for them, a coupling of joints, a mounting other than on the floor, and a payload.
@@ -273,7 +275,10 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
     if convention == "standard":
         if ending != ".csv":
             raise InputError("--dh", "standard", "a name ending in .csv: robot.toml and its JSON are modified", path)
-        robot = replace(robot, mdh=standard_table(robot), gravity=replace(robot.gravity, masses=(), centres=()))
+        units = [display(dimension)[1] for dimension in MDH_DIMENSION.values()]
+        numbers = (standard_table(robot) / units).tolist()
+        rounded = np.array([[float(f"{number:.15g}") for number in row] for row in numbers]) * units
+        robot = replace(robot, mdh=rounded, gravity=replace(robot.gravity, masses=(), centres=()))
     content = _content(robot)
     if ending == ".json":
         write_json(path, content)
@@ -311,8 +316,9 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
         return []
     lost = 1e3 * np.radians(1e-4) * np.abs(table[:, 3]).max()
     return [
-        f"Nearly parallel axes have their common normal far away ({', '.join(far)}): transfer all digits (angles "
-        f"rounded to 0.0001 degrees cause {lost:.2g} mm of error), or use a format that has beta (--mdh, --urdf)."
+        f"{Path(path).name}: use --mdh or --urdf if you can, which have beta. Here nearly parallel axes have their "
+        f"common normal far away ({', '.join(far)}): transfer all digits (angles rounded to 0.0001 degrees cause "
+        f"{lost:.2g} mm of error)."
     ]
 
 
@@ -392,8 +398,12 @@ def _csv(content: dict[str, Any], in_si: bool, convention: str) -> str:
         if key in content:
             raise InputError("robot", what, "a name ending in .toml or .json")
     units = {column: SI[kind] if in_si else display(kind)[0] for column, kind in MDH_DIMENSION.items()}
-    header = [f"{column}_{unit}" for column, unit in units.items()]
+    sheet = convention == "standard"
+    header = [f"{column}_{units[column]}" for column in (SHEET_ORDER if sheet else MDH)]
     rows = [dict.fromkeys(header, 0.0) | joint for joint in content["joint"]]
+    if sheet:
+        header = ["joint", *header]
+        rows = [{"joint": number} | row for number, row in enumerate(rows, start=1)]
     for row in rows:
         for unit in UNITS:  # the two limits in cells of their own
             pair = zip(LIMITS, row.pop(f"limits_{unit}", ()), strict=False)
