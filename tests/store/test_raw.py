@@ -439,7 +439,8 @@ def test_names_that_differ_by_zeros_are_joined_in_the_order_of_time(monkeypatch,
     more = ["--key", key] if key else []
     assert new(monkeypatch, arm, tmp_path / "cell", files, *more) == 0
     said = capsys.readouterr().out
-    assert "names are joined that differ by case or leading zeros alone: 'p0' as 'P000'." in said
+    how = "Punkt = Target" if key else "label"
+    assert f"joined by {how} ('p0' as 'P000'): {COUNT} rows of {COUNT} with joints and {COUNT} measured." in said
     assert "rows are in the order of 'Timestamp'." in said
     data = ro.load(tmp_path / "cell").problem.data
     assert list(data.label) == [f"P{i:03d}" for i in reversed(range(COUNT))]

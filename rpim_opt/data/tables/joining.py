@@ -41,17 +41,12 @@ SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
 
 
 class Key(NamedTuple):
-    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones.
-
-    Keys that differ by case and leading zeros alone have the spelling of the joints' table, for which ``spelled`` is an
-    example, ``'P1' as 'P001'``.
-    """
+    """What names rows on both sides: in words, its columns, and the keys of the rows with joints and measured ones."""
 
     how: str
     columns: tuple[str, ...]
     left: list[str]
     right: list[str]
-    spelled: str = ""
 
 
 class Match(NamedTuple):
@@ -150,8 +145,6 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
     names = [chosen.right[i] for i in right]
     counts = f"{len(right)} rows of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
-    if chosen.spelled:
-        notes.append(f"names are joined that differ by case or leading zeros alone: {chosen.spelled}.")
     lonely = [name for name in chosen.left if name not in set(names)]
     lonely += [name for name in chosen.right if name not in place]
     if lonely:
@@ -191,15 +184,15 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
 
 
 def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
-    """Return a key; names that differ by case and leading zeros alone are the same where no two of one side are."""
+    """Return a key; measured names that differ by case and leading zeros alone are spelled as those with joints."""
     if not all(any(map(str.isalpha, "".join(names[:1]))) for names in (left, right)):
         return Key(how, columns, left, right)  # numbers and dates
     spelling = {_bare(name): name for name in left}
     if len(spelling) < len({*left}) or len({*map(_bare, right)}) < len({*right}):
         return Key(how, columns, left, right)
     named = [spelling.get(_bare(name), name) for name in right]
-    changed = (f"'{old}' as '{new}'" for old, new in zip(right, named, strict=True) if old != new)
-    return Key(how, columns, left, named, next(changed, ""))
+    examples = (f" ('{old}' as '{new}')" for old, new in zip(right, named, strict=True) if old != new)
+    return Key(how + next(examples, ""), columns, left, named)
 
 
 def _bare(name: str) -> str:
