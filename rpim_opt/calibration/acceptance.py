@@ -228,7 +228,8 @@ class Acceptance:
 
     ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
     ``repeatability`` would be the largest of them if all parameters were known [m]. ``held_out`` are the errors on
-    held-out rows and the coverage of their intervals, a document [mm] with its ``sentence``.
+    held-out rows and the coverage of their intervals, a document [mm] with its ``sentence``. ``caution`` says how joint
+    values count, where their signs or zeros were estimated.
     """
 
     requirement: Requirement
@@ -237,6 +238,7 @@ class Acceptance:
     workspace: Workspace | None = None
     repeatability: float | None = None
     held_out: Mapping[str, Any] | None = None
+    caution: str = ""
 
     @property
     def bound(self) -> float | None:
@@ -253,11 +255,13 @@ class Acceptance:
         return Delivery(calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
 
     def sentences(self) -> list[str]:
-        """Return the verdict and its grounds, sentence by sentence."""
+        """Return the verdict, its reasons and its grounds, sentence by sentence."""
         requirement = self.requirement
         limit = f"limit {1e3 * requirement.limit:g} mm with {percent(requirement.confidence)} confidence"
         lines = [
             f"{self.verdict.capitalize()}: {limit} at every configuration of the region.",
+            *self.reasons,
+            *filter(None, [self.caution]),
             f"Region: {requirement.where}.",
         ]
         workspace = self.workspace
@@ -266,7 +270,7 @@ class Acceptance:
             lines += [f"{workspace.summary}.", another]
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
-        return [*lines, *self.reasons]
+        return lines
 
     def __str__(self) -> str:
         return "\n".join(self.sentences())
@@ -288,6 +292,7 @@ class Acceptance:
             "place_mm": workspace and (1e3 * workspace.position[-1]).tolist(),
             "checked": self.held_out and {k: v for k, v in self.held_out.items() if k != "sentence"},
             "reasons": list(self.reasons),
+            "caution": self.caution or None,
         }
 
 
@@ -328,7 +333,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
         reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
-        return Acceptance(requirement, "rejected" if against else "inconclusive", reasons, held_out=held_out)
+        word: Verdict = "rejected" if against else "inconclusive"
+        return Acceptance(requirement, word, reasons, held_out=held_out, caution=result.caution)
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
@@ -359,7 +365,8 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "inconclusive"
-    return Acceptance(requirement, verdict, tuple(against or lacking), mapped, repeatability, held_out)
+    reasons = tuple(against or lacking)
+    return Acceptance(requirement, verdict, reasons, mapped, repeatability, held_out, result.caution)
 
 
 def _held_out(

@@ -107,6 +107,11 @@ class Outcome:
         """The deviations (n,) in units of their scales."""
         return self.x / self.problem.parameters.free.scale
 
+    @property
+    def caution(self) -> str:
+        """How joint values count where their signs or zeros were estimated (`JointMapping.caution`); else empty."""
+        return "" if self.mapping is None else self.mapping.caution
+
     # --- the robot that was found ------------------------------------------------------------------------------
 
     @property

@@ -11,13 +11,13 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NotDelivered
-from rpim_opt.basics.text import joined, three_digits
+from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.diagnosis import decimals_of, first
+from rpim_opt.problem.diagnosis import NOTICED, decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
@@ -43,7 +43,6 @@ SPARE = 2.0  # equations per parameter of the frames below which nominal errors 
 INTERPOLATED = 0.1  # residual degrees of freedom below which nothing checks a fit; 73 good tables of few rows left 0.3
 WORSE = 3.0  # standard errors by which squared errors on held-out rows are above those of the nominal robot
 ROWS = 12  # rows below which a standard error of squares says too little, and only twice the nominal error counts
-NOTICED = 2**0.5  # the same from which on an effect may explain half of the squares, and leave no less than the noise
 UPWARD = 5.0  # standard deviations by which a compliance is below zero, which gravity cannot cause
 NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
 HOPELESS = 20.0  # residuals over the stated noise from which something is said even if nothing explains them
@@ -353,7 +352,7 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
         if not causes and noticed and len(problem.arms) == 1:
             limits = [f"{BAD}: residuals; {text}" for text in _limited_by_formulation(result, problem, kept)]
-            causes = [] if limits else list(diagnosis.shown_by_residuals(_without_outliers(result, ordered), result.x))
+            causes = [] if limits else list(diagnosis.shown_by_residuals(*_without_outliers(result, ordered)))
             shared += limits
     if noticed:
         causes += _upward(result, problem)
@@ -477,16 +476,9 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     causes = [*_single_rows(result, ordered), *read]
     if causes:
         return causes
-    causes = first(diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem))
-    if not causes:
-        alone, x = _without_outliers(result, ordered), result.x
-        added = () if result.learned is None else result.learned.added
-        curves = [name for name in added if not name.startswith(BENDS)]
-        if curves:  # they take up ratios and scales of all kinds
-            p = problem.parameters
-            alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
-            x = ridge_deviations(alone)
-        causes = list(diagnosis.shown_by_residuals(alone, x))
+    causes = first(
+        diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem), _shown_without_outliers(result, ordered)
+    )
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))
     unrelated = diagnosis.unrelated_rows(problem, error)
@@ -507,12 +499,41 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
     return problem.on(Dataset.together(list(there.values()), list(there)).take(order))
 
 
-def _without_outliers(result: Outcome, ordered: CalibrationProblem) -> CalibrationProblem:
-    """Return the problem's rows without outliers, and others with no larger errors: of these gross ones are unknown."""
-    single = {flag.label for flag in result.flagged} - set(result.clustered)
-    errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(set(result.problem.labels) - single))
+def _single(result: Outcome) -> list[str]:
+    """Return the labels of the outliers that are in the fit, the worst first."""
+    return [flag.label for flag in result.flagged if flag.label not in result.clustered]
+
+
+def _without_outliers(result: Outcome, ordered: CalibrationProblem) -> tuple[CalibrationProblem, Array]:
+    """Return the problem's rows without outliers, and others with no larger errors: of these gross ones are unknown.
+
+    And the deviations (n,) [SI] that fit them: a squared loss is biased by outliers.
+    """
+    single = _single(result)
+    errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(set(result.problem.labels) - set(single)))
     largest = np.nan_to_num(errors[own]).max()
-    return ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
+    alone = ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
+    return alone, ridge_deviations(alone) if single and result.squared_loss else result.x
+
+
+def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:
+    """Say that outliers make a squared loss fit badly, if all is well without them, else what other residuals show."""
+    alone, x = _without_outliers(result, ordered)
+    single = _single(result)
+    ratio = max(noise_ratio(alone, alone.errors(x, each), each) for each in UNITS)
+    if single and result.squared_loss and ratio <= NOISY:
+        yield (
+            f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the stated noise. "
+            "They bias a squared loss: use formulation 'robust', or leave them out ([exclude])."
+        )
+        return
+    added = () if result.learned is None else result.learned.added
+    curves = [name for name in added if not name.startswith(BENDS)]
+    if curves:  # they take up ratios and scales of all kinds
+        p = result.problem.parameters
+        alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
+        x = ridge_deviations(alone)
+    yield from diagnosis.shown_by_residuals(alone, x)
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

@@ -97,8 +97,8 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
             errors = f"Identification error (mean): {means}."
             break
     reasons = [text for text in verdict.reasons if text != result.message]
-    lines = [*turned_frames(result), errors, *reasons, *weight_lines(result), noise_sentence(result)]
-    return [*lines, *remarks(result)]
+    above = [*turned_frames(result), errors, *filter(None, [result.caution]), *reasons]
+    return [*above, *weight_lines(result), noise_sentence(result), *remarks(result, verdict)]
 
 
 def noise_sentence(result: Outcome) -> str:
@@ -130,9 +130,9 @@ def weight_lines(result: Outcome) -> list[str]:
     return [f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."]
 
 
-def remarks(result: Outcome) -> list[str]:
-    """Return remarks on outliers, active bounds, an assumed noise and convergence."""
-    lines = _outlying(result)
+def remarks(result: Outcome, verdict: Verdict) -> list[str]:
+    """Return remarks on outliers, active bounds, an assumed noise and convergence; no advice beside reasons."""
+    lines = _outlying(result, verdict.delivered)
     for held in result.active_bounds[:MOST_BOUNDS]:
         unit, si = display(result.problem.parameters.dimension_of(held.name))
         tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
@@ -157,7 +157,7 @@ def remarks(result: Outcome) -> list[str]:
     return [*lines, result.message]
 
 
-def _outlying(result: Outcome) -> list[str]:
+def _outlying(result: Outcome, advised: bool) -> list[str]:
     flagged = result.flagged
     if not flagged:
         return []
@@ -170,7 +170,7 @@ def _outlying(result: Outcome) -> list[str]:
             " outliers: the model lacks an effect there (model 'auto' tests compliance and gear eccentricity), or"
             " the set-up moved. --drop-outliers keeps them."
         )
-    if len(together) < len(flagged) and result.squared_loss:
+    if advised and len(together) < len(flagged) and result.squared_loss:
         lines.append("Outliers bias a squared loss: use formulation 'robust', or exclude them.")
     return lines
 

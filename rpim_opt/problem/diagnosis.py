@@ -24,7 +24,7 @@ from rpim_opt.problem.misreadings import BETTER, WRONG, better_reading, coupling
 from rpim_opt.problem.noise import UNITS, Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
-from rpim_opt.problem.registration.frames import fitted_frames
+from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.registration.points import Fit, Points, fit_points, lengths_of, misfit, points_of
 from rpim_opt.problem.row_functions import about_means, repeated
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
@@ -35,6 +35,8 @@ LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}  # a joint that m
 FAR = 5.0
 """A row is in question from so many medians of the errors on, or robust standard deviations above their median."""
 ALIKE = (0.4, 2.5)  # rounding explains errors that are between these multiples of what it makes
+NOTICED = 2**0.5
+"""Residuals over the noise from which on half of the squares may be explained, and no less than the noise be left."""
 MOVED = 0.5  # an instrument has moved if that leaves less than this part of the sum of squares
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
@@ -47,6 +49,7 @@ LINEAR, EXACT = 13, 1e-5
 BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
+FOLDED = 0.1  # part of its largest value below which the smallest one of a column without signs is near zero
 ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their last decimal
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
@@ -223,9 +226,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     data, free = problem.data, problem.parameters.free.names
     fitted, x = fitted_frames(problem)
     residual = fitted.errors(x)
-    middle = np.nanmedian(residual)
-    limit = middle + FAR * 1.4826 * np.nanmedian(np.abs(residual - middle))
-    order = np.argsort(-np.nan_to_num(residual))
+    far, order = far_off(residual), np.argsort(-np.nan_to_num(residual))
     groups: list[tuple[str, ...]] = []
     squares, freedom = 0.0, 0
     for block in data.blocks:
@@ -241,7 +242,6 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         pairs = ", ".join(f"{name[4:]} and {int(name[4:]) + 1}" for name in needed)
         proposals = (f"the axes {pairs} are nearly parallel: add {', '.join(needed)} to `identify`.",)
     # all are identified again, with frames where they were fitted
-    own = dict(zip(fitted.parameters.free.names, x, strict=True))
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
     warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation), *rows_without_values(problem)]
     warnings += filled_rows(data)
@@ -249,13 +249,12 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     if better is not None:
         warnings.append(better.sentence)
     else:
-        there = np.array([own.get(name, 0.0) for name in free])
         warnings += exchanged_rows(problem)
-        warnings += first(moved_far(problem), shown_by_residuals(whole, there, transmission=False))
+        warnings += first(moved_far(problem), shown_by_fit(whole))
     return Inspection(
         problem=problem,
         residual=residual,
-        standing_out=tuple(data.label[i] for i in order if residual[i] > limit and len(data) > 4),
+        standing_out=tuple(data.label[i] for i in order if far[i] and len(data) > 4),
         repeated=tuple(groups),
         repeatability=float(np.sqrt(squares / freedom)) if freedom else None,
         warnings=tuple(warnings),
@@ -263,6 +262,12 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         observability=observe(whole),
         contact=tuple(contact_sentences(problem)),
     )
+
+
+def far_off(errors: Array) -> np.ndarray:
+    """Return which errors (N,) are `FAR` robust standard deviations above their median."""
+    middle = np.nanmedian(errors)
+    return errors > middle + FAR * 1.4826 * np.nanmedian(np.abs(errors - middle))
 
 
 def first(*explanations: Iterable[str]) -> list[str]:
@@ -580,8 +585,10 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
     left = {column: misfit(each) for column, each in fitted.items()}
     column = min(left, key=left.__getitem__)
     if left[column] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
-        if points.y.min() >= 0:
-            yield "no value of column x, y and z is negative: were signs lost?"
+        low, high = points.y.min(axis=0), points.y.max(axis=0)
+        folded = [axis for axis, k in zip("xyz", (low >= 0) & (low < FOLDED * high), strict=True) if k]
+        if folded:
+            yield f"no value of column {joined(folded)} is negative, and some are near zero: were signs lost?"
         return
     best = fitted[column]
     apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
@@ -790,6 +797,16 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
         return np.asarray(G - own @ (own.T @ G), dtype=float)
 
     return without
+
+
+def shown_by_fit(problem: CalibrationProblem) -> Iterator[str]:
+    """Report what residuals of a fit with the stated scales show, without rows far off; nothing within the noise."""
+    near = np.flatnonzero(~far_off(problem.errors(ridge_deviations(problem))))
+    alone = problem.on(problem.data.take(near))
+    x = ridge_deviations(alone)
+    norms, count = alone.whitened_errors(x)
+    if norms @ norms > NOTICED**2 * count.sum():
+        yield from shown_by_residuals(alone, x, transmission=False)
 
 
 def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: bool = True) -> Iterator[str]:

@@ -108,10 +108,14 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
 def _headline(content: Content) -> Iterator[Block]:
     result = content.result
     accepted = content.accepted
+    reasons = result.verdict.reasons
     yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
     if accepted is not None:
         word, _, text = accepted.sentences()[0].partition(": ")
-        if accepted.bound is not None and np.isfinite(accepted.bound):
+        first, *reasons = accepted.reasons or [""]
+        if first:
+            text = f"{text} {first}"
+        elif accepted.bound is not None:
             U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
@@ -122,7 +126,7 @@ def _headline(content: Content) -> Iterator[Block]:
         text = "the fit gives no reason against using this robot; no acceptance limit is stated."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
-    yield "notes", [*result.verdict.reasons, *result.verdict.beside(result.causes)]
+    yield "notes", [*filter(None, [result.caution]), *reasons, *result.verdict.beside(result.causes)]
     name, nominal, identified = headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:
@@ -198,7 +202,7 @@ def _new_measurements(content: Content) -> Iterator[Block]:
 
 
 def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
-    lines = found.sentences()[1:]
+    lines = [text for text in found.sentences()[1:] if text not in (*found.reasons, found.caution)]  # said at the top
     if found.workspace is not None:
         units = joint_columns(result.problem.robot.joint_dimensions)
         values = [f"{value / si:.1f}" for value, si in zip(found.workspace.q[-1], units.values(), strict=True)]

@@ -122,7 +122,7 @@ def headline(result: Calibration) -> str:
         change = f"{change.replace('rises', 'falls')}, by a factor of {factor}"
     sentence = f"{where} the mean {what} {change}."
     if not result.verdict.delivered:
-        return f"Not delivered: this robot should not be used. {sentence}"
+        return f"Not delivered: do not use this robot before the points below are resolved. {sentence}"
     held = result.record.held_out
     if held is not None:
         sentence += (
@@ -154,7 +154,7 @@ def identifiability(result: Calibration) -> str:
 
 def warnings(result: Calibration, checked: bool = False) -> list[str]:
     """Return the warnings, the most serious first; ``checked`` says that new measurements stand beside the result."""
-    lines = [line for line in words.remarks(result) if line != result.message]
+    lines = [line for line in words.remarks(result, result.verdict) if line != result.message]
     excluded = result.record.excluded
     if excluded:
         lines.append(f"Excluded before the fit: {counted(len(excluded), 'row')}, {listed(list(excluded))}.")
@@ -211,6 +211,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "source": record.source,
         **{key: whole[key] for key in KEYS},
         "headline": headline(result),
+        "caution": result.caution or None,
         "errors": errors,
         "orientation": orientation_rows(result),
         "shadow_prices": [price._asdict() for price in result.shadow_prices],
@@ -223,12 +224,13 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
 
 
 def describe(result: Calibration, document: Mapping[str, Any]) -> str:
-    """Return a `summary` as text: headline, verdict, what was estimated, warnings, and the tables."""
+    """Return a `summary` as text: headline, verdict or acceptance, what was estimated, warnings, and the tables."""
     details = [f"{FIELDS[key]}: {text}" for key, text in document["details"].items()]
     lines = [*filter(None, [document["title"], document["source"]]), *details, "", document["headline"]]
-    lines += document["verdict"]["reasons"]
     if document["acceptance"]:
         lines += document["acceptance"]["text"]
+    else:
+        lines += [*filter(None, [document["caution"]]), *document["verdict"]["reasons"]]
     lines += ["", *document["remarks"]]
     if document["lack_of_fit"]:
         lines += document["lack_of_fit"]["text"]

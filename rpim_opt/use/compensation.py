@@ -247,7 +247,7 @@ def compensate(
     """
     verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
     note = verdict.require(despite_verdict)
-    note = " ".join(filter(None, [note, result.mapping and result.mapping.caution, result.no_intervals]))
+    note = " ".join(filter(None, [note, result.caution, result.no_intervals]))
     arm = pick(result.problem.arms, robot, "robot")
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
     if not largest >= SMALLEST:

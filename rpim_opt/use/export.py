@@ -125,7 +125,7 @@ def export_files(
         notes.append(f"Not written: {corrections.name}, since the calibration has no transmission errors.")
         corrections = None
     note, remarks, undecided = _judged(whole, result, despite_verdict)
-    note = " ".join(filter(None, [note, whole.mapping and whole.mapping.caution]))
+    note = " ".join(filter(None, [note, whole.caution]))
     frames |= {"marker": marker, "despite_verdict": True}  # it was asked
     corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),

@@ -180,6 +180,19 @@ def test_the_change_point_is_where_the_instrument_moved() -> None:
         assert "1.1" in text  # 1 mm along x and half of it along y
 
 
+@pytest.mark.parametrize("robot", ROBOTS)
+def test_a_small_motion_of_the_instrument_is_named_before_calibrating_too(robot: str) -> None:
+    """Half a millimetre, as large as the nominal robot's errors, which hide it until they are fitted."""
+    shift = np.array([0.4e-3, 0.25e-3, 0.0]) * (np.arange(COUNT) >= 29)[:, None]
+    moved = values(lambda y: y + shift)(simulated_arm(robot))
+    for texts in (inspect(moved).warnings, likely_causes(ro.calibrate(moved))):
+        (text,) = [text for text in texts if "hardly" not in text]
+        assert "from row P30 on the points are 0.4" in text
+        assert "did the instrument or the robot's base move?" in text
+    alone = values(lambda y: y + 3e-3 * (np.arange(COUNT) == 7)[:, None])(simulated_arm(robot))
+    assert not [text for text in inspect(alone).warnings if "hardly" not in text]
+
+
 def made(monkeypatch, folder, problem, *options: str, robot: str = "ur5e") -> None:
     """Make the folder ``cell`` from a raw table of what was measured."""
     (block,) = problem.data.blocks
@@ -206,6 +219,28 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
         assert "mm instead of" in said
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_joint_that_the_table_counts_the_other_way_is_said_below_the_headline(monkeypatch, capsys, tmp_path) -> None:
+    """And in report and acceptance test, until robot.toml says it, too."""
+    made(monkeypatch, tmp_path, flipped(1)(simulated_arm("ur5e")))
+    cell, out, robot = str(tmp_path / "cell"), str(tmp_path / "out"), tmp_path / "cell" / "robot.toml"
+    said = "Table and robot file count joint values differently: joint 2 reversed (sign = -1). "
+    assert run(monkeypatch, "calibrate", cell, "--out", out) == 0
+    lines = capsys.readouterr().out.splitlines()
+    headline = next(i for i, line in enumerate(lines) if "the mean position error falls" in line)
+    assert lines[headline + 1].startswith(said)
+    assert run(monkeypatch, "report", out) == 0
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert said in page.partition("<section")[0]
+    assert run(monkeypatch, "accept", out, "--limit", "5") == 4  # without held-out rows
+    assert capsys.readouterr().out.count(said) == 1
+    assert run(monkeypatch, "calibrate", cell, "--limit", "5") == 4
+    assert capsys.readouterr().out.count(said) == 1
+    robot.write_text(robot.read_text().replace("alpha_deg = 90\n", "alpha_deg = 90\nsign = -1\n", 1))
+    assert run(monkeypatch, "calibrate", cell) == 0
+    assert "count joint values differently" not in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -354,6 +389,19 @@ def test_an_outlier_of_a_squared_loss_is_no_moved_base(row: int) -> None:
     result = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, y=y),))), ro.tikhonov, weight=1.0)
     assert problem.data.label[row] in [flag.label for flag in result.flagged]
     assert not any("base" in cause for cause in result.causes)
+
+
+@pytest.mark.parametrize("robot", ROBOTS)
+@pytest.mark.parametrize("weight", [0.5, "reml"])
+def test_gross_errors_under_a_squared_loss_are_outliers_and_no_backlash(robot: str, weight) -> None:
+    wrong = values(lambda y: y + 3e-3 * np.eye(COUNT, 3))(simulated_arm(robot))
+    result = ro.calibrate(wrong, "tikhonov", weight)
+    assert {flag.label for flag in result.flagged} == {"P1", "P2", "P3"}
+    (text,) = result.verdict.reasons
+    assert re.match(r"Likely: outliers \((P[123](, )?){3}\): without them residuals are 0\.\d+ times", text)
+    assert "use formulation 'robust', or leave them out ([exclude])" in str(result)
+    assert str(result).count("'robust'") == 1
+    assert ro.calibrate(wrong, "robust", weight).verdict.delivered
 
 
 def test_an_exchanged_reflector_is_no_moved_foot() -> None:

@@ -34,8 +34,8 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     bare = Acceptance(LIMIT, "inconclusive", ("Missing: rows.",))
     assert bare.sentences() == [
         "Inconclusive: limit 0.1 mm with 95 % confidence at every configuration of the region.",
-        "Region: joints within the measured ranges.",
         "Missing: rows.",
+        "Region: joints within the measured ranges.",
     ]
     assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "repeatability", "box")] == [None] * 4
     free = Acceptance(LIMIT, "inconclusive", (), expanded(500, np.inf, 5e-5), 2e-5)

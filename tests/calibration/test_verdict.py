@@ -175,7 +175,7 @@ def test_commands_follow_it(monkeypatch, capsys, tmp_path: Path) -> None:
     assert "despite the verdict" in capsys.readouterr().out
     assert run(monkeypatch, "accept", folder, "--limit", "500") == 1
     assert run(monkeypatch, "report", folder) == 0
-    assert "should not be used" in (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert "do not use this robot" in (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def test_a_weight_that_makes_a_robot_worse_than_nominal_is_no_delivery() -> None:

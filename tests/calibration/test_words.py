@@ -15,6 +15,7 @@ from rpim_opt.calibration.certificate import Certificate
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, ShadowPrice
 from rpim_opt.calibration.identify import ending
 from rpim_opt.calibration.loop import Ended, State
+from rpim_opt.calibration.verdict import Verdict
 from tests.calibration.test_loop import state
 
 RESULT = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1e-3)
@@ -59,7 +60,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
         formulation=ro.tikhonov,
         message="Done.",
     )
-    return words.remarks(stand_in)
+    return words.remarks(stand_in, Verdict())
 
 
 def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
@@ -99,7 +100,7 @@ def test_what_a_file_could_not_hold_is_said() -> None:
         formulation=replace(ro.tikhonov, solvable=False),
         message="Done.",
     )
-    assert "cannot be solved again" in words.remarks(stand_in)[0]
+    assert "cannot be solved again" in words.remarks(stand_in, Verdict())[0]
 
 
 def test_errors_before_and_after_are_in_millimetres() -> None:
@@ -150,8 +151,8 @@ def test_deviations_beyond_a_tolerance_that_nothing_bounds_are_named() -> None:
     instance = ro.load("paper_arm")
     tight = instance.problem.with_parameters(instance.problem.parameters.toleranced({"length_mm": 0.01}))
     free = ro.calibrate(tight, ro.tikhonov, 1e-3)
-    (line,) = [line for line in words.remarks(free) if "tolerance" in line]
+    (line,) = [line for line in words.remarks(free, free.verdict) if "tolerance" in line]
     assert line.endswith("Only the formulation 'bounded' enforces tolerances.")
     assert "d4" in line
     bounded = ro.calibrate(tight, ro.bounded, 1e-3)
-    assert not [line for line in words.remarks(bounded) if line.startswith("Beyond")]
+    assert not [line for line in words.remarks(bounded, bounded.verdict) if line.startswith("Beyond")]

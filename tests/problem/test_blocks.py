@@ -94,7 +94,7 @@ def test_flags_come_from_all_parts_and_are_dropped_in_all(whole: ro.CalibrationP
     order = np.concatenate(thirds(whole))
     np.testing.assert_allclose(here.nominal_errors(), there.nominal_errors()[order], rtol=1e-9)
     assert str(here).splitlines()[-1] == here.message
-    assert sum("Outliers" in line and "1:" in line for line in words.remarks(here)) == 1
+    assert sum("Outliers" in line and "1:" in line for line in words.remarks(here, here.verdict)) == 1
 
 
 def test_dropping_everything_is_refused(whole: ro.CalibrationProblem) -> None:

@@ -152,7 +152,7 @@ def test_a_report_says_what_a_reader_must_know() -> None:
     stopped = ro.load("position")
     result = ro.calibrate(stopped.problem, ro.tikhonov, 1.0, max_iterations=1)
     text = page(result)
-    assert "Not delivered: this robot should not be used." in text
+    assert "Not delivered: do not use this robot before the points below are resolved." in text
     assert "40 validation rows repeat" in page(replace(result, record=ro.data.Record(validation=result.problem.data)))
     assert "(no validation data)" in text
     assert "Without validation data" in text
@@ -273,11 +273,13 @@ def required(result: ro.calibration.Calibration, limit: float) -> ro.calibration
 def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) -> None:
     read = Reader(page(required(result_of("position"), limit)))
     words = " ".join(read.words.split())
-    assert (
-        0
-        <= words.index(f"{verdict}: expanded uncertainty of the position reached (U, 95 %) at most")
-        < words.index("Mean error, nominal")
+    said = (
+        "limit 0.07 mm with 95 % confidence at every configuration of the region. Missing: measurements. The bound is"
     )
+    if verdict == "Accepted":
+        said = "expanded uncertainty of the position reached (U, 95 %) at most"
+    assert 0 <= words.index(f"{verdict}: {said}") < words.index("Mean error, nominal")
+    assert words.count("Missing: measurements.") == (verdict != "Accepted")
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
     assert "The maximum U is at joints" in words

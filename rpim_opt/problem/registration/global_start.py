@@ -15,7 +15,7 @@ from itertools import product
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.text import joined, listed, three_digits
+from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
@@ -89,12 +89,19 @@ class JointMapping:
     same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
 
     @property
+    def explanations(self) -> str:
+        """Return signs and zeros as text, with the other descriptions of the same robot."""
+        return ", or ".join(described(self.joint_types, each.sign, each.zero) for each in (self, *self.same))
+
+    @property
     def caution(self) -> str:
-        """Return how joint values count in what is made of the calibrated robot."""
+        """Return that table and robot file count joint values differently, and what to check and to write."""
+        equally = " (both explain the data equally well)" if self.same else ""
         return (
-            f"Joint values count as in the calibrated table: {described(self.joint_types, self.sign, self.zero)} "
-            "against the robot file. If the controller counts as the file does, correct the table's columns and "
-            "calibrate again before using this."
+            f"Table and robot file count joint values differently: {self.explanations}{equally}. The result holds for "
+            "joint values as the table counts them. Look at the pendant: if the controller counts so, write sign and "
+            "theta_deg of these joints in robot.toml; if it counts as the robot file does, correct the table's columns "
+            "and calibrate again before using this robot."
         )
 
     @property
@@ -106,10 +113,6 @@ class JointMapping:
             f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
-        also = [described(self.joint_types, other.sign, other.zero) for other in self.same]
-        if also:
-            text += f" The same robot with other frames: {listed(also)}. Write what the set-up confirms as sign "
-            text += "and theta_deg in robot.toml."
         return " ".join([text, *self._said(self.alternatives)])
 
     @property

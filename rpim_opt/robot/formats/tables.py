@@ -306,7 +306,8 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     """
     table = without_beta(robot).mdh
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):
-        raise InputError("robot", "signs or couplings of joints", "joints with RoboDK's signs", robot.name)
+        found = "signs or couplings of joints, which four DH numbers a joint cannot hold"
+        raise InputError("--robodk", found, "--mdh or --urdf, which hold them", robot.name)
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
     far = [f"d{i} = {1e3 * d:.0f} mm" for i, d in enumerate(table[:, 3], start=1) if abs(d) > FAR]
     numbers = table[:, :4] / [si for _, si in units.values()]
