@@ -37,6 +37,7 @@ FAR = 5.0
 ALIKE = (0.4, 2.5)  # rounding explains errors that are between these multiples of what it makes
 NOTICED = 2**0.5
 """Residuals over the noise from which on half of the squares may be explained, and no less than the noise be left."""
+MANY_MINUTES, TAKEN_UP = 30, 0.05  # different decimals below .60 that are no chance, and what a model leaves of them
 MOVED = 0.5  # an instrument has moved if that leaves less than this part of the sum of squares
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
@@ -428,13 +429,14 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit."""
     causes: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
+    minutes = "joint values look like degrees and minutes (no decimals from .60 on)"
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     angles = _all_q(problem.data)[:, turning]
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
-    if ((np.abs(np.degrees(angles)) % 1).round(6) < 0.6).all():
-        what = "joint values look like degrees and minutes (no decimals from .60 on)"
-        causes.append((what, np.radians(0.4) / np.sqrt(3) * arm, "convert them"))
+    decimals = (np.abs(np.degrees(angles)) % 1).round(6)
+    if (decimals < 0.6).all():
+        causes.append((minutes, np.radians(0.4) / np.sqrt(3) * arm, "convert them"))
     for block in problem.data.blocks:
         if len(block.y) < FEWEST:  # lengths of a drawing are round
             continue
@@ -464,7 +466,8 @@ def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
                 f"{three_digits(1e3 * error)} mm beside them; log the measured ones."
             )
     for what, made, remedy in causes:
-        if ALIKE[0] * made < error < ALIKE[1] * made:
+        certain = what == minutes and len(np.unique(decimals)) > MANY_MINUTES
+        if (TAKEN_UP if certain else ALIKE[0]) * made < error < ALIKE[1] * made:
             commanded = ""
             yield (
                 f"{what}: that alone contributes {three_digits(1e3 * made)} mm, the residual RMS is "

@@ -78,6 +78,22 @@ def test_rounded_values_are_named_where_that_explains_the_fit() -> None:
     )
 
 
+def test_degrees_and_minutes_are_named_also_where_a_model_takes_most_of_them_up() -> None:
+    """So many different decimals below .60 are no chance; those of a coarse grid may be."""
+    problem = ro.load("position").problem
+    whole, part = np.divmod(np.abs(np.degrees(problem.data.q)), 1)
+
+    def says(decimals: np.ndarray, error: float) -> list[str]:
+        q = np.radians(np.sign(problem.data.q) * (whole + decimals))
+        texts = rounded(problem.on(ro.Dataset.of(q, problem.data.blocks[0].y, 5e-5)), error)
+        return [text for text in texts if "degrees and minutes" in text]
+
+    (text,) = says((60 * part).round() % 60 / 100, 3e-3)
+    assert "no decimals from .60 on" in text
+    assert says((60 * part).round() % 60 / 100, 4e-4)
+    assert not says((part * 10).round() % 6 / 10, 4e-4)
+
+
 def test_values_of_three_digits_are_rounded_to_the_last_of_the_largest() -> None:
     problem, _ = simulated(("theta2",), 30)
     y = np.array([[float(f"{value:.3g}") for value in row] for row in 1e3 * problem.data.blocks[0].y])
