@@ -147,9 +147,11 @@ def identifiability(result: Calibration) -> str:
     model = result.program.model
     parameters = ~result.problem.parameters.free.of_curves
     s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
-    text = f"{np.sum(s > RANK_TOLERANCE * s[0])} of {parameters.sum()} parameter combinations are identifiable"
+    rank, count = int(np.sum(s > RANK_TOLERANCE * s[0])), int(parameters.sum())
     apart = "" if parameters.all() else ", without the transmission errors of the joints"
-    return f"{text} from {model.equations} equations{apart}."
+    others = " Standard deviations of parameters contain the others; the position's uncertainty does not."
+    others = others if rank < count else ""
+    return f"{rank} of {count} parameter combinations are identifiable from {model.equations} equations{apart}.{others}"
 
 
 def warnings(result: Calibration, checked: bool = False) -> list[str]:

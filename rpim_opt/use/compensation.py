@@ -282,13 +282,11 @@ def compensate(
     found = Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
     )
-    rows = found.uncertain
-    if tool is None or not rows.any():
+    if tool is None or robot or torque is not None or not found.uncertain.any():
         return found
-    first = reflectors(cell.problem.parameters.names)[0]
-    measured = _Cell.of(result, robot, arm, kind, None, first, base, targets.torque is not None)
-    loads = [None if each is None else each[rows] for each in (targets.torque, targets.payload)]
-    expanded = EXPANDED * measured.uncertainty(found.q[rows], *loads)[0].max()
+    # of the reflector that the stated tool took the place of
+    known = tool_uncertainty(result, found.q[found.uncertain], marker=reflectors(result.problem.parameters.names)[0])
+    expanded = EXPANDED * known[0].max()
     if expanded > limit:
         return found
     why = (
