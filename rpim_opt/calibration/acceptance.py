@@ -338,9 +338,11 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
+        selected = result.learned is not None and result.learned.trials
+        model = "" if selected else 'a model that explains more of the residuals (model = "auto") or '
         against.append(
-            f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only a model "
-            'that explains more of the residuals (model = "auto") or a more repeatable robot reduces it.'
+            f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only {model}a "
+            "more repeatable robot reduces it."
         )
     if not np.isfinite(mapped.largest):
         lacking.append(

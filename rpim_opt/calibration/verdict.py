@@ -210,7 +210,7 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     if ratio > NOISY and share > REACH:
         yield (
             f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the stated noise and "
-            f"{100 * share:.2g} % of the arm's length; a robot's own errors stay below {100 * REACH:g} %."
+            f"{three_digits(100 * share)} % of the arm's length; a robot's own errors stay below {100 * REACH:g} %."
         )
     size, ratio = residuals["angle"]
     if ratio > NOISY and size > ANGULAR:
@@ -350,6 +350,8 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = [other.sentence]
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
+        if causes:
+            causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
         if not causes and noticed and len(problem.arms) == 1:
             limits = [f"{BAD}: residuals; {text}" for text in _limited_by_formulation(result, problem, kept)]
             causes = [] if limits else list(diagnosis.shown_by_residuals(*_without_outliers(result, ordered)))
@@ -549,8 +551,9 @@ def refuse_misread(result: Outcome, data: Dataset) -> None:
     """Refuse new measurements that `better_fitting` interprets differently."""
     better = better_fitting(result, data)
     if better is not None:
-        left = f"errors of {1e3 * better.stated:.3g} mm, but {1e3 * better.left:.3g} mm with {better.what}"
-        raise InputError("the new measurements", left, better.remedy)
+        stated, left = (three_digits(1e3 * error) for error in (better.stated, better.left))
+        found = f"errors of {stated} mm, but {left} mm with {better.what}"
+        raise InputError("the new measurements", found, better.remedy)
 
 
 def misread(result: Outcome, data: Dataset) -> str:

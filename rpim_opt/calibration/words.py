@@ -144,7 +144,7 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
     if len(beyond):
         names = listed([result.problem.parameters.free.names[i] for i in beyond])
         lines.append(
-            f"Deviations beyond the stated tolerance: {names}. Only the formulation 'bounded' enforces tolerances."
+            f"Deviations beyond the tolerance ([tolerance]): {names}. Only formulation 'bounded' enforces them."
         )
     lines += [price.sentence() for price in result.shadow_prices]
     if not result.formulation.solvable:
@@ -184,8 +184,8 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
     unusual = []
     for i in np.argsort(-ratio)[:MOST]:
         if ratio[i] > UNUSUAL:
-            cause = ": an assembly or joint-zero error" if is_joint_offset(names[i]) else ""
-            unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group{cause}.")
+            cause = "an assembly or joint-zero error" if is_joint_offset(names[i]) else "check it in the data sheet"
+            unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group: {cause}.")
     estimates = {**_scales(learned), **_noise(learned), **_conditions(learned, names, z)}
     lines = [f"{what}: {joined(parts)}." for what, parts in estimates.items() if parts]
     lines += [*_model_lines(learned), *unusual]

@@ -117,7 +117,9 @@ def headline(result: Calibration) -> str:
     what = "position error" if of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)
     change = f"rises from {mm(before['mean_mm'])} mm to {mm(after['mean_mm'])} mm"
-    if ratio > 1:
+    if mm(before["mean_mm"]) == mm(after["mean_mm"]):
+        change = f"stays at {mm(after['mean_mm'])} mm"
+    elif ratio > 1:
         factor = f"{ratio:.1f}" if ratio < 10 else f"{ratio:.0f}"
         change = f"{change.replace('rises', 'falls')}, by a factor of {factor}"
     sentence = f"{where} the mean {what} {change}."

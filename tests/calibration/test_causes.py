@@ -345,6 +345,7 @@ def test_excluded_rows_are_named_by_the_joint_that_explains_them() -> None:
     assert set(result.excluded.label) == {"P4", "P10", "P22"}
     (said,) = result.verdict.reasons
     assert said.startswith("Likely: rows P4, P10, P22 have wrong values of joint 5, by 180.0 to 180.0 deg")
+    assert said.endswith("The other rows fit: calibrate again with these corrected, or left out ([exclude]).")
     far = values(lambda y: y + 0.05 * np.isin(np.arange(COUNT), [3, 9, 21])[:, None] * np.sin(y / 0.1))
     assert ro.calibrate(far(simulated_arm("irb120"))).verdict.delivered
 

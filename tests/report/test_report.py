@@ -323,7 +323,7 @@ def test_only_tolerances_that_were_kept_are_shown() -> None:
     loose = ro.calibrate(instance.problem, ro.tikhonov, 1.0)
     assert "tolerance" in Reader(page(kept)).words
     words = Reader(page(loose)).words
-    said = "Deviations beyond the stated tolerance: a5. Only the formulation 'bounded' enforces tolerances."
+    said = "Deviations beyond the tolerance ([tolerance]): a5. Only formulation 'bounded' enforces them."
     assert said in words
     assert "tolerance" not in words.replace(said, "")  # no column of them
 
