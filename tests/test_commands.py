@@ -668,7 +668,7 @@ BAD = {
     "folder is there": (["new", "results", *NEW[2:]], ["results", "nothing is overwritten"]),
     "two validations": ([*NEW, "--hold-out", "0.2", "--validation", "later.csv"], ["one of them"]),
     "all held out": ([*NEW, "--hold-out", "1"], ["--hold-out", "between 0 and 1"]),
-    "bad validation": ([*NEW, "--validation", "broken.csv"], ["broken.csv", "row 2", "'nan'"]),
+    "bad validation": ([*NEW, "--validation", "broken.csv"], ["broken.csv", "row 2", "'inf'"]),
     "another robot's data": ([*NEW[:3], "panda", *NEW[4:]], ["measured.csv", "no column for 'q7'"]),
     "several points": ([*NEW[:5], "points.csv", *NEW[6:]], ["column 'x2', another point", "marker"]),
     "the same twice": ([*NEW[:5], "twice.csv", *NEW[6:]], ["columns 'x1' and 'X' for x_m"]),
@@ -678,7 +678,7 @@ BAD = {
     "option unknown": ([*NEW, "--unit", "m"], ["No such option", "--units"]),
     "no result": (["validate", "nothing", "later.csv"], ["nothing", "the file: found nothing"]),
     "not a result": (["validate", "other.json", "later.csv"], ["other.json", "no result of rpim-opt"]),
-    "bad row": (["validate", *RESULT, "broken.csv", "--units", "rad,m"], ["broken.csv", "row 2", "'nan'"]),
+    "bad row": (["validate", *RESULT, "broken.csv", "--units", "rad,m"], ["broken.csv", "row 2", "'inf'"]),
     "limit": (["validate", *RESULT, "later.csv", "--units", "rad,m", "--limit", "0"], ["--limit", "greater than zero"]),
     "another kind": (["validate", *RESULT, "later.csv", "--measurement", "pose"], ["'pose'", "position"]),
     "nothing to export": (["export", *RESULT], ["nothing to write", "--urdf", "--robodk"]),
@@ -711,7 +711,7 @@ def desk(cell: Path, made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     write_csv(tmp_path / "joints.csv", header[3:], rows[:, 3:])
     write_csv(tmp_path / "empty.csv", header, rows[:0])
     broken = rows[:9].copy()
-    broken[1, 2] = np.nan
+    broken[1, 2] = np.inf
     write_csv(tmp_path / "broken.csv", header, broken)
     (tmp_path / "other.json").write_text("{}")
     (tmp_path / "bare.urdf").write_text(urdf_text(ARM.mdh, TOOL, fixed=False))
