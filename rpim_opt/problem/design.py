@@ -292,10 +292,11 @@ class Observability(Brief):
     def __str__(self) -> str:
         """Return what configurations can show, in lines."""
         indices = ", ".join(f"{name} {value:.3g}" for name, value in self.indices.items())
+        weak = f"; for {self.weak} of them the prior says more than the data" if self.weak else ""
+        raw = f", {self.raw_condition:.3g} in mm and rad" if np.isfinite(self.raw_condition) else ""
         lines = [
-            f"{self.rank} of {len(self.names)} parameter combinations are identifiable, {self.weak} of them less "
-            "precisely than by the prior.",
-            f"Condition {self.condition:.3g} scaled and whitened, {self.raw_condition:.3g} in mm and rad; {indices}.",
+            f"{self.rank} of {len(self.names)} parameter combinations are identifiable{weak}.",
+            f"Condition number {self.condition:.3g} in prior scales and standard deviations{raw}; {indices}.",
         ]
         if self.unidentifiable:
             lines.append(f"Unidentifiable: {', '.join(self.unidentifiable)}.")
