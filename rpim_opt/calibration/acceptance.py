@@ -415,8 +415,9 @@ def _held_out(
             f"Missing: valid prediction intervals. Rows outside them: {listed(beyond, MOST)}. "
             + (moved or "Repeat these measurements, or extend the model.")
         )
-    sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm, of "
-    sentence += f"which the instrument may contribute {1e3 * instrument[inside].max(initial=0.0):.3f} mm"
+    noise = 1e3 * instrument[inside].max(initial=0.0)
+    sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm "
+    sentence += f"(the instrument alone makes up to {noise:.3f} mm)"
     if held.coverage is not None:
         least = required_coverage(rows)
         share = f"{100 * held.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
