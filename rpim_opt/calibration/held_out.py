@@ -96,8 +96,9 @@ def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, s
     )
     if far and after <= before / 2:
         return (
-            f"Likely: the instrument or the base moved. {said} `validate` and `accept` do so with --register, "
-            "`update --reset 'base_*'` recalibrates. If neither moved, the robot has one common error there."
+            f"Likely: the instrument or the base moved. {said} `validate` and `accept` do so with --register: leave "
+            "such rows out of the problem's folder; `update --reset 'base_*'` recalibrates. If neither moved, the "
+            "robot has one common error there."
         ), ""
     if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:
         return "", f"{said} If the instrument was set up again since the calibration, use --register."

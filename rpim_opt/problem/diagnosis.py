@@ -220,7 +220,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     >>> wrong = replace(problem.data.blocks[0], q=problem.data.blocks[0].q * [1, 1, -1, 1, 1, 1])
     >>> said = ro.problem.inspect(problem.on(replace(problem.data, blocks=(wrong,)))).warnings[-1]
     >>> said.split(":")[-1]
-    ' write sign and theta_deg of these joints in robot.toml.'
+    ' write sign, and add the zeros to theta_deg, of these joints in robot.toml.'
     """
     if not problem.keeps_rows:
         raise InputError("inspect", "data in blocks", "one of them: inspect(part) for part in problem.rows()")

@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.position import from_elevation, from_zenith
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
-from rpim_opt.problem.registration.global_start import JointMapping, explained, search
+from rpim_opt.problem.registration.global_start import WRITE, JointMapping, explained, search
 from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import forward_kinematics
@@ -444,7 +444,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
 def _of_mapping(mapping: JointMapping) -> Better:
     """Return signs and zeros of joints in words, and a mirrored frame that explains the data as well."""
     words = mapping.explanations
-    remedy = "write sign and theta_deg of these joints in robot.toml"
+    remedy = WRITE
     if mapping.mirrored:
         words = f"the measured frame mirrored (left-handed), or {words}"
         remedy = (

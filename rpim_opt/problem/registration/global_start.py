@@ -52,6 +52,7 @@ FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
 MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
 COMPARED = 200  # configurations at which mappings are compared
+WRITE = "write sign, and add the zeros to theta_deg, of these joints in robot.toml"  # the remedy
 AS_STATED = "joints as stated"
 RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
 
@@ -99,9 +100,8 @@ class JointMapping:
         equally = " (both explain the data equally well)" if self.same else ""
         return (
             f"Table and robot file count joint values differently: {self.explanations}{equally}. The result holds for "
-            "joint values as the table counts them. Look at the pendant: if the controller counts so, write sign and "
-            "theta_deg of these joints in robot.toml; if it counts as the robot file does, correct the table's columns "
-            "and calibrate again before using this robot."
+            f"joint values as the table counts them. Look at the pendant: if the controller counts so, {WRITE}; if it "
+            "counts as the robot file does, correct the table's columns and calibrate again before using this robot."
         )
 
     @property
@@ -134,7 +134,7 @@ class JointMapping:
                 first = described(self.joint_types, self.sign, self.zero)
                 sentences.append(
                     f"{what}, fits as well as {first}: lengths do not tell an arm from its mirror image; a few "
-                    "positions would decide, or write what the set-up confirms as sign and theta_deg in robot.toml."
+                    f"positions would decide, or {WRITE}, as the set-up confirms."
                 )
                 continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))
