@@ -223,7 +223,8 @@ def _notes(grid: Grid, above: Sequence[int], left: Collection[int], options: Tab
     elif len(above) > 1:
         yield f"the header has {len(above)} lines, from line {grid.lines[above[0]]}."
     if above and above[0]:
-        yield f"{above[0]} lines above the header are ignored ('{' '.join(filter(None, grid.rows[0]))[:50]}' ...)."
+        count = grid.lines[above[0]] - 1  # with blank lines
+        yield f"{count} lines above the header are ignored ('{' '.join(filter(None, grid.rows[0]))[:50]}' ...)."
     for i in sorted(left)[:MOST_NAMED]:
         text = ", ".join(filter(None, grid.rows[i]))
         yield f"line {grid.lines[i]} is not a row of the table: '{text[:60]}' ignored."

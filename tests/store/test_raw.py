@@ -232,12 +232,30 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     assert f"without a match, ignored: P{COUNT}, P0." in said
 
 
-def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, arm) -> None:
+def test_joints_of_axes_are_known_and_lost_columns_are_named(monkeypatch, capsys, tmp_path, arm) -> None:
     joints = tmp_path / "first.csv"
     points = tmp_path / "second.csv"
-    joints.write_text(text([HEAD[:7]], [row[:7] for row in ROWS]))
+    points.write_text(text([["Point", *HEAD[7:]]], beside(NAMED, POINTS)))
+    for pattern in ("AX{}_ACT [deg]", "AX{} [deg]", "Ax {} [deg]"):
+        joints.write_text(text([["Point", *(pattern.format(i) for i in range(1, 7))]], beside(NAMED, JOINTS)))
+        assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0, capsys.readouterr().err
+        assert f"joined by label: {COUNT} rows of {COUNT}" in capsys.readouterr().out
+    joints.write_text(text([["Point", "Foo", "Bar"]], beside(NAMED, [row[:2] for row in JOINTS])))
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
+    said = capsys.readouterr().err
+    assert "no joint values or no measured values in first.csv (Point, Foo, Bar)" in said
+    assert "named as A1, J1, Axis 1 or q1_deg and measured values x, y, z" in said
+
+
+@pytest.mark.parametrize("head", [("Point", "Point"), ("Nr,PosName", "Target")])
+def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, arm, head) -> None:
+    """Also where the column that names the point, and repeats for its reflectors, is called otherwise."""
+    joints = tmp_path / "first.csv"
+    points = tmp_path / "second.csv"
+    rows = [[*([str(i)] if "," in head[0] else []), *row[:7]] for i, row in enumerate(ROWS, start=1)]
+    joints.write_text(text([[head[0], *HEAD[1:7]]], rows))
     several = [[row[0], marker, *row[7:]] for row in ROWS for marker in ("A", "B")]
-    points.write_text(text([["Point", "SMR", *HEAD[7:]]], several))
+    points.write_text(text([[head[1], "SMR", *HEAD[7:]]], several))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 0
     data = ro.load(tmp_path / "cell").problem.data
     assert len(data) == 2 * COUNT
@@ -251,7 +269,7 @@ def test_rows_that_were_left_out_are_named(monkeypatch, capsys, tmp_path, arm) -
         ("footer and means", "is not a row of the table: 'Mean, 1.5,"),
         ("footer and means", "is not a row of the table: 'End of export' ignored."),
         ("header again on every page", "line 7 is not a row of the table: 'Point, J1 [deg],"),
-        ("preamble", "3 lines above the header are ignored ('Export of cell 7' ...)."),
+        ("preamble", "4 lines above the header are ignored ('Export of cell 7' ...)."),
         ("Latin-1 with degrees", "read as cp1252: not UTF-8."),
         ("semicolon and decimal comma", "decimal commas: no comma can be a thousands separator."),
         ("preamble", "--decimal comma does not apply: found '"),

@@ -73,9 +73,12 @@ def together(
     if len(tables) == 1 or (len(moving) == len(seen) == len(tables)):
         return _stacked(tables)
     if not moving or not seen or len(moving) + len(seen) != len(tables):
-        lost = ", ".join(table.file for table in tables if table not in moving and table not in seen)
-        found = f"{lost or 'some tables'} without joint or measured values"
-        raise InputError("--data", found, "tables that have both, or tables of joints and tables of measured values")
+        lost = [table for table in tables if table not in moving and table not in seen]
+        lost = lost or [table for table in tables if table not in moving or table not in seen]
+        found = "; ".join(f"{table.file} ({listed([each.column for each in table.meant], 12)})" for table in lost)
+        accepted = "in every file, or in one file each, joint values named as A1, J1, Axis 1 or q1_deg and measured "
+        accepted += f"values {', '.join(kind.columns)}"
+        raise InputError("--data", f"no joint values or no measured values in {found}", accepted)
     columns = [each.column for table in tables for each in table.meant]
     if key.lower() not in ("", "row", "label", "time", *map(str.lower, columns)):
         raise InputError("--key", f"'{key}', no column of the files", choices(key, columns))
@@ -159,7 +162,7 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
         for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
         if key in ("", "row") or key.lower() in (name.lower(), other.lower())
     ]
-    pairs = [pair for pair in pairs if len({*pair.left} & {*pair.right}) >= SAME * min(len(pair.left), len(pair.right))]
+    pairs = [pair for pair in pairs if _alike({*pair.left}, {*pair.right})]
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
     pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
     if key == "row":
@@ -183,6 +186,10 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     raise InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
 
 
+def _alike(own: set[str], others: set[str]) -> bool:
+    return len(own & others) >= SAME * min(len(own), len(others))
+
+
 def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
     """Return a key; measured names that differ by case and leading zeros alone are spelled as those with joints."""
     if not all(any(map(str.isalpha, "".join(names[:1]))) for names in (left, right)):
@@ -200,10 +207,12 @@ def _bare(name: str) -> str:
 
 
 def _naming(table: Understood) -> dict[str, list[str]]:
-    """Return the keys of columns, labels or left out, that name every row differently."""
+    """Return the keys of columns, labels or left out, that name every row differently, or every row of a reflector."""
     free = [each.column for each in table.meant if each.name in ("", "label", "configuration")]
     cells = {name: _normal(table.raw[name.lower()]) for name in free if name.lower() in table.raw}
-    return {name: keys for name, keys in cells.items() if all(keys) and len(set(keys)) == len(keys)}
+    markers = table.columns.get("marker", [""] * len(table.labels))
+    rows = {name: {*zip(keys, markers, strict=True)} for name, keys in cells.items()}
+    return {name: keys for name, keys in cells.items() if all(keys) and len(rows[name]) == len(keys)}
 
 
 def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Key:

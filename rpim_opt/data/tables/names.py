@@ -33,7 +33,7 @@ Readings = dict[str, Reading]  # what every column holds, by its name
 
 
 _WHERE = r"(?:(?:field|pose|transform|point|position|translation|pos|p|t|coords?|coordinates?|cartesian|cart|tcp)_?)*"
-_JOINT = "q|j|jt|joint|axis|a|theta|θ|rax|achse|gelenk|axe|eje|giunto|关节|轴|軸"
+_JOINT = "q|j|jt|joint|axis|ax|a|theta|θ|rax|achse|gelenk|axe|eje|giunto|关节|轴|軸"
 _SPREAD = r"(?:std|stdev|stddev|std_?dev|sigma|sd)"
 NAMES: tuple[tuple[str, ...], ...] = (
     (rf"(to_)?(?:{_JOINT})_?(\d+)(?:_?(?:pos|position|angle|value))?", r"\1q\2"),
