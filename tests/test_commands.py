@@ -512,22 +512,28 @@ def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, c
 
 def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch, capsys, made, tmp_path) -> None:
     q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
-    robot = ro.load_result(made / "results").robot
+    result = ro.load_result(made / "results")
+    robot = result.robot
     assert robot.mdh[:-1, 4].any()  # near parallel axes, which standard and modified tables tilt differently
     for convention in ("standard", "modified"):
         path = tmp_path / f"{convention}.csv"
         assert run(monkeypatch, "export", str(made / "results"), "--mdh", str(path), "--dh", convention) == 0
         said = capsys.readouterr().out
         assert f"{path.name}: {convention} DH" in said
-        assert ("which place axis 1 in the base" in said) == (convention == "standard")
+        assert ("Its base contains alpha1 = " in said) == (convention == "standard")
         assert path.read_text().startswith("joint,theta_deg,d_mm,a_mm,alpha_deg,beta_deg,") == (
             convention == "standard"
         )
-        assert re.search(r"without base and tool: base x .* reflector x 30\.", said)
+        printed = re.findall(r" (?:x|y|z|rx|ry|rz) (-?[\d.]+)", said.split("without base and tool: ")[1])
+        numbers = np.array(printed, dtype=float).reshape(2, 6) * ([1e-3] * 3 + [np.pi / 180] * 3)
+        base, tool = (numeric_frame(place) for place in numbers)
         read = read_arm(path)
-        base = numeric_link(*robot.mdh[0, :2]) if convention == "standard" else np.eye(4)
-        found = base @ numeric_frame(read.base) @ ro.robot.forward_kinematics(read.robot, q) @ numeric_frame(read.tool)
-        assert np.abs(found - ro.robot.forward_kinematics(robot, q)).max() < 1e-12
+        first = numeric_link(*robot.mdh[0, :2]) if convention == "standard" else np.eye(4)
+        flange = numeric_frame(read.base) @ ro.robot.forward_kinematics(read.robot, q) @ numeric_frame(read.tool)
+        assert np.abs(first @ flange - ro.robot.forward_kinematics(robot, q)).max() < 1e-12
+        missed = np.linalg.norm((base @ flange @ tool - result.forward(q))[:, :3, 3], axis=1)
+        turn, reach = np.radians(0.0005), np.linalg.norm(flange[:, :3, 3], axis=1)
+        assert (missed < 2e-6 + 2 * turn * reach).all()  # 0.001 mm and 0.001 deg are printed
     assert run(monkeypatch, "export", str(made / "results"), "--mdh", str(tmp_path / "a.toml"), "--dh", "paul") == 2
     assert "modified" in capsys.readouterr().err
 

@@ -32,7 +32,7 @@ from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
-from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame
+from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty
 
@@ -237,12 +237,13 @@ def _write_table(result: Calibration, marker: str | None, dh: str, target: Path)
     robot = arm.robot
     write_robot(robot, target, dh)
     convention = CONVENTIONS[dh.lower()]
-    alpha, a = 1e3 * robot.mdh[0, :2]
-    apart = ""
+    alpha, a = robot.mdh[0, :2]
+    base, inside = arm.base, ""
     if convention == "standard" and (alpha or a):
-        apart = f" Not in it: alpha1 = {alpha:.4g} mrad and a1 = {a:.4g} mm, which place axis 1 in the base."
-    ends = f"base {placed(arm.base)} in the instrument's frame, reflector {placed(arm.tool)} in the flange frame"
-    return [f"{target.name}: {CONVENTION[convention]}.{apart}", f"{target.name} is without base and tool: {ends}."]
+        base = frame_numbers(numeric_frame(base) @ numeric_link(alpha, a))
+        inside = f" Its base contains alpha1 = {1e3 * alpha:.4g} mrad and a1 = {1e3 * a:.4g} mm, which place axis 1."
+    ends = f"base {placed(base)} in the instrument's frame, reflector {placed(arm.tool)} in the flange frame"
+    return [f"{target.name}: {CONVENTION[convention]}.{inside}", f"{target.name} is without base and tool: {ends}."]
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
