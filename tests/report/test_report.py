@@ -163,7 +163,7 @@ def test_other_formulations_have_a_report(formulation) -> None:
     problem, _ = simulated(("a?", "theta?", "base_*"), noise=5e-5)
     weight = 0.0 if formulation is ro.least_squares else 1.0
     text = page(ro.calibrate(problem, formulation, weight))
-    assert ("No intervals" in text) == (formulation is not ro.least_squares)
+    assert ("No uncertainties and prediction intervals" in text) == (formulation is not ro.least_squares)
     assert ("L-curve: residual norm" in text) == (formulation is not ro.least_squares)
 
 

@@ -279,7 +279,10 @@ def test_bad_input_is_one_sentence(monkeypatch, capsys, tmp_path, crashed: Robot
         "columns": (table(crashed.after, drop=("q6_rad",)), "q6"),
         "values": (table(crashed.after, drop=("z_m",)), "z"),
         "robot": (table(with_points(block.y[[3, 0, 6, 7, 1, 5, 2, 4]])), "mm off, whichever parameters change"),
-        "order": (table(with_points(block.y[::-1])), "the rows of joint values in the reverse order, accepted: turn"),
+        "order": (
+            table(with_points(block.y[::-1])),
+            "the rows of joint values in the reverse order, accepted: reverse",
+        ),
         "units": (table(with_points(block.y / 1e3)), "measured lengths a thousand times larger, accepted: name"),
     }
     for name, (text, said) in tables.items():
