@@ -370,7 +370,9 @@ def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
             row.pop()
         lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
         if len(row) != width and not lacks_remark:
-            what = "--columns" if options.columns else "the header"
+            what = "the header"
+            if options.columns:
+                what = "--columns, which holds for every file (of several, write a header into those without one)"
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))

@@ -153,7 +153,7 @@ def test_the_order_of_a_quaternion_is_checked_and_said(monkeypatch, capsys, tmp_
 U = ["Point", *HEAD[1:7], "X", "Y", "Z"]
 REFUSED = {
     "no header": (text([], ROWS), [], ["line 1", "no header above 'P1", "--columns with 10 names"]),
-    "too few names": (text([], ROWS), ["--columns", "label,q1_deg"], ["10 cells", "2 cells as in --columns"]),
+    "too few names": (text([], ROWS), ["--columns", "label,q1_deg"], ["2 cells as in --columns", "for every file"]),
     "no unit": (text([U], ROWS), [], ["columns without a unit (X, Y, Z)", "--units"]),
     "thousands or decimals": (
         text([HEAD], [["P1", *["1,234"] * 9], ["P2", *["2,345"] * 9]], ";"), [], ["'1,234'", "--decimal"]
@@ -247,7 +247,7 @@ def test_joints_of_axes_are_known_and_lost_columns_are_named(monkeypatch, capsys
     assert "named as A1, J1, Axis 1 or q1_deg and measured values x, y, z" in said
 
 
-@pytest.mark.parametrize("head", [("Point", "Point"), ("Nr,PosName", "Target")])
+@pytest.mark.parametrize("head", [("Point", "Point"), ("Nr,Spot", "Target")])
 def test_reflectors_of_one_point_share_its_configuration(monkeypatch, tmp_path, arm, head) -> None:
     """Also where the column that names the point, and repeats for its reflectors, is called otherwise."""
     joints = tmp_path / "first.csv"
@@ -329,6 +329,16 @@ def test_new_measurements_are_read_as_raw_files_are(monkeypatch, capsys, tmp_pat
         documents.append(json.loads(capsys.readouterr().out)["identified"])
     assert run(monkeypatch, "compensate", str(out), raw, "--units", "deg,mm", "--json") in (0, 1)
     assert documents[0] == pytest.approx(documents[1])
+
+
+def test_targets_keep_the_names_of_their_positions(monkeypatch, capsys, tmp_path, calibrated) -> None:
+    targets = tmp_path / "targets.csv"
+    targets.write_text(text([["Nr", "PosName", *HEAD[1:7]]], [[str(i), *row[:7]] for i, row in enumerate(ROWS[:3], 1)]))
+    capsys.readouterr()
+    assert run(monkeypatch, "compensate", str(calibrated[1]), str(targets)) in (0, 1)
+    said = capsys.readouterr().out
+    assert "Ignored columns: Nr." in said
+    assert "\nP3," in said
 
 
 @pytest.mark.parametrize("decimal", ["", "comma", "point"])

@@ -58,8 +58,9 @@ NAMES: tuple[tuple[str, ...], ...] = (
          "expanded uncertainty, coverage factor 2"),
     (rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
     (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
-    (r"label|name|id|no|nr|number|index|point|point_(?:id|name|no|nr)|row|target|target_(?:id|name)|punkt|punkt_?name|messpunkt"
-         r"|punkt_?nr|feature|nom_du_point|punto|pt|点名|点号|測定点|測点|(?:collection_)?group", "label"),
+    (r"label|name|id|no|nr|number|index|row|point(?:_(?:id|name|no|nr))?|target(?:_(?:id|name))?|messpunkt|feature"
+         r"|punkt(?:_?(?:name|nr))?|pos(?:e|ition)?_?name|nom_du_point|punto|pt|点名|点号|測定点|測点"
+         r"|(?:collection_)?group", "label"),
     (r"configuration|config|pose|pose_id", "configuration"),
     (r"marker|reflector|smr", "marker"),
     (r"temp(?:erature|eratur)?", "temperature"),
