@@ -12,7 +12,7 @@ import scipy
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.tables import columns_csv, records
-from rpim_opt.basics.text import listed, table
+from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration.acceptance import accept
@@ -37,6 +37,7 @@ SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
 REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
 EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
+LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is said
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 AT_FAULT = {UNREACHABLE: " in the robot's base frame", ABOVE: ""}  # states of commands that miss, and of which target
@@ -282,17 +283,24 @@ def compensate(
     found = Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
     )
-    if tool is None or robot or torque is not None or not found.uncertain.any():
+    if tool is None:
         return found
-    # of the reflector that the stated tool took the place of
-    known = tool_uncertainty(result, found.q[found.uncertain], marker=reflectors(result.problem.parameters.names)[0])
-    expanded = EXPANDED * known[0].max()
-    if expanded > limit:
+    # beside the reflector that the stated tool took the place of, where the tool is known least
+    row = [int(np.argmax(found.std))]
+    reflector = _Cell.of(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
+    loads = (None if each is None else each[row] for each in (targets.torque, targets.payload))
+    known, of_tool = reflector.uncertainty(found.q[row], *loads)[0][0], found.std[row[0]]
+    if not of_tool > LESS_KNOWN * known:
         return found
-    why = (
-        f" The reflector's U is at most {1e3 * expanded:.3f} mm there: its positions do not determine another point of "
-        "the flange as well. Measure a second reflector, or state what is known (`known` in [prior], d6 or the tool)."
-    )
+    last = {f"{name}{len(arm.joint_types)}" for name in ("d", "theta")} & set(cell.problem.parameters.free.names)
+    advice = "Measure a reflector as far from the flange as this point."
+    if last:
+        advice = (
+            f"No reflector, of however many, tells {joined(sorted(last))} from the tool: state what is known of the "
+            "flange (`known` in [prior], or these parameters not identified)."
+        )
+    sizes = [f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known)]
+    why = f" In row {found.label[row[0]]} its U is {sizes[0]}, the reflector's {sizes[1]}. {advice}"
     return replace(found, point=cell.point + why)
 
 

@@ -526,9 +526,19 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     assert f"{found.missed[0]} (0.000 mm off, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in said
     assert f"{above.sum()} of 10 commands reach their target by the model" in said
     assert "miss their target" not in said
-    (stated,) = re.findall(r"The reflector's U is at most ([\d.]+) mm there", said)
-    rows = [found.label.index(label) for label in found.missed]
-    assert float(stated) == pytest.approx(2e3 * ro.use.compensate(result, found.q[rows]).std.max(), abs=1e-3)
+    row = int(np.argmax(known_to.std))
+    reflector = 2e3 * ro.use.compensate(result, known_to.q[[row]]).std[0]
+    for text in (said, str(known_to)):  # with and without a limit
+        (known,) = re.findall(
+            rf"In row {row + 1} its U is {2e3 * known_to.std[row]:.3f} mm, the reflector's (.*) mm", text
+        )
+        assert float(known) == pytest.approx(reflector, abs=2e-3)
+        assert "No reflector, of however many, tells d6 and theta6 from the tool: state what is known" in text
+    p = result.problem.parameters
+    flange = result.problem.identifying(p.identified & ~np.isin(p.names, ["d6", "theta6"]))
+    stated = ro.calibrate(flange, ro.tikhonov, 1.0)
+    assert "Measure a reflector as far from the flange" in str(ro.use.compensate(stated, q, tool=tool))
+    assert "the reflector's" not in str(ro.use.compensate(stated, q, tool=[0.0, 0.0, 0.1, 0.0, 0.0, 0.0]))
 
 
 def test_orientations_have_no_uncertainty_where_they_do_not_count() -> None:
