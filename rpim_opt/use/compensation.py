@@ -14,7 +14,7 @@ from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
-from rpim_opt.basics.units import joint_columns
+from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import accept
 from rpim_opt.calibration.covariance import noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import Outside
@@ -108,7 +108,7 @@ class Compensation:
             rows = []
             for i in [i for i, each in enumerate(self.status) if each == status]:
                 expanded = f", U {1e3 * EXPANDED * self.std[i]:.3f} mm" if status == ABOVE else ""
-                rows.append(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded})")
+                rows.append(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded}{self._at_limit(i)})")
             if rows:
                 lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
         uncertain = int(self.uncertain.sum())
@@ -142,6 +142,15 @@ class Compensation:
     def uncertain(self) -> np.ndarray:
         """Which rows (N,) are above the limit by their uncertainty alone."""
         return (np.array(self.status) == ABOVE) & (self.position_error <= self.limit)
+
+    def _at_limit(self, row: int) -> str:
+        """Return which joints of a row that misses its target are at a limit, as part of a sentence."""
+        if self.status[row] != "limited" and self.position_error[row] <= REACHED:
+            return ""
+        low, high = self.robot.limits.T
+        at = np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high))
+        units = [display(dimension) for dimension in self.robot.joint_dimensions]
+        return "".join(f", joint {i + 1} at its limit of {self.q[row, i] / units[i][1]:.6g} {units[i][0]}" for i in at)
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -280,8 +289,11 @@ def compensate(
     status = np.where(above, ABOVE, whole["status"])
     status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
+    point = cell.point
+    if targets.q is None:
+        point += " Targets without joint values may be reached in another arm configuration: state q1, ... beside them."
     found = Compensation(
-        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=cell.point, limit=limit
+        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=point, limit=limit
     )
     if tool is None:
         return found
@@ -300,8 +312,8 @@ def compensate(
             "flange (`known` in [prior], or these parameters not identified)."
         )
     sizes = [f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known)]
-    why = f" In row {found.label[row[0]]} its U is {sizes[0]}, the reflector's {sizes[1]}. {advice}"
-    return replace(found, point=cell.point + why)
+    why = f" In row {found.label[row[0]]} the U of the tool is {sizes[0]}, the reflector's {sizes[1]}. {advice}"
+    return replace(found, point=point + why)
 
 
 def tool_uncertainty(

@@ -240,6 +240,8 @@ def test_joint_limits_hold_and_the_rest_is_the_best_within_them() -> None:
         )
         mine = np.sum(pose_error(result, found.q[i], target[i]) ** 2) / 2
         assert mine <= best.cost * (1 + 1e-6) + 1e-20
+    for said in (str(found), str(ro.use.compensate(result, q, largest=0.5, limit=5e-4))):
+        assert re.search(r"mm off.*, joint 2 at its limit of 114.592 deg", said)
     outside = q.copy()
     outside[:, 0] = 2.3
     assert (np.abs(ro.use.compensate(result, outside).q) <= 2.0).all()
@@ -256,6 +258,8 @@ def test_poses_are_reached_from_a_start_and_without_one() -> None:
     assert close.mean() > 0.8
     assert found.q[close] == pytest.approx(same.q[close], abs=1e-6)
     searched = ro.use.compensate(result, poses=poses, largest=0.5)
+    assert "another arm configuration" in searched.point
+    assert "another arm configuration" not in found.point
     assert (np.abs(searched.nominal) <= 2.0).all()
     place, turn = misses(nominal_poses(result, searched.nominal), poses)
     assert ((place < 1e-7) & (turn < 1e-7)).mean() > 0.99  # every one can be had; limits are narrow
@@ -530,7 +534,7 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     reflector = 2e3 * ro.use.compensate(result, known_to.q[[row]]).std[0]
     for text in (said, str(known_to)):  # with and without a limit
         (known,) = re.findall(
-            rf"In row {row + 1} its U is {2e3 * known_to.std[row]:.3f} mm, the reflector's (.*) mm", text
+            rf"In row {row + 1} the U of the tool is {2e3 * known_to.std[row]:.3f} mm, the reflector's (.*) mm", text
         )
         assert float(known) == pytest.approx(reflector, abs=2e-3)
         assert "No reflector, of however many, tells d6 and theta6 from the tool: state what is known" in text
