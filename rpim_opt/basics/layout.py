@@ -431,8 +431,8 @@ def _impossible(number: str, name: str, options: TableOptions) -> bool:
     """Return whether a number is beyond any joint value or coordinate, in its column's unit or all that are stated."""
     own = split(name)[1]
     units = [UNITS[FOREIGN.get(unit, (unit,))[0]] for unit in ([own] if own else options.units.values())]
-    sizes = [abs(float(number)) * unit.si > BEYOND[unit.dimension] for unit in units if unit.dimension in BEYOND]
-    return bool(sizes) and all(sizes)
+    beyond = [abs(float(number)) * unit.si > BEYOND[unit.dimension] for unit in units if unit.dimension in BEYOND]
+    return bool(beyond) and all(beyond)
 
 
 def _unit_of(cells: Sequence[str]) -> str:

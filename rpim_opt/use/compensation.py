@@ -297,23 +297,27 @@ def compensate(
     )
     if tool is None:
         return found
-    # beside the reflector that the stated tool took the place of, where the tool is known least
-    row = [int(np.argmax(found.std))]
+    # the reflector that the stated tool took the place of
     reflector = _Cell.of(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
+    return replace(found, point=point + _less_known(found, targets, reflector))
+
+
+def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
+    """Say why a stated tool is known less than the reflector, where it is known least; empty where it is not."""
+    row = [int(np.argmax(found.std))]
     loads = (None if each is None else each[row] for each in (targets.torque, targets.payload))
     known, of_tool = reflector.uncertainty(found.q[row], *loads)[0][0], found.std[row[0]]
     if not of_tool > LESS_KNOWN * known:
-        return found
-    last = {f"{name}{len(arm.joint_types)}" for name in ("d", "theta")} & set(cell.problem.parameters.free.names)
+        return ""
+    last = {f"{name}{found.robot.dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
     advice = "Measure a reflector as far from the flange as this point."
     if last:
         advice = (
             f"No reflector, of however many, tells {joined(sorted(last))} from the tool: state what is known of the "
             "flange (`known` in [prior], or these parameters not identified)."
         )
-    sizes = [f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known)]
-    why = f" In row {found.label[row[0]]} the U of the tool is {sizes[0]}, the reflector's {sizes[1]}. {advice}"
-    return replace(found, point=point + why)
+    of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
+    return f" In row {found.label[row[0]]} the U of the tool is {of_tool}, the reflector's {known}. {advice}"
 
 
 def tool_uncertainty(
