@@ -68,7 +68,7 @@ class WarmStart:
         return self
 
 
-def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
+def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None) -> Point:
     """Return the minimum of a convex program; the structure of the loss selects the solver.
 
     ============================ ===================================================
@@ -80,8 +80,8 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     any other                    all rows
     ============================ ===================================================
 
-    ``accuracy`` is the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is
-    found, also by a small program of proximal Newton: then CVXPY solves all rows (`Program.solve`).
+    Unsolved where no minimum is found, also by a small program of proximal Newton: then CVXPY solves all rows
+    (`Program.solve`).
     """
     with warm.lock:
         loss = warm.structure.loss
@@ -91,16 +91,14 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
             point = _coupled(loss, rows, warm, weight, damping)
         else:
             try:
-                point = _by_newton(loss, rows, warm, weight, damping, accuracy)
+                point = _by_newton(loss, rows, warm, weight, damping)
             except (OutsideDomain, np.linalg.LinAlgError):
                 point = _all_rows(loss, rows, warm, weight, damping)
         warm.z, warm.x = point.x[warm.canonical.at], point.x
         return point
 
 
-def _by_newton(
-    loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None, accuracy: float
-) -> Point:
+def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
     # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too, or
     # begin with an unknown active set
@@ -117,7 +115,7 @@ def _by_newton(
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.canonical.at]
-    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink, accuracy)
+    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
