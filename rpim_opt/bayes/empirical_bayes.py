@@ -13,7 +13,7 @@ from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned,
 from rpim_opt.bayes.model_selection import select_model
 from rpim_opt.bayes.outliers import beyond_noise, error_vectors, isolated, outlier_candidates, unexplained
 from rpim_opt.bayes.prior_terms import ScaledPrior
-from rpim_opt.bayes.transmission import admitted, possible
+from rpim_opt.bayes.transmission import admitted
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import ridge_deviations
@@ -105,10 +105,7 @@ def _without_outliers(
         if model == "geometry":
             return fit, (), 0.0
         fit, trials = select_model(estimator, fit)
-        curved = None
-        if possible(fit.problem):
-            curved = admitted(estimator, fit, every.parameters.free.names, trials)
-        return curved or (fit, trials, 0.0)
+        return admitted(estimator, fit, every.parameters.free.names, trials) or (fit, trials, 0.0)
 
     outliers = outlier_candidates(every, whole.x, whole.laid.parameters.free.scale, whole.spare)
     fit, trials, gain = explain(outliers)

@@ -33,7 +33,8 @@ SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
 STEEPEST = 0.8  # bound on the slope of a local variance's map: its steps are at most five times the map's
 COUPLED, LONGEST_COUPLED = 0.3, 1.0
 """Changes of logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
-BASIN = 0.3  # logarithms of hyperparameters within which of a known optimum no other is looked for
+FEW = 60  # configurations up to which several optima are looked for
+BASIN = 0.3  # logarithms of hyperparameters within which two optima are one
 FIRST_RADIUS, LARGEST_RADIUS = 2.0, 3.0
 """Trust region of the logarithms of hyperparameters: how far the first step and any other may go."""
 WIDEST = 1e8
@@ -267,8 +268,6 @@ class Evidence:
 
     def at(self, logs: Array, near: Point | None = None, accuracy: float = SETTLED) -> Point:
         """Return the marginal likelihood at (s,); the iteration for local variances starts from those of ``near``."""
-        if near is not None and not len(self._heavy) and np.array_equal(logs, near.logs):
-            return near
         prior = self.prior
         s = len(prior.hyperparameters)
         parts = whitened(self.data, self.repeatability(logs), self.noise)
@@ -325,11 +324,11 @@ class Evidence:
             parts=parts,
         )
 
-    def optima(self, starts: Sequence[Array], accuracy: float = 1e-3, near: Point | None = None) -> list[Point]:
+    def optima(self, starts: Sequence[Array], accuracy: float = 1e-3) -> list[Point]:
         """Return the local optima reached from some starts (s,), the best first.
 
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
-        accuracy. A way that leads into an optimum that is known ends there. ``near`` is a known point near the starts.
+        accuracy.
         """
         known: list[Point] = []
 
@@ -339,15 +338,8 @@ class Evidence:
                 last = self.at(logs.copy(), last, ROUGHLY)
             return last
 
-        def is_known(at: Any) -> bool:
-            return any(at.fun >= point.value and np.abs(at.x - point.logs).max() <= BASIN for point in known)
-
-        def explored(intermediate_result: Any) -> None:
-            if is_known(intermediate_result):
-                raise StopIteration
-
         for start in starts:
-            last = self.at(start, near, ROUGHLY)
+            last = self.at(start, accuracy=ROUGHLY)
             if not len(start):
                 known.append(self.at(start, last))
                 continue
@@ -357,22 +349,19 @@ class Evidence:
                 method="trust-exact",
                 jac=lambda logs: ask(logs).gradient,
                 hess=lambda logs: ask(logs).curvature,
-                callback=explored,
                 options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
             )
-            if not is_known(optimum):
+            if all(np.abs(optimum.x - point.logs).max() > BASIN for point in known):
                 known.append(self.at(optimum.x, last))
         return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
-        """Return the starts of the search: all residuals noise, prior medians, and large deviations.
-
-        The first one leads to the best optimum most often, where only one is used.
-        """
+        """Return the starts of the search: all residuals noise, and for few data prior medians and large deviations."""
         noisy = 3.0 * np.isin(self.names, self.noise)
         geometry = 2.0 * np.isin(np.arange(len(self.centre)), self.prior.geometry)
         starts = [self.centre + noisy, self.centre, self.centre + geometry]
-        return starts[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
+        starts = starts[0 if noisy.any() else 1 : 3 if geometry.any() else 2]
+        return starts if sum(len(stack.index) for stack in self.data.stacks) <= FEW else starts[:1]
 
     def restricted(self, keep: np.ndarray) -> Evidence:
         """Return the marginal likelihood of a model with a subset of the columns (p,)."""
@@ -405,44 +394,32 @@ class Evidence:
         return z, C, logdet + more, np.append(v, size2[g:])
 
     def _known(self, H: Array, h: Array, size2: Array, v: Array, accuracy: float) -> tuple[Array, Array, float, Array]:
-        """Return z, C, -ln|C| and v of all but curves, from their information matrix H and vector h."""
-        heavy = self._heavy
-        local = v[heavy]
-        v = size2.copy()
-        own = np.where(self.prior.replaced[: len(v)], 0.0, 1.0)
-        if len(heavy):
-            # the others' variances stay: their share of the information is taken out once
-            light = np.setdiff1d(np.arange(len(v)), heavy)
-            S, g = H[heavy][:, heavy], h[heavy]
-            if len(light):
-                right = np.column_stack([H[light][:, heavy], h[light]])
-                Y = _half_solved(*_factored(H[light][:, light], (own / v)[light]), right)
-                S, g = S - Y[:, :-1].T @ Y[:, :-1], g - Y[:, :-1].T @ Y[:, -1]
-            v[heavy] = self._local(S, g, size2[heavy], local, accuracy)
-        return *_posterior(H, h, own / v), v
+        """Return z, C, -ln|C| and v of all but curves, from their information matrix H and vector h.
 
-    def _local(self, S: Array, g: Array, size2: Array, v: Array, accuracy: float) -> Array:
-        """Return the local variances of Student-t deviations, a fixed point: S is their information matrix, S z = g.
-
-        By Newton's steps for ln v: d C_ij / d v_k = C_ik C_kj / v_k^2, d z_j / d v_k = C_jk z_k / v_k^2.
+        Local variances of Student-t deviations are a fixed point, found by Newton's steps for ln v:
+        d C_ij / d v_k = C_ik C_kj / v_k^2, d z_j / d v_k = C_jk z_k / v_k^2.
         """
-        tails = self.prior.tails
-        before = np.inf
-        widest = WIDEST * np.maximum(size2, 1.0)
+        heavy, tails = self._heavy, self.prior.tails
+        own = np.where(self.prior.replaced[: len(v)], 0.0, 1.0)
+        t2 = size2[heavy]
+        widest = WIDEST * np.maximum(t2, 1.0)
+        local = np.minimum(v[heavy], widest)
+        v, before = size2.copy(), np.inf
         for _ in range(MOST_ROUNDS):
-            v = np.minimum(v, widest)
-            z, C, _ = _posterior(S, g, 1 / v)
-            weighed = np.minimum(tails * size2 + z**2 + C.diagonal(), (tails + 1) * widest)
-            change = np.log(weighed / ((tails + 1) * v))
-            largest = np.abs(change).max()
+            v[heavy] = local
+            z, C, logdet = _posterior(H, h, own / v)
+            z_heavy, C_heavy = z[heavy], C[np.ix_(heavy, heavy)]
+            weighed = np.minimum(tails * t2 + z_heavy**2 + C_heavy.diagonal(), (tails + 1) * widest)
+            change = np.log(weighed / ((tails + 1) * local))
+            largest = np.abs(change).max(initial=0.0)
             if largest <= accuracy:
                 break
             step = change  # which always leads downhill, slowly
             if largest < before:
-                step = _step(change, C * (C + 2 * np.outer(z, z)), weighed, v)
-            v = v * np.exp(step)
+                step = _step(change, C_heavy * (C_heavy + 2 * np.outer(z_heavy, z_heavy)), weighed, local)
+            local = np.minimum(local * np.exp(step), widest)
             before = min(before, largest)
-        return np.minimum(v, widest)
+        return z, C, logdet, v
 
     def _log_variances(self, of_size: Array, direct: Array, follows: Array, size2: Array, v: Array) -> Array:
         """Return the derivatives (p, s) of ln v, an implicit equation for Student-t deviations."""

@@ -31,7 +31,6 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
 MOST = 1000  # configurations that hyperparameters are estimated from, drawn at random where there are more
-FEW = 60  # configurations up to which several optima of the marginal likelihood are looked for
 SAME_SIZE, SAME_PLACE = 0.02, 0.01
 """Largest change of the logarithms of hyperparameters, and of deviations over their scales (RMS), at the end."""
 CLOSE = 0.1  # scales (RMS) up to which the posterior mean at one linearization stands for a fit
@@ -224,11 +223,11 @@ class Estimator:
         From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known. Several optima are all
         continued, since where few data leave frames far from their start, their order changes with the linearization.
         """
-        first = self._once(problem, x, before, before is None, ITERATIONS)
-        fits = [first, *(self._once(problem, x, other.logs, False, ITERATIONS) for other in first.others)]
+        first = self._once(problem, x, before, ITERATIONS)
+        fits = [first, *(self._once(problem, x, other.logs, ITERATIONS) for other in first.others)]
         for i, fit in enumerate(fits):
             for k in range(1, rounds):
-                again = self._once(problem, fit.x, fit.point.logs, False, ITERATIONS * 2**k)
+                again = self._once(problem, fit.x, fit.point.logs, ITERATIONS * 2**k)
                 moved = _distance(again.x, fit.x, again.laid)
                 resized = np.abs(again.point.logs - fit.point.logs).max(initial=0.0)
                 fit = fits[i] = again
@@ -236,15 +235,12 @@ class Estimator:
                     break
         return min(fits, key=lambda fit: fit.point.value)
 
-    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, several: bool, iterations: int) -> Fit:
-        """Estimate hyperparameters at one linearization, starting from given values (s,) and from several starts."""
+    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, iterations: int) -> Fit:
+        """Estimate hyperparameters at one linearization, starting from given values (s,), or from several starts."""
         p = problem.parameters
         prior = self.prior.stated(p)
         evidence = self.evidence(problem, x, prior)
-        starts = [] if known is None else [known]
-        if several:
-            starts += multistart(problem, evidence)
-        point, *others = evidence.optima(starts)
+        point, *others = evidence.optima(evidence.starts() if known is None else [known])
         scale = p.scale.copy()
         scale[p.identified] *= prior.scale * np.sqrt(point.v)
         repeatability = replace(evidence.repeatability(point.logs), at=p.values_at(x))
@@ -267,12 +263,6 @@ def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:
         share += [np.diff(between) / (2 * np.pi)] * 2  # a coefficient stands for the frequencies nearest to its own
     frequencies = np.concatenate(w)
     return Spectrum(frequencies**2, unit[len(unit) - len(frequencies) :] ** 2 / np.concatenate(share))
-
-
-def multistart(problem: CalibrationProblem, evidence: Evidence) -> list[Array]:
-    """Return the starts of the search for the optimum; several if configurations are few."""
-    few = len(np.unique(problem.data.configuration)) <= FEW
-    return evidence.starts()[: None if few else 1]
 
 
 def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:

@@ -12,7 +12,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CENTRES, Evidence, Point
-from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, multistart, sampled
+from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, sampled
 from rpim_opt.bayes.outliers import clustered
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Result
@@ -254,7 +254,7 @@ class Comparison(Models):
     def plain(self) -> Candidate:
         """The result's own model, without extensions."""
         evidence = self.columns.restricted(self.members(()))
-        starts = multistart(self.problem, evidence)
+        starts = evidence.starts()
         if self.result.learned is not None:
             noise = {name: np.log(size.value) for name, size in self.result.learned.noise.items() if name in CENTRES}
             starts = [np.array([noise.get(n, c) for n, c in zip(evidence.names, evidence.centre, strict=True)])]

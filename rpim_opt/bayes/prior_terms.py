@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -113,10 +113,7 @@ def prior_penalty(
     arguments = (penalty, tuple(keep), tuple(centre), tuple(map(tuple, rows)), tuple(values), groups)
     if penalty is None or penalty in NAMED or isinstance(penalty, Ready):
         return _Penalty("prior_penalty", _penalized, arguments)
-    return partial(_penalized, **dict(zip(ARGUMENTS, arguments, strict=True)))
-
-
-ARGUMENTS = ("penalty", "keep", "centre", "rows", "values", "groups")
+    return lambda z: _penalized(z, *arguments)
 
 
 def _penalized(

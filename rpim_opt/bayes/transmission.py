@@ -19,7 +19,6 @@ from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
 from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, complexity, extended, named
 from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.problem.noise import Repeatability, Stack
-from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
 TRANSMISSION = "transmission error"  # the extension by curves of the joints' transmission error
@@ -35,12 +34,6 @@ STARTS = (0.3, 0.03)  # length scales [rad] from which the optimum is looked for
 ACCURACY = 0.3  # slope of -2 ln L by the logarithms of hyperparameters at which curves are admitted
 ROUNDS = 3  # linearizations at which curves are estimated
 LEAST = 2e-6  # noise [m or rad] from which its optimum is looked for at least
-
-
-def possible(problem: CalibrationProblem) -> bool:
-    """Return whether every equation depends on a single configuration of one robot, as transmission errors require."""
-    one_stop = all(block.q.shape[1] == 1 for block in problem.data.blocks)
-    return len(problem.arms) == 1 and problem.touches is None and one_stop
 
 
 def series(curves: Sequence[Curve], q: Array, slopes: Array) -> Array:
@@ -61,11 +54,15 @@ def admitted(
 ) -> tuple[Fit, tuple[Trial, ...], float] | None:
     """Return the fit with transmission errors, the models compared, and the decrease of -2 ln L; None if too small.
 
+    And where an equation depends on several configurations, or on one of several robots.
     Curves stand in the place of second harmonics. All other extensions are selected again, with curves in the model;
     gravity stays if it was selected without them: waves can imitate it where joints were measured, but not elsewhere.
     ``fit`` is that of the model without curves that was selected, the first of ``trials``; ``stated`` are the names of
     the parameters that were to be identified.
     """
+    several = any(block.q.shape[1] > 1 for block in fit.problem.data.blocks)
+    if several or len(fit.problem.arms) > 1 or fit.problem.touches is not None:
+        return None
     p = fit.problem.parameters
     bare = fit.problem.with_parameters(replace(p, identified=np.isin(p.names, stated)))
     deviation = named(fit.problem, fit.x)
@@ -144,7 +141,7 @@ def _most_likely(
     size = CURVES["transmission size"][0]
     starts = [beside.at(np.array([*np.log([size, length]), *plain.logs])) for length in STARTS]
     start = min(starts, key=lambda point: point.value)
-    point = beside.optima([start.logs], ACCURACY, start)[0]
+    point = beside.optima([start.logs], ACCURACY)[0]
     return (point, curves, columns) if plain.value - point.value > GAIN else None
 
 

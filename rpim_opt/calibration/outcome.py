@@ -102,6 +102,9 @@ class Outcome:
     excluded: Dataset | None = None
     known: Mapping[str, Any] = field(default_factory=dict)
 
+    def __post_init__(self) -> None:
+        vars(self).update(self.known)  # in the place of what the cached properties of these names would compute
+
     @property
     def z(self) -> Array:
         """The deviations (n,) in units of their scales."""
@@ -328,8 +331,6 @@ class Outcome:
     @cached_property
     def squares(self) -> LinearModel:
         """The equations whose squares the fit amounts to, multiplied by a factor."""
-        if "squares" in self.known:
-            return self.known["squares"]
         program = self.program
         source = in_parts(self.problem)
         if self._reweighed:
@@ -450,18 +451,16 @@ class Outcome:
         problem = self.problem
         if not flags or self.squared_loss or not self.linear_penalty or not isinstance(problem, CalibrationProblem):
             return flags
-        model = self.program.model
-        if len(model.b) != sum(len(part.owners) for part in problem.rows()):  # reduced to a QR factor
+        model, free = self.program.model, problem.parameters.free
+        if len(model.b) != len(problem.owners):  # reduced to a QR factor
             return flags
         number = dict(zip(problem.labels, problem.data.configuration, strict=True))
         groups = np.array([number[flag.label] for flag in flags])
-        p = problem.parameters
-        width = (default_widths(p) / p.scale)[p.identified]
         try:
             weight = self.penalty_weight / self.squares.factor
         except InputError:  # a loss with own variables has no quadratic model by which a row could be contradicted
             return flags
-        sure = contradicted(model, self.program.penalty_form, weight, width, groups)
+        sure = contradicted(model, self.program.penalty_form, weight, default_widths(free) / free.scale, groups)
         return tuple(flag for flag, certain in zip(flags, sure, strict=True) if certain)
 
     @cached_property
@@ -503,8 +502,6 @@ class Outcome:
         the bound were loosened by a tenth of its size, from its multiplier. A large gain is an alarm: wrong data, or a
         drawing that does not describe this robot.
         """
-        if "active_bounds" in self.known:
-            return self.known["active_bounds"]
         program, z = self.program, self.z
         if program.box is None or not program.formulation.constraints:
             return ()
@@ -525,8 +522,6 @@ class Outcome:
     @cached_property
     def shadow_prices(self) -> tuple[ShadowPrice, ...]:
         """Shadow prices of textual constraints (`constraints.parse`), in their order; empty if there are none."""
-        if "shadow_prices" in self.known:
-            return self.known["shadow_prices"]
         program, z = self.program, self.z
         constraints, parameters = program.formulation.constraints, program.model.parameters
         texts = [(i, parsed) for i, parsed in enumerate(constraints) if isinstance(parsed, Parsed)]

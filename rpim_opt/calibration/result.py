@@ -77,8 +77,6 @@ class Calibration(Outcome):
     @cached_property
     def causes(self) -> tuple[str, ...]:
         """Likely causes of a poor fit, one sentence each (`likely_causes`)."""
-        if "causes" in self.known:
-            return self.known["causes"]
         return tuple(likely_causes(self))
 
     def weight_sentence(self) -> str:
