@@ -39,11 +39,7 @@ class Estimated:
 
 
 def estimate(problem: Source, estimator: Estimator, model: str, start: Array | None) -> Estimated:
-    """Estimate hyperparameters, model extensions and outliers, and return them with the problem that has them applied.
-
-    ``model`` is ``"geometry"``, or ``"auto"`` for the extensions that the marginal likelihood selects; ``start`` (n,)
-    [SI] or None.
-    """
+    """Estimate hyperparameters, outliers, and of the model ``"auto"`` extensions, from a start (n,) [SI] or None."""
     try:
         return _estimate(problem, estimator, model, start)
     except np.linalg.LinAlgError:

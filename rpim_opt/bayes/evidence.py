@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -108,10 +108,7 @@ class Hierarchy:
         return self.names if self.spectrum is None else (*self.names, *CURVES)
 
     def variances(self, logs: Array) -> tuple[Array, Array, Array]:
-        """Return variances (p,) at logarithms of hyperparameters, slopes (p, s) of ln, and curvature of a spectrum's.
-
-        Without local scales; replaced deviations follow no hyperparameter.
-        """
+        """Return variances (p,) without local scales, slopes (p, s) of ln by the logs, and a spectrum's curvature."""
         g = len(self.names)
         variances = np.append(np.exp(2 * logs[:g]), 1.0)[self.group]
         slopes = np.zeros((len(variances), len(logs)))
@@ -404,22 +401,22 @@ class Evidence:
         t2 = size2[heavy]
         widest = WIDEST * np.maximum(t2, 1.0)
         local = np.minimum(v[heavy], widest)
-        v, before = size2.copy(), np.inf
-        for _ in range(MOST_ROUNDS):
+        v, before, rounds = size2.copy(), np.inf, 0
+        while True:
             v[heavy] = local
             z, C, logdet = _posterior(H, h, own / v)
             z_heavy, C_heavy = z[heavy], C[np.ix_(heavy, heavy)]
             weighed = np.minimum(tails * t2 + z_heavy**2 + C_heavy.diagonal(), (tails + 1) * widest)
             change = np.log(weighed / ((tails + 1) * local))
             largest = np.abs(change).max(initial=0.0)
-            if largest <= accuracy:
-                break
+            rounds += 1
+            if largest <= accuracy or rounds == MOST_ROUNDS:
+                return z, C, logdet, v
             step = change  # which always leads downhill, slowly
             if largest < before:
                 step = _step(change, C_heavy * (C_heavy + 2 * np.outer(z_heavy, z_heavy)), weighed, local)
             local = np.minimum(local * np.exp(step), widest)
             before = min(before, largest)
-        return z, C, logdet, v
 
     def _log_variances(self, of_size: Array, direct: Array, follows: Array, size2: Array, v: Array) -> Array:
         """Return the derivatives (p, s) of ln v, an implicit equation for Student-t deviations."""
@@ -437,14 +434,14 @@ def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -
     """Return derivatives by logarithms of noise: the gradient (q,), X'R^-1 R_a u (q, p), and parts of the second's.
 
     Those are 2 u'R_a R^-1 R_b u - tr(P R_a P R_b) (q, q), but for what of u follows the noise, and the diagonals (p, q)
-    of C X'R^-1 R_a R^-1 X C. Products are with equations or with deviations, whichever are less work.
+    of C X'R^-1 R_a R^-1 X C.
     """
     q, p = len(parts[0].noise), len(C)
     gradient, f, among, of_C = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), np.zeros((p, q))
     if not q:
         return gradient, f, among, of_C
     rows = [part.X.reshape(-1, p) for part in parts]
-    by_equations = sum(map(len, rows)) < 2 * p
+    by_equations = sum(map(len, rows)) < 2 * p  # which then is less work than by deviations
     S = np.zeros((q, p, p))  # X'R^-1 R_a R^-1 X
     products = []
     for part, X, residual in zip(parts, rows, residuals, strict=True):
@@ -470,8 +467,7 @@ def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -
 
 # --- linear algebra ---------------------------------------------------------------------------------------------
 
-_potrf: Any = get_lapack_funcs("potrf", dtype=float)
-_potri: Any = get_lapack_funcs("potri", dtype=float)
+_potrf, _potri = get_lapack_funcs(("potrf", "potri"), dtype=float)
 
 
 def _factored(H: Array, precision: Array) -> tuple[Array, Array]:

@@ -220,8 +220,8 @@ class Estimator:
     def fit(self, problem: CalibrationProblem, x: Array, before: Array | None, rounds: int) -> Fit:
         """Alternate hyperparameters and deviations to a fixed point, with a limited number of linearizations.
 
-        From x (n,) [SI] and logarithms of hyperparameters, or None where they are not known. Several optima are all
-        continued, since where few data leave frames far from their start, their order changes with the linearization.
+        From x (n,) [SI] and logarithms of hyperparameters, or None. Several optima are all continued, since where few
+        data leave frames far from their start, their order changes with the linearization.
         """
         first = self._once(problem, x, before, ITERATIONS)
         fits = [first, *(self._once(problem, x, other.logs, ITERATIONS) for other in first.others)]
@@ -291,8 +291,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     """Return the hyperparameters of a fit with their standard errors; ``gain`` is the gain by transmission errors.
 
     Their covariance (s, s) is twice the inverse of the second derivatives of -2 ln L, and the variance V of a reading
-    has Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three: of all of it, as what is not known of the
-    model counts with how little is known of the hyperparameters behind it.
+    has Satterthwaite's degrees of freedom 2 V^2 / var(V), at least three.
     """
     evidence, point, prior = fit.evidence, fit.point, fit.evidence.prior
     curvature, U = np.linalg.eigh((point.curvature + point.curvature.T) / 2)

@@ -38,16 +38,6 @@ LARGE = 3.0  # by how much larger, in its logarithm, the scale of an extension i
 COMPARED = 1e-2  # slopes of -2 ln L by the logarithms of hyperparameters at which models are compared
 ROUNDS = 3  # linearizations at which the hyperparameters of the selected model are estimated
 SPEAK = 10.0  # fall of -2 ln L for an extension to be spoken of: false picks gain 4, none of many gained 10
-OWNED = {
-    "gravity": ("compliance", "bend"),
-    "first harmonic": ("ecc",),
-    "second harmonic": ("ecc2",),
-    SESSIONS: ("session",),
-    WARMTH: ("expansion",),
-}
-"""Extensions whose evidence is asked for at a result, and the terms that stand for them.
-
-First moments of links are gravity's, too: either would stand for the other."""
 NOISE = ("position", "orientation", "joint")  # parts of the noise of a comparison at a result
 KNOWN = Prior(joint_offset=1.0, frames=1.0)  # the prior once scales were estimated: they are as the problem says
 
@@ -65,10 +55,7 @@ class Candidate(NamedTuple):
 
 
 def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
-    """Return the parameters of every extension that the data may identify and that are not identified yet.
-
-    Of harmonics those of joints that turned far enough.
-    """
+    """Return the parameters of every extension that are not identified yet, of joints that turned far enough."""
     candidates: dict[str, list[str]] = {}
     known = set(problem.parameters.free.names)
     for robot, arm in problem.arms.items():
@@ -84,9 +71,7 @@ def identifiable(problem: CalibrationProblem) -> dict[str, tuple[str, ...]]:
     grows = [n for n in problem.parameters.names if own_name(n) == EXPANSION]
     if grows and np.ptp(problem.data.temperatures) > 0:
         candidates[WARMTH] = grows
-    new = {
-        extension: tuple(dict.fromkeys(n for n in names if n not in known)) for extension, names in candidates.items()
-    }
+    new = {each: tuple(dict.fromkeys(n for n in names if n not in known)) for each, names in candidates.items()}
     return {extension: names for extension, names in new.items() if names}
 
 
@@ -129,9 +114,7 @@ class Models:
     ) -> None:
         self.problem = problem
         self.own = problem.parameters.free.names
-        self.extensions = {
-            extension: names for extension, names in identifiable(problem).items() if extension not in skip
-        }
+        self.extensions = {name: own for name, own in identifiable(problem).items() if name not in skip}
         self.whole = extended(problem, self.added(self.extensions))
         self.names = np.array(self.whole.parameters.free.names)
         self.x = deviations(self.whole, known)
@@ -152,9 +135,7 @@ class Models:
         the best one each condition is asked for.
         """
         conditions = tuple(condition for condition in CONDITIONS if condition in self.extensions)
-        possible = [
-            tuple(extension for extension in candidate if extension in self.extensions) for candidate in CANDIDATES
-        ]
+        possible = [tuple(each for each in candidate if each in self.extensions) for candidate in CANDIDATES]
         candidates = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
         best = min(candidates, key=lambda each: each.price)
         further = FURTHER if len(np.unique(self.problem.data.configuration)) >= MANY else {}

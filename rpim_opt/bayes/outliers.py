@@ -56,16 +56,15 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
 
 
 def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
-    """Return error ratios (N,) to the median of the measurement type, scaled to the same false rate for every type.
+    """Return the larger ratio (N,) of errors in length and in angle to the median of the measurement type.
 
-    The larger of those of lengths and of angles, at the deviations x (n,) [SI].
+    Scaled to the same false rate for every type, at the deviations x (n,) [SI].
     """
-    components = np.zeros((len(problem.data), 2), dtype=int)
-    for block in problem.data.blocks:
-        dimensions = error_dimensions(block)
-        components[block.row] = [dimensions.count("length"), dimensions.count("angle")]
     ratios = np.zeros(len(problem.data))
-    for dimension, counts in zip(("length", "angle"), components.T, strict=True):
+    for dimension in ("length", "angle"):
+        counts = np.zeros(len(ratios), dtype=int)
+        for block in problem.data.blocks:
+            counts[block.row] = error_dimensions(block).count(dimension)
         if not counts.any():
             continue
         errors = np.nan_to_num(problem.errors(x, dimension))
@@ -113,18 +112,22 @@ def resistant_fit(problem: CalibrationProblem, x: Array, scale: Array) -> Array:
 
 
 def outlier_candidates(problem: CalibrationProblem, x: Array, scale: Array, spare: float) -> dict[str, float]:
-    """Return the rows that may be outliers, as a mapping from label to error over the median.
+    """Return the error over the median, by label, of rows that may be outliers of a squared fit x (n,) [SI].
 
-    At deviations x (n,) of a squared fit, of prior scales (n,) [SI], that left over a part ``spare`` of the equations.
+    Of prior scales (n,) [SI]; a part ``spare`` of the equations was left over.
     """
     ratio = error_ratios(problem, x)
     if spare < SPARE or ratio.max() < LOOK:
         return {}
     if len(problem.groups) < WELL_DETERMINED * len(x):
         ratio = error_ratios(problem, resistant_fit(problem, x, scale))
-    rows = np.flatnonzero(ratio > BEYOND)
-    alone = rows[~clustered(problem, x, rows)]
-    return {problem.labels[i]: float(ratio[i]) for i in alone}
+    return _alone(problem, x, {problem.labels[i]: float(ratio[i]) for i in np.flatnonzero(ratio > BEYOND)})
+
+
+def _alone(problem: CalibrationProblem, x: Array, ratios: dict[str, float]) -> dict[str, float]:
+    """Return the rows without clusters of neighbours."""
+    rows = np.flatnonzero(np.isin(problem.labels, list(ratios)))
+    return {problem.labels[i]: ratios[problem.labels[i]] for i in rows[~clustered(problem, x, rows)]}
 
 
 def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
@@ -153,10 +156,7 @@ def clustered(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.nda
 
 
 def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndarray:
-    """Return which rows (r,) have errors correlated with neighbours in joint space or time, so are not outliers.
-
-    In time that is a run of visits one after the other that chance makes once in a hundred sets of data.
-    """
+    """Return which rows (r,) have errors like their neighbours in joint space, or are a run in time, so no outliers."""
     q = problem.data.q
     visit = np.cumsum(np.any(np.diff(q, axis=0, prepend=q[:1]) != 0, axis=1))  # of the same joint values
     suspect = np.zeros(visit[-1] + 1, dtype=bool)
@@ -165,17 +165,14 @@ def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndar
     edges = np.flatnonzero(np.diff(suspect, prepend=False, append=False))
     long = np.zeros(len(suspect), dtype=bool)
     for start, end in edges.reshape(-1, 2):
-        # a run of so many begins at any visit with probability share^length
+        # a run of so many begins at any visit with probability share^length: not once in a hundred sets of data
         if end - start >= NEIGHBOURS and len(suspect) * share ** (end - start) < RUN:
             long[start:end] = True
     return clustered(problem, x, rows) | long[visit[rows]]
 
 
 def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
-    """Return the rows that the noise of a fit x (n,) [SI] cannot explain, at the same false rate.
-
-    For so many measurements that no single one pulls the fit, and that are not all used to estimate hyperparameters.
-    """
+    """Return the rows that the noise of a fit x (n,) [SI] cannot explain; of so many that no single one pulls it."""
     norms, count = problem.whitened_errors(x)
     rare = chdtrc(count, norms**2) < FALSE_RATE
     typical = norms / np.sqrt(chdtri(count, 0.5))
@@ -185,10 +182,7 @@ def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
 
 def isolated(problem: CalibrationProblem, x: Array) -> dict[str, float]:
     """Return the rows that the noise of a fit x (n,) [SI] cannot explain, without clusters of neighbours."""
-    beyond = beyond_noise(problem, x)
-    rows = np.array([i for i, label in enumerate(problem.labels) if label in beyond], dtype=int)
-    alone = rows[~clustered(problem, x, rows)]
-    return {problem.labels[i]: beyond[problem.labels[i]] for i in alone}
+    return _alone(problem, x, beyond_noise(problem, x))
 
 
 def unexplained(problem: CalibrationProblem, x: Array, covariance: Array, labels: dict[str, float]) -> dict[str, float]:

@@ -143,10 +143,7 @@ class Workspace:
 
 
 def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: Array) -> Workspace:
-    """Return the expanded uncertainty at configurations (N, dof) of a region and at the maximum found by a search.
-
-    InputError for a formulation without covariance.
-    """
+    """Return the expanded uncertainty at configurations (N, dof) of a region, and at the maximum found by a search."""
     rng = np.random.default_rng(0)
     span = np.ptp(region.limits, axis=1)
     q, bound = drawn, reaching(result, region, drawn, requirement.confidence)[1]
@@ -437,7 +434,7 @@ def _held_out(
 def repeatability_bounds(result: Calibration, region: Region, q: Array, confidence: float) -> tuple[float, float]:
     """Return the bounds [m] at q (dof,) if all parameters were known, for the estimated and the smallest repeatability.
 
-    Zero where it is not known apart from the noise; at the least where the data know no more than an upper end.
+    Zero where it is not known apart from the noise, the smallest also where the data know no more than an upper end.
     """
     results = [result]
     repeatability = result.problem.repeatability

@@ -15,16 +15,15 @@ __all__ = ["gauss_newton", "levenberg_marquardt", "linear_least_squares"]
 
 
 class Baseline(NamedTuple):
-    """Identified deviations (n,) [SI], the number of iterations or evaluations, and the method."""
+    """Identified deviations (n,) [SI], and the number of iterations or evaluations."""
 
     x: Array
     iterations: int
-    method: str
 
 
 def linear_least_squares(problem: CalibrationProblem) -> Baseline:
     """Linear least squares of the paper: one step from nominal, of smallest norm in units of the scales."""
-    return gauss_newton(problem, iterations=1, cutoff=1e-12)._replace(method="linear least squares")
+    return gauss_newton(problem, iterations=1, cutoff=1e-12)
 
 
 def gauss_newton(
@@ -48,25 +47,25 @@ def gauss_newton(
         z = z + step
         if np.linalg.norm(step) <= tolerance * (1 + np.linalg.norm(z)):
             break
-    return Baseline(scale * z, k, "Gauss-Newton")
+    return Baseline(scale * z, k)
 
 
 def levenberg_marquardt(problem: CalibrationProblem) -> Baseline:
     """Levenberg-Marquardt of SciPy (MINPACK) on whitened residuals, with analytic Jacobian and 200 evaluations."""
     scale = problem.parameters.free.scale
 
-    def residual(z: Array) -> Array:
-        model = problem.linearize(scale * z)
-        return model.A @ z - model.b
+    def slope(z: Array) -> Any:
+        return -problem.linearize(scale * z).A
 
-    if len(residual(np.zeros_like(scale))) < len(scale):
+    if len(problem.owners) < len(scale):
         raise InputError("data", "fewer equations than parameters", "gauss_newton, or a calibration with a penalty")
-
-    def slope(z: Array) -> Array:
-        return problem.linearize(scale * z).A
-
-    jac: Any = slope
     solution = scipy.optimize.least_squares(
-        residual, np.zeros_like(scale), jac=jac, method="lm", xtol=1e-12, ftol=1e-12, max_nfev=200
+        lambda z: problem.whitened_residual(scale * z),
+        np.zeros_like(scale),
+        slope,
+        method="lm",
+        xtol=1e-12,
+        ftol=1e-12,
+        max_nfev=200,
     )
-    return Baseline(scale * solution.x, int(solution.nfev), "Levenberg-Marquardt")
+    return Baseline(scale * solution.x, int(solution.nfev))

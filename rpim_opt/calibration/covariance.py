@@ -113,8 +113,8 @@ class NoiseCovariances(NamedTuple):
 def noise_covariances(problem: CalibrationProblem, level: float) -> NoiseCovariances:
     """Return the covariances that robot and instrument add to the model of some measurements.
 
-    A problem whose repeatability was estimated knows its parts. Of another one the robot's is what the residuals show
-    beyond the stated noise, (level - 1) Sigma, with ``level`` the noise's variance over the stated one, at least 1.
+    Where repeatability was not estimated, the robot's is what residuals show beyond the stated noise: (level - 1)
+    Sigma, with ``level`` the noise's variance over the stated one, at least 1.
     """
     session = unknown_sessions(problem)
     if problem.repeatability is not None:

@@ -63,10 +63,7 @@ def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = No
 
 
 def required_coverage(rows: int) -> float:
-    """Return the share of coordinates in 95 % intervals that so many rows fall below with probability 0.01.
-
-    Coordinates of a row are not independent of each other: a row counts once.
-    """
+    """Return the share of coordinates in 95 % intervals that so many rows, each counted once, rarely fall below."""
     return float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
 
 
@@ -139,11 +136,8 @@ def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
 
 def excluded_by_fit(result: Calibration) -> list[str]:
     """Return the labels of held-out rows that the fit to all rows excludes as outliers."""
-    held = result.record.held_out
-    if held is None:
-        return []
-    used = set(result.problem.labels)
-    return [label for label in held.label if label not in used]
+    held, used = result.record.held_out, set(result.problem.labels)
+    return [] if held is None else [label for label in held.label if label not in used]
 
 
 def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibration:
@@ -183,17 +177,12 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
 
 def sets(result: Calibration) -> dict[str, Dataset]:
     """Return the data sets by name, validation first if present."""
-    data = {"identification": result.problem.data}
-    if result.record.validation is None:
-        return data
-    return {"validation": result.record.validation, **data}
+    held = result.record.validation
+    return {**({} if held is None else {"validation": held}), "identification": result.problem.data}
 
 
 def headline_errors(result: Calibration) -> tuple[str, Array, Array]:
-    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified.
-
-    Of held-out rows those count that the final fit does not exclude as outliers.
-    """
+    """Return the name of the headline's rows, and their errors (N,) [m], nominal and identified, without outliers."""
     held = result.record.held_out
     if held is not None:
         kept = ~np.isin(held.label, excluded_by_fit(result))

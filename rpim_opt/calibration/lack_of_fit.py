@@ -15,7 +15,7 @@ from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.hyperparameters import ExcludedRow, sampled
-from rpim_opt.bayes.model_selection import OWNED, SESSIONS, SPEAK, WARMTH, Candidate, Comparison
+from rpim_opt.bayes.model_selection import SESSIONS, SPEAK, WARMTH, Candidate, Comparison
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
@@ -38,30 +38,38 @@ FEWEST_NEIGHBOURS = 8  # configurations below which there is no autocorrelation
 
 
 class Extension(NamedTuple):
-    """A model extension in words: its parameter patterns, and its description when missing and when present."""
+    """A model extension: its parameter patterns, what it is called when missing, the same when present, and its terms.
+
+    Terms whose evidence is asked for at a result; first moments of links are gravity's, as either stands for the other.
+    """
 
     identify: tuple[str, ...]
     name: str
     effect: str = ""
+    terms: tuple[str, ...] = ()
 
 
 EXTENSIONS = {
-    "gravity": Extension(("compliance?",), "gravity", "The arm deflects under gravity"),
+    "gravity": Extension(("compliance?",), "gravity", "The arm deflects under gravity", ("compliance", "bend")),
     "first harmonic": Extension(
         ("ecc_cos?", "ecc_sin?"),
         "eccentric encoders or gears (once a turn)",
         "Encoders or gears of joints are eccentric (errors once a turn)",
+        ("ecc",),
     ),
     "second harmonic": Extension(
-        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints have errors twice a turn"
+        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints have errors twice a turn", ("ecc2",)
     ),
     "moments": Extension(("bend*",), "gravity on masses whose centres differ from the assumed ones"),
     SESSIONS: Extension(
         ("session_*",),
         "a registration that differs from session to session",
         "The registration differs from session to session",
+        ("session",),
     ),
-    WARMTH: Extension(("expansion",), "lengths that grow with temperature", "Lengths grow with temperature"),
+    WARMTH: Extension(
+        ("expansion",), "lengths that grow with temperature", "Lengths grow with temperature", ("expansion",)
+    ),
 }
 
 
@@ -206,7 +214,7 @@ def lack_of_fit(result: Outcome) -> LackOfFit:
     if best.extensions:
         share = max(total - sum(part**2 for part in after.values()), 0.0) / total
     group = [kind_of(name) for name in compared.own]
-    members = {extension: np.isin(group, terms) for extension, terms in OWNED.items()}
+    members = {name: np.isin(group, extension.terms) for name, extension in EXTENSIONS.items()}
     gains = {extension: compared.rise_without(own) for extension, own in members.items() if own.any()}
     present = {extension: gain for extension, gain in gains.items() if gain > SPEAK}
     again, freedom = _repeated(problem, result.x, dimension)

@@ -156,22 +156,16 @@ def _equations(result: Outcome) -> tuple[LinearModel, dict[int, str]]:
 
 def _left_out(Q: Array, residual: Array, equations: np.ndarray) -> tuple[Array, Array]:
     """Return leverages (C,), and changes (C, k) by Q (m, k) of leaving out so many ``equations`` (C,) in turn."""
-    first = np.cumsum(equations) - equations
-    leverage = np.empty(len(first))
-    change = np.empty((len(first), Q.shape[1]))
-    for count in np.unique(equations):
-        chosen = np.flatnonzero(equations == count)
-        rows = first[chosen][:, None] + np.arange(count)
-        q, r = Q[rows], residual[rows]
-        hat = q @ q.transpose(0, 2, 1)
-        leverage[chosen] = np.einsum("kii->k", hat)
-        spare = np.eye(count) - hat
-        alone = np.linalg.eigvalsh(spare)[:, 0] < ALONE
-        spare[alone] = np.eye(count)
-        pull = np.linalg.solve(spare, r[:, :, None])[:, :, 0]
-        moved = np.einsum("kij,ki->kj", q, pull)
-        moved[alone] = np.nan
-        change[chosen] = moved
+    leverage = np.empty(len(equations))
+    change = np.full((len(equations), Q.shape[1]), np.nan)
+    ends = np.cumsum(equations)
+    for k, (start, end) in enumerate(zip(ends - equations, ends, strict=True)):
+        q = Q[start:end]
+        hat = q @ q.T
+        leverage[k] = np.trace(hat)
+        spare = np.eye(len(hat)) - hat
+        if np.linalg.eigvalsh(spare)[0] >= ALONE:
+            change[k] = q.T @ np.linalg.solve(spare, residual[start:end])
     return leverage, change
 
 
@@ -237,16 +231,13 @@ def improvement(result: Outcome) -> Improvement | None:
 
 
 def _slopes(result: Outcome) -> tuple[Array, Array]:
-    """Return the slopes of flange positions less what fitting base and tool takes back, (3 W, n) and (W, 3, n).
-
-    Several problems of `together` are one machine where they share all that is identified of the joints.
-    """
+    """Return the slopes of flange positions less what fitting base and tool takes back, (3 W, n) and (W, 3, n)."""
     problem = result.problem.sample()
     parameters = result.problem.parameters
     robot = next(iter(problem.arms))
     joints = [name for name in parameters.free.names if of_joint(name) or name in parameters.terms]
     own = [name for name in joints if own_name(name) != name]
-    if own:
+    if own:  # several problems are one machine where they share all of the joints
         raise InputError("improvement", f"several robots: '{own[0]}' belongs to one only", "one robot")
     columns = parameters.free.places_of(robot)
     of_robot = parameters.of_robot(robot)

@@ -386,10 +386,9 @@ class Loop:
         return program.solve(state.choice.weight, damping=damping, **how).z
 
     def _accelerated(self, state: State, solution: Array) -> Array:
-        """Let a step follow the curve of the residual: the convex program again, b moved by half the curvature.
+        """Let a step follow the curve of the residual: the program again, with b moved by half the curvature along it.
 
-        (Geodesic acceleration; Transtrum and Sethna 2012, arXiv:1201.5885. The curvature is that along the step, by a
-        difference of residuals.)
+        Geodesic acceleration (Transtrum and Sethna 2012, arXiv:1201.5885).
         """
         step = solution - state.z
         source, model = self.source, state.program.model
@@ -498,10 +497,7 @@ def nearby(problem: Source, formulation: Formulation, start: Array, steps: int) 
 
 
 def _certified(loop: Loop, problem: Source, state: State) -> Ended:
-    """Certify the end of a loop by the formulation's functions and the measurements' model, asked anew.
-
-    Of data in blocks by the squares that stand for the loss.
-    """
+    """Certify the end of a loop by functions and model asked anew; blocks by the squares that stand for the loss."""
     model, residual = state.program.model, None
     if loop.source.keeps_rows:  # of more than fits into memory the last iteration has to do
         anew = in_parts(problem.frozen())

@@ -478,6 +478,11 @@ class Outcome:
         return tuple(flag.label for flag, kept in zip(self.flagged, together, strict=True) if kept)
 
     @property
+    def single(self) -> tuple[Flag, ...]:
+        """The outliers that are not `clustered`."""
+        return tuple(flag for flag in self.flagged if flag.label not in self.clustered)
+
+    @property
     def outliers(self) -> list[str]:
         """Labels of all outliers: excluded before the fit, and flagged after it."""
         before = () if self.learned is None else self.learned.left_out
@@ -488,9 +493,8 @@ class Outcome:
 
         Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
         """
-        out = [flag for flag in self.flagged if flag.label not in self.clustered]
-        rest = self.stated.without({flag.label for flag in out})
-        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in out}
+        rest = self.stated.without({flag.label for flag in self.single})
+        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in self.single}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.calibrate_again(rest), record=record)
 

@@ -123,8 +123,8 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 def kept_rows(result: Outcome) -> np.ndarray:
     """Return which rows (N,) are not flagged after a robust fit; those that were excluded before are none any more."""
-    flagged = () if result.squared_loss else result.flagged
-    return ~np.isin(result.problem.labels, [flag.label for flag in flagged if flag.label not in result.clustered])
+    out = () if result.squared_loss else result.single
+    return ~np.isin(result.problem.labels, [flag.label for flag in out])
 
 
 def residual_rms(result: Outcome, kept: np.ndarray) -> dict[str, tuple[float, float]]:
@@ -175,10 +175,7 @@ def rms(errors: Array) -> float:
 
 
 def worse_than_nominal(nominal: Array, identified: Array) -> bool:
-    """Whether errors (N,) of the identified robot are significantly larger than those of the nominal one.
-
-    By the mean difference of the squares, row by row, over its standard error.
-    """
+    """Whether errors (N,) of the identified robot are significantly larger, by the mean difference of the squares."""
     both = np.isfinite(nominal) & np.isfinite(identified)
     difference = identified[both] ** 2 - nominal[both] ** 2
     rows = len(difference)
@@ -257,10 +254,7 @@ def _deviations(result: Outcome) -> Iterator[str]:
 
 
 def _worse(result: Outcome) -> Iterator[str]:
-    """Say that the robot misses rows by more than the nominal one, or that no row would tell.
-
-    By a far too large weight, or held-out rows; without these an interpolating fit may be anything.
-    """
+    """Say that the robot misses rows by more than the nominal one, or that none is left to tell."""
     nominal, identified = result.nominal_errors(), result.errors()
     if worse_than_nominal(nominal, identified):
         sentence = worse_sentence(nominal, identified, "the identification rows")
@@ -432,10 +426,7 @@ def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
 
 
 def bent_upwards(names: Sequence[str], x: Array, sd: Array, moves: Array) -> tuple[int, ...]:
-    """Return the joints that surely turn against gravity, of parameters x (n,) with standard deviations (n,).
-
-    Not those that move (n,) the points far less than another one.
-    """
+    """Return the joints that surely turn against gravity, from x (n,), standard deviations (n,) and movements (n,)."""
     joints = {i: int(name.removeprefix("compliance")) for i, name in enumerate(names) if name.startswith("compliance")}
     largest = max((moves[i] for i in joints), default=0.0)
     return tuple(k for i, k in joints.items() if x[i] < -UPWARD * sd[i] and moves[i] > NOTABLE * largest)
@@ -467,10 +458,7 @@ def _single_rows(result: Outcome, ordered: CalibrationProblem) -> list[str]:
 
 
 def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
-    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some.
-
-    ``ordered`` has the rows of the problem and those that are held out or excluded, as in the table.
-    """
+    """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(diagnosis.rows_without_values(problem))
     better = better_reading(ordered)
@@ -501,27 +489,19 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
     return problem.on(Dataset.together(list(there.values()), list(there)).take(order))
 
 
-def _single(result: Outcome) -> list[str]:
-    """Return the labels of the outliers that are in the fit, the worst first."""
-    return [flag.label for flag in result.flagged if flag.label not in result.clustered]
-
-
 def _without_outliers(result: Outcome, ordered: CalibrationProblem) -> tuple[CalibrationProblem, Array]:
-    """Return the problem's rows without outliers, and others with no larger errors: of these gross ones are unknown.
-
-    And the deviations (n,) [SI] that fit them: a squared loss is biased by outliers.
-    """
-    single = _single(result)
-    errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(set(result.problem.labels) - set(single)))
+    """Return the rows without outliers, others with no larger errors, and the deviations (n,) [SI] that fit them."""
+    kept = set(result.problem.labels) - {flag.label for flag in result.single}
+    errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(kept))
     largest = np.nan_to_num(errors[own]).max()
     alone = ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
-    return alone, ridge_deviations(alone) if single and result.squared_loss else result.x
+    return alone, ridge_deviations(alone) if result.single and result.squared_loss else result.x
 
 
 def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:
     """Say that outliers make a squared loss fit badly, if all is well without them, else what other residuals show."""
     alone, x = _without_outliers(result, ordered)
-    single = _single(result)
+    single = [flag.label for flag in result.single]
     ratio = max(noise_ratio(alone, alone.errors(x, each), each) for each in UNITS)
     if single and result.squared_loss and ratio <= NOISY:
         yield (
@@ -539,10 +519,7 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:
-    """Return the interpretation of new measurements that fits far better; None if they fit, or if there is none.
-
-    Asked where their errors are beyond `HOPELESS` times what the instrument is stated to have.
-    """
+    """Return the interpretation of new measurements that fits far better; None if they fit, or if there is none."""
     problem = result.problem.sample().on(data)
     return better_reading(problem) if noise_ratio(problem, result.errors(data)) > HOPELESS else None
 

@@ -186,8 +186,7 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
         if ratio[i] > UNUSUAL:
             cause = "an assembly or joint-zero error" if is_joint_offset(names[i]) else "check it in the data sheet"
             unusual.append(f"{names[i]} deviates by {ratio[i]:.0f} prior standard deviations of its group: {cause}.")
-    estimates = {**_scales(learned), **_noise(learned), **_conditions(learned, names, z)}
-    lines = [f"{what}: {joined(parts)}." for what, parts in estimates.items() if parts]
+    lines = [f"{what}: {joined(parts)}." for what, parts in _estimates(learned, names, z).items() if parts]
     lines += [*_model_lines(learned), *unusual]
     if learned.left_out:
         excluded = [str(row) for row in learned.left_out]
@@ -195,8 +194,8 @@ def learned_lines(learned: Learned, names: tuple[str, ...], z: Array) -> list[st
     return [*lines, *learned.notes]
 
 
-def _scales(learned: Learned) -> dict[str, list[str]]:
-    """Return the prior scales of the deviations, of model extensions and of transmission errors as texts."""
+def _estimates(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, list[str]]:
+    """Return the estimates as texts: prior scales, repeatability beside its largest part, noise, and conditions."""
     groups, deflections, curves = [], [], []
     for name, size in learned.sizes.items():
         if name in DEFLECTIONS:
@@ -206,15 +205,6 @@ def _scales(learned: Learned) -> dict[str, list[str]]:
     if learned.curves is not None:
         ripple = _figure(learned.curves.size, 1e3, "mrad")
         curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad")
-    return {
-        "Estimated prior scale": groups,
-        "Estimated scale of model extensions": deflections,
-        "Transmission error of joints (1 sigma)": curves,
-    }
-
-
-def _noise(learned: Learned) -> dict[str, list[str]]:
-    """Return the robot's repeatability, its parts beside the largest, and the factor on the instrument's noise."""
     robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
     largest = max((size.value for size in robot.values()), default=0.0)
     parts = []
@@ -223,12 +213,7 @@ def _noise(learned: Learned) -> dict[str, list[str]]:
             parts.append(f"{_figure_or_bound(size, 1e3, REPEATABILITY[kind][0])} {WHERE[kind]}")
     factor = learned.noise.get("instrument")
     instrument = [] if factor is None else [_figure_or_bound(factor, 1.0, "x the stated one")]
-    return {"Robot repeatability (1 sigma)": parts, "Measurement noise": instrument}
-
-
-def _conditions(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, list[str]]:
-    """Return session offsets, of a coordinate and an axis, and thermal expansion."""
-    sessions = []
+    sessions = []  # of a coordinate, and of an axis
     for dimension, group in SESSIONS.items():
         if group in learned.sizes:
             turn = dimension == "angle"
@@ -240,7 +225,15 @@ def _conditions(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str,
         per_kelvin = 1e6 * learned.stated * learned.sizes[EXPANSION].value * z
         of = [own_name(name) == EXPANSION for name in names]
         expansion = [f"{value:.3g} um per metre and kelvin" for value in per_kelvin[of]]
-    return {"Session offsets (1 sigma)": sessions, "Thermal expansion": expansion}
+    return {
+        "Estimated prior scale": groups,
+        "Estimated scale of model extensions": deflections,
+        "Transmission error of joints (1 sigma)": curves,
+        "Robot repeatability (1 sigma)": parts,
+        "Measurement noise": instrument,
+        "Session offsets (1 sigma)": sessions,
+        "Thermal expansion": expansion,
+    }
 
 
 def _model_lines(learned: Learned) -> list[str]:
@@ -325,10 +318,7 @@ def camera_remarks(result: Outcome) -> list[str]:
 
 
 def touch_errors(data: Dataset, nominal: Array, error: Array) -> tuple[dict[str, Any], ...]:
-    """Return the distances [mm] of touches from their point or plane, the worst first, from errors (N,) [m].
-
-    By its name: how many, their RMS before and after calibration, and the largest.
-    """
+    """Return by point or plane, the worst first: touches, their RMS errors [mm] before and after, and the largest."""
     errors = []
     for name, rows in _touched(data).items():
         before, after = 1e3 * nominal[rows], 1e3 * error[rows]

@@ -17,7 +17,7 @@ def test_one_linear_step_is_that_of_the_normal_equations() -> None:
     m = PROBLEM.linearize(0 * SCALE)
     found = baselines.linear_least_squares(PROBLEM)
     assert found.x == pytest.approx(SCALE * np.linalg.solve(m.A.T @ m.A, m.A.T @ m.b), rel=1e-6)
-    assert (found.iterations, found.method) == (1, "linear least squares")
+    assert found.iterations == 1
     assert baselines.gauss_newton(PROBLEM, iterations=1).x == pytest.approx(found.x, rel=1e-6)
 
 
