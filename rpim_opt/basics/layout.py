@@ -263,9 +263,11 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
         raise InputError(f"line {grid.lines[full[0]]}", found, accepted)
     lines = [_uncommented(grid.rows[i], width) for i in above]
     width = max(map(len, lines))
-    units = _units_alone(lines[-1]) if len(lines) > 1 else []
-    if units:
-        lines.pop()
+    units: list[str] = []
+    signs = {cell.strip("[]()").lower() for cell in lines[-1]} - {""}
+    if len(lines) > 1 and signs and signs <= UNIT_SIGNS:  # a line of nothing but units
+        units = [cell.strip("[]()") for cell in lines.pop()]
+        units = ["" if unit in ("-", "1") else unit for unit in units]
     lacking = [""] * (width - len(units))
     units = lacking + units if grid.blanks else units + lacking  # a blank cell of the label cannot be seen
     *grouping, names = [[*line, *[""] * (width - len(line))] for line in lines]
@@ -277,13 +279,6 @@ def _heads(grid: Grid, full: Sequence[int], options: TableOptions) -> tuple[list
     groups = [_merged(row, downwards) for row in grouping]
     heads = zip(names, units, *groups, strict=True)
     return [(_with_unit(name, unit), " ".join(filter(None, above_it))) for name, unit, *above_it in heads], above
-
-
-def _units_alone(line: Sequence[str]) -> list[str]:
-    """Return the units in a line of the header that has nothing else; of other lines nothing."""
-    bare = [cell.strip("[]()") for cell in line]
-    signs = {cell.lower() for cell in bare} - {""}
-    return ["" if cell in ("-", "1") else cell for cell in bare] if signs and signs <= UNIT_SIGNS else []
 
 
 def _merged(row: Sequence[str], downwards: Sequence[bool]) -> list[str]:
@@ -365,14 +360,14 @@ def _columns(rows: Sequence[list[str]], heads: Sequence[tuple[str, str]], option
 
 def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
     """Give every row as many cells as the header; blank ones at the end may be missing or too many."""
+    what = "the header"
+    if options.columns:
+        what = "--columns, which holds for every file (of several, write a header into those without one)"
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()
         lacks_remark = len(row) == width - 1 and width > 2 and not options.separator
         if len(row) != width and not lacks_remark:
-            what = "the header"
-            if options.columns:
-                what = "--columns, which holds for every file (of several, write a header into those without one)"
             hint = "" if len(row) < width else "; decimal commas between commas need quotes"
             raise InputError(f"row {number} ({row[0]})", f"{len(row)} cells", f"{width} cells as in {what}{hint}")
         row += [""] * (width - len(row))

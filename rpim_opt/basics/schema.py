@@ -17,14 +17,8 @@ Name = Annotated[str, Field(max_length=200)]
 Model = TypeVar("Model", bound=BaseModel)
 
 
-class Misfit(ValueError):
-    """An invalid key of a table; pydantic adds its location."""
-
-    def __init__(self, key: str, found: str, accepted: str):
-        super().__init__(found)
-        self.key = key
-        self.found = found
-        self.accepted = accepted
+class Misfit(InputError, ValueError):
+    """An invalid key of a table: a ValueError, to which pydantic adds its location."""
 
 
 class Table(BaseModel):
@@ -73,7 +67,7 @@ def validate(model: type[Model], content: dict[str, Any], file: object, table: s
             elif not part.startswith("list["):  # which of several types, and no key
                 where += f".{part}" if where else part
         if isinstance(misfit, Misfit):
-            where = ".".join(part for part in (where, misfit.key) if part) or "the top level"
+            where = ".".join(filter(None, (where, misfit.where))) or "the top level"
             raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
         if first["type"] == "missing":
             raise InputError(f"key {where}", "nothing", "this key is required", file) from None

@@ -24,7 +24,7 @@ from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.names import recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.multi_robot import NAME
-from rpim_opt.problem.problem import identifiable
+from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
 from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, placed, same_place
@@ -33,7 +33,7 @@ from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_source, read_arm
 from rpim_opt.robot.mdh import MDH, MOUNTINGS
-from rpim_opt.robot.parameters import frame_of
+from rpim_opt.robot.parameters import frame_of, model_parameters
 from rpim_opt.store.raw import CLEARLY, Understanding, in_time_order, rows_of, understand_of, usual_noise
 
 TABLES = ("identification.csv", "validation.csv", "target.csv")  # of a new folder
@@ -304,20 +304,15 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
     for name, kind in CAMERAS.items():
         data = read_data(columns, arm.robot, {"pixel_px": 1.0}, kind)
         poses = posed(data, starting_cameras(data, {}))
-        tools = {block.markers[0]: np.zeros(6) for block in poses.blocks}
-        base, places, _ = locate(arm.robot, poses, tools)
-        squares = []
-        for block in poses.blocks:
-            tool = numeric_frame(places[block.markers[0]])
-            T = numeric_frame(base) @ forward_kinematics(arm.robot, block.q[:, 0]) @ tool
-            squares += np.sum((T[:, :3, 3] - block.y[:, :3]) ** 2, axis=1).tolist()
-        misfit[name] = float(np.sqrt(np.mean(squares)))
+        base, tools, _ = locate(arm.robot, poses, {block.markers[0]: np.zeros(6) for block in poses.blocks})
+        placed_so = model_parameters(arm.robot, base, tools).identify(["base_*"])
+        errors = CalibrationProblem(arm.robot, placed_so, poses).errors(np.zeros(len(placed_so.free)))
+        misfit[name] = float(np.sqrt(np.mean(errors**2)))
     best, other = sorted(misfit, key=lambda name: misfit[name])
     figures = f"{1e3 * misfit[best]:.3g} mm RMS, {other} {1e3 * misfit[other]:.3g} mm"
     if not misfit[other] > CLEARLY * misfit[best]:
-        raise InputError(
-            "the camera", f"no clear mounting ({best} leaves {figures})", f"--measurement {best} or {other}"
-        )
+        found = f"no clear mounting ({best} leaves {figures})"
+        raise InputError("the camera", found, f"--measurement {best} or {other}")
     return CAMERAS[best], f"guessed: single views of the board, robot nominal and lens not fitted, leave {figures}"
 
 

@@ -55,7 +55,7 @@ DERIVED = ("active_bounds", "shadow_prices", "record", "causes")
 RELATIVE = 1e-4  # standard deviations of hardly identifiable directions differ by that much between processors
 ABSOLUTE = 1e-6  # Largest difference of a small figure [mm, deg] and the one that follows from the data.
 NOT_FINITE = ("inf", "-inf", "nan")  # how a file spells the numbers that JSON does not have
-KINDS = {bool: "boolean", int: "integer", str: "string"}
+KINDS = {bool: "boolean", int: "integer", float: "number", str: "string"}
 FUNCTIONS: dict[str, Callable[..., Any]] = {
     "sum_squares": SQUARES, "sum": SUM, "max": LARGEST, "norm1": NORM1, "norm2": NORM2, "huber": huber,
     "prior_penalty": prior_penalty,
@@ -462,7 +462,6 @@ def _converter() -> Any:
         Record: {"validation": omitted, "digest": omitted},  # among the data; of the file itself
         Robot: {"model": omitted},  # functions of a script, who gives them again
         Block: {"measurement": by_name},
-        Dataset: {"configuration": override(unstruct_hook=_listed, struct_hook=lambda v, _: _array(v, np.ndarray))},
     }
     for kind, changes in fields.items():
         made.register_unstructure_hook(kind, make_dict_unstructure_fn(kind, made, **changes))
@@ -471,19 +470,11 @@ def _converter() -> Any:
 
 
 def _scalar(value: Any, kind: type) -> Any:
-    if kind is float:
-        return _number(value)
-    if type(value) is not kind:
+    if kind is float and (value in NOT_FINITE or (type(value) in (int, float) and abs(value) <= sys.float_info.max)):
+        return float(value)
+    if kind is float or type(value) is not kind:
         raise _unfit(value, f"a valid {KINDS[kind]}")
     return value
-
-
-def _number(value: Any) -> float:
-    if value in NOT_FINITE:
-        return float(value)
-    if not isinstance(value, int | float) or isinstance(value, bool) or not abs(value) <= sys.float_info.max:
-        raise _unfit(value, "a valid number")
-    return float(value)
 
 
 def _spelled(value: float) -> float | str:
@@ -512,7 +503,8 @@ def _array(values: Any, kind: Any) -> np.ndarray:
         if array.dtype.kind in "if" and np.isfinite(array).all():
             return array.astype(float)
         spelled = np.array(values, dtype=object)
-        return np.array([_number(value) for value in spelled.ravel().tolist()], dtype=float).reshape(spelled.shape)
+        numbers = [_scalar(value, float) for value in spelled.ravel().tolist()]
+        return np.array(numbers, dtype=float).reshape(spelled.shape)
     if not array.size:
         return array.astype(int)
     if array.dtype.kind not in "biU":

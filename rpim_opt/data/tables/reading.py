@@ -111,10 +111,7 @@ def _configurations(table: Columns, joints: Array) -> np.ndarray:
     """Return the configuration (N,) of every row: as stated, or rows of equal joint values (N, d) are one."""
     if "configuration" in table:
         return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
-    order = np.lexsort(joints.T[::-1])  # np.unique of whole rows takes ten times as long
-    configuration = np.empty(len(joints), dtype=int)
-    configuration[order] = np.cumsum(np.any(np.diff(joints[order], axis=0, prepend=joints[order[:1]]) != 0, axis=1))
-    return configuration
+    return np.unique(joints, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _by_markers(whole: Block, table: Columns, kind: Measurement, label: Sequence[str]) -> tuple[Block, ...]:
