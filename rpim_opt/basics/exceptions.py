@@ -80,22 +80,17 @@ class NotDelivered(InputError):
 
 
 class RowError(InputError):
-    """Invalid value in a row of a table (counted from 0); the table's reader adds the label of the row."""
+    """Invalid value in a row of a table (counted from 0)."""
 
     def __init__(self, row: int, found: str, accepted: str):
         super().__init__(f"row {row + 1}", found, accepted)
         self.row = row
 
-    def named(self, where: str) -> InputError:
-        """Return the error with the label of the row."""
-        return InputError(where, self.found, self.accepted)
-
 
 class Conflict(NamedTuple):
-    """By how much bounds of parameters [SI] would have to give way, with the least sum; empty where that would not do.
+    """A contradiction: by how much bounds of parameters and ``stated`` constraints would have to give way [SI].
 
-    ``constraints`` are those that cannot hold together, of which any one less would do; ``stated`` says by how much
-    [SI] statements in words would have to give way.
+    ``constraints`` are those that cannot hold together, of which any one less would do.
     """
 
     parameters: dict[str, float]

@@ -70,11 +70,7 @@ def read_text(path: Path, largest: int = LARGEST_TEXT, endings: Sequence[str] = 
 
 
 def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
-    """Return the path of a file in a folder; refuse names that lead out of it.
-
-    A folder may come from somebody else: what it names elsewhere is neither read nor written, be it by an absolute
-    path, by ``..`` or by a link. Errors have ``where`` and ``file`` as the place of the name.
-    """
+    """Return the path of a file in a folder; refuse a name in ``file`` that leads out of it, by a link for instance."""
     path = folder / name
     accepted = "the name of a file in the folder"
     try:
@@ -110,11 +106,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return the content of a JSON text.
-
-    A ValueError is what is no JSON, is nested too deeply, states a key twice, or has half a surrogate pair, which no
-    file of UTF-8 can hold.
-    """
+    """Return the content of a JSON text; ValueError if it is none, too deep, or has a key twice or half a character."""
     try:
         content = json.loads(text, object_pairs_hook=_unique)
         if _HALF_PAIR.search(text):
@@ -159,11 +151,10 @@ def write_bytes(path: Path, data: bytes) -> None:
 
 
 def write_files(contents: Mapping[Path, bytes]) -> None:
-    """Write several files: all of them, or none.
+    """Write several files, once the bytes of all are on the disk: all of them, or none.
 
     A file keeps its mode, a new one has that of the umask; a link stays one, and what it leads to is written. A device
-    or pipe gets the bytes as they are. Nothing is put in its place before the bytes of all are on the disk; when one
-    cannot be, those before it, and folders that were made, are taken back.
+    or pipe gets the bytes as they are.
     """
     streams = [path for path in contents if path.exists() and not (path.is_file() or path.is_dir())]
     with undoing() as folders, ExitStack() as stack, undoing() as renames:

@@ -141,11 +141,7 @@ class RawTable:
 
 
 def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
-    """Return the table of a raw file (text of any layout, Excel, Parquet), or of columns of texts.
-
-    A column whose cells list several numbers, ``[1.5, 2, 3]``, becomes a column each; rows that hold one coordinate
-    each, ``P1, X, 1.5``, become one.
-    """
+    """Return the table of a raw file, or of columns of texts, with a number a cell and a row a point."""
     options = options or TableOptions()
     readers = {".parquet": read_columns, ".mat": array_columns, ".npz": array_columns}
     reader = readers.get(path.suffix.lower())
@@ -194,10 +190,7 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
 
 
 def _summaries(columns: Columns) -> int:
-    """Return how many rows at the end are means, extremes or spreads of all rows above, whatever they are called.
-
-    One of them has to be a mean or a spread: the end of a path may be where its joints are largest, more than once.
-    """
+    """Return how many rows at the end are means, spreads or extremes of all above; extremes alone may end a path."""
     table = np.array([[numeral(cell) for cell in cells] for cells in columns.values() if _is_numeric(cells)]).T
     for count in range(min(MOST_SUMMARIES, len(table) - FEWEST_ROWS), 0, -1):
         above, below = table[:-count], table[-count:]
@@ -379,11 +372,7 @@ def _is_numeric(cells: Sequence[str]) -> bool:
 
 
 def _decimal_mark(columns: Mapping[str, Sequence[str]], options: TableOptions) -> tuple[str, tuple[str, ...]]:
-    """Return the decimal mark of a table's numbers, a comma or a point, and notes on it.
-
-    Where both stand in a number, the last one is it. Where commas alone do, one that cannot part thousands decides. A
-    stated mark decides what the numbers leave open.
-    """
+    """Return the decimal mark of a table's numbers, and notes; a stated one decides what the numbers leave open."""
     stated = {"comma": ",", "point": "."}.get(options.decimal, options.decimal)
     if stated not in ("", ",", "."):
         raise InputError("--decimal", f"'{stated}'", "comma or point")

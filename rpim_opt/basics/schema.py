@@ -22,10 +22,7 @@ class Misfit(InputError, ValueError):
 
 
 class Table(BaseModel):
-    """A TOML table in which quantities carry their unit: ``a_mm = 1.0`` sets ``a`` to 0.001.
-
-    A field annotated ``Length``, ``Angle`` or ``Mass`` (or listing several) is given under its name plus a unit.
-    """
+    """A TOML table: a field annotated ``Length``, ``Angle`` or ``Mass`` is given with its unit, ``a_mm = 1.0``."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 

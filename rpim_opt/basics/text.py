@@ -35,10 +35,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def visible(text: str) -> str:
-    r"""Return a text that is safe for a terminal: non-printable characters are escaped, as in ``\x1b``.
-
-    Titles, sources, labels and file names may come from somebody else, and a terminal obeys what they say.
-    """
+    r"""Return a text of somebody else that a terminal may print: non-printable characters are escaped (``\x1b``)."""
     return "".join(
         c if c.isprintable() or c == "\n" or category(c) == "Zs" else c.encode("unicode_escape").decode("ascii")
         for c in text
@@ -156,11 +153,7 @@ Progress = Callable[[int, int], None]  # receives how many of how many are done
 
 @contextmanager
 def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress]:
-    """Provide a function that shows the progress, called with the number done and the total.
-
-    That is a bar on stderr, where it is wanted and that is a terminal or a notebook with widgets; or a function of
-    one's own.
-    """
+    """Provide a function of the number done and the total: one's own, or a bar on a terminal or in a notebook."""
     if callable(wanted):
         yield wanted
         return

@@ -139,10 +139,7 @@ class Dataset(Tabled):
         return np.concatenate([np.zeros(0), *columns])
 
     def by_session(self) -> list[np.ndarray]:
-        """Return the numbers (k,) of the configurations of every session, for cross-validation by sessions (`k_fold`).
-
-        Rows that name no session are one more. Sessions that share a configuration stand together.
-        """
+        """Return the configurations (k,) of every session, of those that share one together, and of unnamed rows."""
         parts: list[np.ndarray] = []
         for name in ("", *self.sessions):
             mine = [self.configuration[block.row[block.session_names == name]] for block in self.blocks]
@@ -286,7 +283,7 @@ class Dataset(Tabled):
             try:
                 y = from_matrices(np.hstack([y[:, :3, 3], y[:, :3, :3].reshape(len(y), 9)]))
             except RowError as error:
-                raise error.named(f"y, {error.where}") from None
+                raise InputError(f"y, {error.where}", error.found, error.accepted) from None
         if q.ndim != 3 or q.shape[:2] != (len(y), points) or y.shape[1:] != (c,):
             of_q = "(N, dof)" if points == 1 else f"(N, {points}, dof)"
             joints = q[:, 0] if q.ndim == 3 and q.shape[1] == 1 else q
@@ -308,11 +305,7 @@ class Dataset(Tabled):
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
-        """Return several datasets of a robot as one.
-
-        Rows of different parts belong to the same configuration when their joint values are equal. The ``names`` of the
-        parts precede labels, ``name:label``, where labels occur twice.
-        """
+        """Return several datasets of a robot as one (`concatenated`); equal joint values are one configuration."""
         whole = cls.concatenated(parts, names)
         stop = np.unique(whole.q, axis=0, return_inverse=True)[1].reshape(-1)
         first = np.full(len(whole), len(whole))

@@ -33,8 +33,8 @@ from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import plot, summary
 from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
+from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import definition
-from rpim_opt.store.statements import FIELDS
 from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first

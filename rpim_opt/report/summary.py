@@ -17,8 +17,8 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.contact import known_distance, known_parallel, known_square
 from rpim_opt.problem.linear import RANK_TOLERANCE
+from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import figures
-from rpim_opt.store.statements import FIELDS
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")

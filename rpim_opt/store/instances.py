@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from inspect import signature
+from itertools import product
 from pathlib import Path
 from typing import Any, Concatenate, ParamSpec
 
@@ -37,7 +38,6 @@ from rpim_opt.robot.chain import OF_JOINTS
 from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.terms import Model as KinematicModel
 from rpim_opt.store import problem_file
-from rpim_opt.store.statements import place_fixtures, stated_details, stated_prior, stated_requirement
 
 _Options = ParamSpec("_Options")
 ROLES = ("identification", "validation")
@@ -122,17 +122,17 @@ def load(
     with in_file(path):
         rows = data["identification"]
         temperature = None if table.celsius is None else table.celsius + UNITS["degC"].zero
-        fixtures = place_fixtures(definition.placed, rows)
+        fixtures = problem_file.place_fixtures(definition.placed, rows)
         parameters = starting_parameters(definition.robot, rows, definition.base, tools, fixtures, temperature)
         problem = CalibrationProblem(definition.robot, definition.chosen(parameters, rows), rows)
         problem = problem.with_repeatability(problem_file.stated_repeatability(table, path))
         if validation is not None:
             problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
         formulation = _formulation(definition, problem)
-        prior = stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
-        details = stated_details(table.record)
+        prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
+        details = problem_file.stated_details(table.record)
         TableOptions.stated(table.reading)
-        requirement = stated_requirement(table.acceptance, problem.robot, path)
+        requirement = problem_file.stated_requirement(table.acceptance, problem.robot, path)
     for file in table.published:
         if not inside(path.parent, file, "table published", path).is_file():
             raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
@@ -247,39 +247,33 @@ def _formulation(stated: problem_file.ProblemFile, problem: CalibrationProblem) 
 
 def _read_tables(stated: problem_file.ProblemFile) -> tuple[dict[str, Dataset], dict[str, list[str]]]:
     """Return the measurements and the names of their files by role."""
-    exclude = stated.table.exclude
     files: dict[str, list[str]] = {role: [] for role in ROLES}
     parts: dict[str, list[Dataset]] = {role: [] for role in ROLES}
-    for each in stated.observations:
-        for role in ROLES:
-            file = getattr(each, role)
-            if file:
-                files[role].append(file)
-                parts[role].append(_read(stated, each, stated.path.parent / file))
-    data = {
-        role: Dataset.together(parts[role], [Path(file).stem for file in files[role]]) for role in ROLES if files[role]
-    }
-    labels = {label for each in data.values() for label in each.label}
-    for label in exclude:
-        if label not in labels:
+    for each, role in product(stated.observations, ROLES):
+        file = getattr(each, role)
+        if not file:
+            continue
+        kind = stated.kinds[each.measurement]
+        source: Any = stated.path.parent / file
+        if stated.board is not None and kind.by_camera:
+            with in_file(source):
+                source = on_board(read_columns(source), stated.board)
+        with in_file(stated.path):
+            data = read_data(source, stated.robot, each.noise or stated.table.noise, kind)
+        files[role].append(file)
+        parts[role].append(data)
+    stems = {role: [Path(file).stem for file in names] for role, names in files.items() if names}
+    whole = {role: Dataset.together(parts[role], names) for role, names in stems.items()}
+    for label in stated.table.exclude:
+        if not any(label in each.label for each in whole.values()):
             raise InputError("key exclude", f"label '{label}'", "a label of the data", stated.path)
-    for role in data:
-        rest = data[role].without(exclude)
+    for role, each in whole.items():
+        rest = each.without(stated.table.exclude)
         if not len(rest):
             file = stated.path.parent / files[role][0]
             raise InputError("the table", "no remaining row (all are excluded)", "at least one", file)
-        data[role] = _with_known(rest, stated.table, role, stated.path)
-    return data, files
-
-
-def _read(stated: problem_file.ProblemFile, each: problem_file.Observation, path: Path) -> Dataset:
-    kind = stated.kinds[each.measurement]
-    source: Any = path
-    if stated.board is not None and kind.by_camera:
-        with in_file(path):
-            source = on_board(read_columns(path), stated.board)
-    with in_file(stated.path):
-        return read_data(source, stated.robot, each.noise or stated.table.noise, kind)
+        whole[role] = _with_known(rest, stated.table, role, stated.path)
+    return whole, files
 
 
 def _with_known(data: Dataset, table: problem_file.ProblemTable, role: str, path: Path) -> Dataset:

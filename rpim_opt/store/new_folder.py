@@ -50,10 +50,7 @@ UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above whi
 
 
 class Started(NamedTuple):
-    """A new folder: its files with their rows, notes on what was guessed, and what was understood of the tables.
-
-    ``written`` is False after a dry run.
-    """
+    """A new folder: rows by file, notes on guesses, what was understood of tables; not ``written`` by a dry run."""
 
     folder: Path
     rows: Mapping[str, int]
@@ -362,10 +359,7 @@ def _problem_text(arm: Described, kind: Measurement, rows: Dataset, chain: str, 
 
 
 def _at_links(names: Sequence[str], carried: Sequence[Carried], at_base: bool) -> list[str]:
-    """Return parameters of a chain with those of fixed joints at its ends, which a URDF holds, for base and tool.
-
-    A base that is the chain's first link is no parameter where no fixed joint holds it: the next origin is the same.
-    """
+    """Return parameters of a chain, with those of fixed joints at its ends, if any, in place of base and tool."""
     mounts = {
         origin.up: origin.prefix for part in carried for origin in part.origins if origin.prefix.startswith(MOUNT)
     }

@@ -38,10 +38,7 @@ def is_own(name: object) -> TypeGuard[str]:
 
 
 def own_object(name: str, kind: type[T], where: str, file: Path) -> T:
-    """Return an object of a Python file beside ``file``, which names it as the value of ``where``.
-
-    InputError where code is not allowed, the Python file is missing or cannot be run, or the object is of another kind.
-    """
+    """Return an object of a Python file beside ``file``, which names it at ``where``, if code is allowed."""
     module, _, attribute = name.partition(":")
     source = inside(file.parent, f"{module}.py", where, file)
     if not _ALLOWED.get():

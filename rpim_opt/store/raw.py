@@ -120,11 +120,7 @@ def understand_of(
     options: TableOptions | None = None,
     targets: bool = False,
 ) -> Understanding:
-    """Interpret raw tables (files or data frames) of measurements, or of targets.
-
-    Several files are stacked where each is whole, and joined by a key where some have the joint values and others the
-    measured ones. Whether a quaternion's numbered components begin with w is checked against the nominal robot.
-    """
+    """Interpret raw tables (files or data frames) of measurements, or of targets, as one table."""
     options = options or TableOptions()
     once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}  # once a sheet is once
     files = [(path, _upright(raw, arm)) for source in once.values() for path, raw in _sheets(source, options)]
@@ -219,10 +215,7 @@ def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: s
 
 
 def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:
-    """Return poses read as they fit the nominal robot, and say both figures: the order of a quaternion is found.
-
-    Turns that fit clearly better in another convention than roll, pitch, yaw are asked for.
-    """
+    """Return poses with the order of a quaternion that fits the nominal robot; refuse turns that are not as usual."""
     alternatives: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
     noise = {"position_mm": 1.0, "orientation_mrad": 1.0}

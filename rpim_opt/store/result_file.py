@@ -285,12 +285,9 @@ def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
 
 def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
     """Return what a file says of a user's own terms on a robot: all but their functions."""
-    terms = []
-    for term in model.terms:
-        if not term.ready:
-            names = [name for i in term.places(robot.joint_types) for name in term.names(i)]
-            terms.append(OwnTerm(term.at, names, dict(term.columns)))
-    return terms
+    own = [term for term in model.terms if not term.ready]
+    names = [[name for i in term.places(robot.joint_types) for name in term.names(i)] for term in own]
+    return [OwnTerm(term.at, named, dict(term.columns)) for term, named in zip(own, names, strict=True)]
 
 
 def _inliers(result: Calibration) -> StoredInliers | None:

@@ -25,8 +25,7 @@ from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import Target, configurations_at, visible_configurations
 from rpim_opt.robot.parameters import Parameters, model_parameters
-from rpim_opt.store.problem_file import Observation, ProblemFile, read_problem
-from rpim_opt.store.statements import place_fixtures
+from rpim_opt.store.problem_file import Observation, ProblemFile, place_fixtures, read_problem
 
 Columns = dict[str, list[str]]
 MOST = 1_000_000  # configurations of a table
@@ -146,10 +145,7 @@ def _parameters(stated: ProblemFile) -> tuple[list[tuple[str, ...]], Parameters]
 
 
 def write_simulation(name: str | Path, seed: int | None = None, out: Path | None = None) -> list[Path]:
-    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files.
-
-    All of them lie in it: names that lead elsewhere are refused.
-    """
+    """Write the tables of `simulate` and ``truth.toml`` into the folder, or into another; return the files."""
     made = simulate(name, seed)
     folder = out or read_problem(name).path.parent
     texts = {file: csv_text(table, zip(*table.values(), strict=True)) for file, table in made.tables.items()}

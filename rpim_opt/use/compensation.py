@@ -344,7 +344,7 @@ def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
         try:
             poses = pose.prepare(poses)[:, : 7 if orientation else 3]
         except RowError as error:
-            raise error.named(f"poses, {error.where}") from None
+            raise InputError(f"poses, {error.where}", error.found, error.accepted) from None
     if len(stated.label) not in (0, N):
         raise InputError("label", f"{len(stated.label)} labels", f"{N}, one per row")
     return Targets(stated.label or tuple(str(i) for i in range(1, N + 1)), q, poses, torque)

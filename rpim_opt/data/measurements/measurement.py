@@ -24,10 +24,7 @@ XYZ = {"x": "length", "y": "length", "z": "length"}  # a position's coordinates
 
 
 class Words(NamedTuple):
-    """Wording of a measurement type: its target, its reference frame, typical noise and a typical mistake.
-
-    ``columns`` says what its columns are: ``{"u": "measured pixel, to the right"}``.
-    """
+    """Wording of a measurement type: target, reference frame, typical noise and mistake, meaning of columns."""
 
     thing: str = "a reflector"
     thing_at: str = "The reflector"

@@ -62,11 +62,7 @@ class Match(NamedTuple):
 def together(
     tables: Sequence[Understood], robot: Robot, kind: Measurement, key: str = "", within: float | None = None
 ) -> Understood:
-    """Return several tables as one, with notes on how; ``key`` and ``within`` are those of `TableOptions`.
-
-    Tables that have joint and measured values each are stacked. Where some have the one and some the other, rows of
-    equal keys (the label by default, else the only name that both have), or of the nearest times, are one row.
-    """
+    """Return tables stacked where each is whole, else joined; ``key`` and ``within`` as in `TableOptions`."""
     stems = row_stems(robot, kind)
     moving = [table for table in tables if table.stems & stems["joint"]]
     seen = [table for table in tables if table.stems & stems["measured"]]
@@ -331,11 +327,7 @@ def time_column(names: Iterable[str]) -> str | None:
 
 
 def seconds(name: str, cells: Sequence[Any]) -> Array:
-    """Return times (N,) [s] of a column's numbers, in the unit of its name, or of its dates (ISO 8601, DIN 1355).
-
-    Numbers without a unit are seconds, or, where that would be after the year 5000, what since 1970 is in our time.
-    Dates without a zone are UTC.
-    """
+    """Return times (N,) [s] from numbers, in the unit of the column's name, or dates (ISO 8601, DIN 1355, UTC)."""
     texts = [str(cell).strip() for cell in cells]
     times = np.array([numeral(text) for text in texts])
     dates = bool(np.isnan(times[:1]).any())

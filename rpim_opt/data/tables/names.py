@@ -199,10 +199,7 @@ def _entries(read: Readings) -> dict[str, tuple[int, int]]:
 
 
 def quaternion_columns(read: Readings, dof: int) -> list[str]:
-    """Return the four numbered columns of a quaternion, in order; empty if there is none.
-
-    ``q0 ... q3`` are one where other columns are the joints.
-    """
+    """Return the four numbered columns of a quaternion, in order; ``q0 ... q3`` where other columns are the joints."""
     components: dict[str, dict[int, str]] = {}
     for name in read:
         match = QUATERNION.fullmatch(name.strip().lower())

@@ -72,7 +72,7 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     try:
         y = kind.prepare(convert(_beside_each_other(columns, stems, N)))
     except RowError as error:
-        raise error.named(f"row {label[error.row]}") from None
+        raise InputError(f"row {label[error.row]}", error.found, error.accepted) from None
     q, torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("q", "tau", "approach"))
     stated = {"torque": torque, "payload": columns.get(("payload", "")), "approach": approach}
     _require_states(stated["payload"], approach, label)
@@ -137,16 +137,12 @@ def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:
 
 
 def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: int) -> Any:
-    """Return joint values, torques or directions (N, p, dof), or None; a second point without its own has the first's.
-
-    Of one point they are no copy.
-    """
+    """Return joint values, torques or directions (N, p, dof), or None; a second point may have the first's."""
     if (f"{stem}1", "") not in columns:
         return None
     own = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
     points = [own, [f"to_{name}" for name in own] if (f"to_{stem}1", "") in columns else own][: kind.points]
-    values = [_beside_each_other(columns, names, N) for names in points]
-    return values[0][:, None] if len(values) == 1 else np.stack(values, axis=1)  # of one point without a copy
+    return np.stack([_beside_each_other(columns, names, N) for names in points], axis=1)
 
 
 def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
@@ -167,8 +163,7 @@ def text_columns(kind: Measurement) -> list[str]:
 def number_columns(robot: Robot, kind: Measurement) -> dict[str, list[str]]:
     """Return the columns of numbers that a table may have, name without unit to its dimensions; "" is a plain one."""
     joints = {f"q{i}": dimension for i, dimension in enumerate(robot.joint_dimensions, start=1)}
-    joints |= {f"tau{i}": "torque" for i in range(1, robot.dof + 1)}
-    joints |= {f"approach{i}": "" for i in range(1, robot.dof + 1)}
+    joints |= {f"{stem}{i}": of for stem, of in (("tau", "torque"), ("approach", "")) for i in range(1, robot.dof + 1)}
     plain = {**further_columns(robot, kind), **joints, **kind.columns, "payload": "mass"}
     for form, _ in kind.forms:
         plain |= form

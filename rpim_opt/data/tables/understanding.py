@@ -101,11 +101,9 @@ def understand(
     joints: Sequence[str] = (),
     targets: bool = False,
 ) -> Understood:
-    """Interpret a raw table for a robot and a measurement type, with the names that `read_data` takes.
+    """Interpret a raw table with the names that `read_data` takes, leaving out other columns and rows without values.
 
-    Names that it takes already stay; others are recognized where they can mean one thing only (`names`). What is not
-    recognized is left out, and so are rows without any measured or any joint value. ``joints`` are the names that the
-    robot's file has. Of ``targets`` what was commanded counts, and rows may lack either values.
+    ``joints`` are the names of the robot's file. Of ``targets`` what was commanded counts; rows may lack either values.
     """
     options = options or TableOptions()
     units = options.units
@@ -279,10 +277,7 @@ def _count_from_one(read: Readings, dof: int) -> None:
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
-    """Return the meanings of names without a common prefix, where no name is known with it.
-
-    Coordinates that are known with theirs, ``POS_ACT.X``, may be the controller's: beside others they are asked for.
-    """
+    """Return the meanings of names without a common prefix; a controller's coordinates beside others are asked for."""
     known = [name for name, each in read.items() if each.stem in wanted]
     direct = dict.fromkeys(known, Reading("", "", "another column is the instrument's"))
     bare = any(len(split(name)[0]) == 1 or INSTRUMENT.search(name) for name in known)
@@ -323,11 +318,7 @@ def _prefixed(read: Readings, joints: Sequence[str]) -> dict[str, Readings]:
 
 
 def _counted(read: Readings, robot: Robot) -> None:
-    """Name unknown columns of any one word that are counted.
-
-    With joint units they are the joints, if none are known otherwise; three of them, ``p_1, p_2, p_3``, are x, y, z, if
-    nothing else is measured.
-    """
+    """Name counted columns of an unknown word: in joint units the joints, three others (``p_1, p_2, p_3``) x, y, z."""
     words: dict[str, dict[int, str]] = {}
     for name, each in read.items():
         match = re.fullmatch(r"(\D*?)_?(0|[1-9]\d?)", each.stem)
@@ -386,10 +377,7 @@ def _under_our_names(
     known: Mapping[str, Sequence[str]],
     units: Mapping[str, tuple[str, str]],
 ) -> tuple[dict[str, Sequence[Any]], list[Meant]]:
-    """Return the columns with canonical names and units, and the meaning of every column.
-
-    ``units`` are those of columns whose name has none, by stem or dimension, and where they are stated.
-    """
+    """Return columns under canonical names and their meanings; ``units`` by stem or dimension, and who says so."""
     columns: dict[str, Sequence[Any]] = {}
     meant: list[Meant] = []
     stems: dict[str, Sequence[str]] = {**dict.fromkeys(text_columns(kind), ()), **known}
