@@ -27,7 +27,7 @@ from types import ModuleType
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError, choices
-from rpim_opt.basics.files import LARGEST_DATA, json_text, parse_json, read_json, refused, require_file, write_files
+from rpim_opt.basics.files import LARGEST_DATA, json_text, read_json, refused, require_file, sha256_of, write_files
 from rpim_opt.basics.tables import library
 from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
@@ -78,7 +78,7 @@ SHORT = 12  # digits of a digest that a reader compares by eye
 SCHEMA = """
 BEGIN IMMEDIATE;
 CREATE TABLE IF NOT EXISTS code (part TEXT PRIMARY KEY, digest TEXT);
-CREATE TABLE IF NOT EXISTS replicates (key TEXT PRIMARY KEY, found TEXT, digest TEXT);
+CREATE TABLE IF NOT EXISTS replicates (key TEXT PRIMARY KEY, found TEXT);
 COMMIT;
 """
 
@@ -186,16 +186,11 @@ def _matching(folder: Path, pattern: str) -> set[Path]:
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:
     """Return a sentence on the command, commit, files and versions that produce the replicates."""
-    own = path.parent == studies_folder()
-    command = f"rpim-opt study {_label(path) if own else path.name}{' --quick' if quick else ''}"
-    if own:
-        root = path.parent.parent
-        source = f" ({commit(root, *(root / name for name in ('rpim_opt', 'studies', 'problems')))})"
-    else:
-        source = f", {file_state(path)}, with {package_state()}"
+    name = _label(path) if path.parent == studies_folder() else path.name
+    source = f"`rpim-opt study {name}{' --quick' if quick else ''}`, {file_state(path)}, with {package_state()}"
     digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
     known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"
-    return f"Made by `{command}`{source}: {count} replicates, {versions()}. {known}."
+    return f"Made by {source}: {count} replicates, {versions()}. {known}."
 
 
 def run_study(
@@ -336,9 +331,8 @@ def run_cases(
         progress(len(done), len(cases))
         tasks = [(key, work(case)) for key, case in keyed if key not in done]
         for key, row in compute(tasks, workers):
-            text = json.dumps(row)
             with _sentence(journal):
-                base.execute("INSERT INTO replicates VALUES (?, ?, ?)", (key, text, _digest(code, key, text)))
+                base.execute("INSERT INTO replicates VALUES (?, ?)", (key, json.dumps(row)))
             done[key] = row
             progress(len(done), len(cases))
     return [{**case, **done[key]} for key, case in keyed]
@@ -347,9 +341,9 @@ def run_cases(
 def _resumed(
     base: sqlite3.Connection, path: Path | None, code: Mapping[str, str], resume: bool | None
 ) -> dict[str, Row]:
-    """Return the replicates of an interrupted run by their keys; refuse those of other code, and edited ones."""
+    """Return the replicates of an interrupted run by their keys; refuse those of other code."""
     known = dict(base.execute("SELECT part, digest FROM code"))
-    stored = base.execute("SELECT key, found, digest FROM replicates").fetchall()
+    stored = base.execute("SELECT key, found FROM replicates").fetchall()
     if not stored:
         base.execute("DELETE FROM code")
         base.executemany("INSERT INTO code VALUES (?, ?)", list(code.items()))
@@ -361,16 +355,7 @@ def _resumed(
         if code.get(part) != known.get(part):
             accepted = "the same code, data and versions, or --no-resume to start again"
             raise InputError("resume", f"replicates of another {part}", accepted, path)
-    for key, text, digest in stored:
-        if digest != _digest(code, key, text):
-            found = f"a replicate that was changed afterwards: {key}"
-            raise InputError("resume", found, "unmodified replicates, or --no-resume", path)
-    return {key: parse_json(text) for key, text, _ in stored}
-
-
-def _digest(code: Mapping[str, str], key: str, found: str) -> str:
-    text = json.dumps(dict(code), sort_keys=True)
-    return sha256("\0".join([text, str(key), str(found)]).encode()).hexdigest()
+    return {key: json.loads(text) for key, text in stored}
 
 
 @contextmanager
@@ -444,30 +429,26 @@ def versions() -> str:
 
 def file_state(path: Path) -> str:
     """Return a file's name with its digest and its commit."""
-    return f"{path.name} with SHA-256 {sha256(path.read_bytes()).hexdigest()[:SHORT]} ({commit(path.parent, path)})"
+    return f"{path.name} with SHA-256 {sha256_of(path)[:SHORT]} ({commit(path)})"
 
 
 def package_state() -> str:
     """Return the package's version, its digest, and its commit where there is one."""
     checkout = (PACKAGE.parent / "pyproject.toml").is_file()
-    state = commit(PACKAGE.parent, PACKAGE, problems_folder()) if checkout else "installed"
+    state = commit(PACKAGE, problems_folder()) if checkout else "installed"
     return f"rpim-opt {version_of('rpim-opt')}, SHA-256 {package_code()['package'][:SHORT]} ({state})"
 
 
-def commit(folder: Path, *paths: Path) -> str:
-    """Return the commit of some paths, with ``untracked`` or ``dirty`` if they differ from it.
-
-    Results of studies do not count.
-    """
+def commit(*paths: Path) -> str:
+    """Return the commit of some paths, with ``untracked`` or ``dirty`` if they differ from it."""
 
     def git(*arguments: str) -> str:
-        command = ["git", "-C", str(folder), *arguments]
+        command = ["git", "-C", str(paths[0].parent), *arguments]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
     try:
         described = f"commit {git('describe', '--always').strip()}"
-        named = (*map(str, paths), ":(exclude,glob)**/results/**")
-        changes = git("status", "--porcelain", "--untracked-files=all", "--", *named)
+        changes = git("status", "--porcelain", "--untracked-files=all", "--", *map(str, paths))
     except (OSError, subprocess.CalledProcessError):
         return "in no repository"
     if "??" in {line[:2] for line in changes.splitlines()}:
@@ -507,7 +488,7 @@ def script_code() -> dict[str, str]:
         file = Path(getattr(module, "__file__", None) or "")
         own = PACKAGE not in file.parents and not any(folder in file.resolve().parents for folder in LIBRARIES)
         if file.suffix == ".py" and own and file.is_file():
-            codes[f"file {file.name} ({module.__name__})"] = sha256(file.read_bytes()).hexdigest()
+            codes[f"file {file.name} ({module.__name__})"] = sha256_of(file)
             if module.__name__ == "__main__":
                 codes["set of arguments of the script"] = repr(sys.argv[1:])
     return codes
