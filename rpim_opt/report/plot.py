@@ -33,14 +33,14 @@ Axes = Any  # matplotlib's, imported where axes are made
 COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
 """Colours by meaning, as in the page's style sheet, which has others in the dark."""
 SHAPES = "osD^v<>"
-CLOSE, VERY_CLOSE = 3.0, 1.6  # ratios of an axis's ends below which it has ticks between 1, 2, 5; at every tenth
+CLOSE = 3.0  # ratio of an axis's ends below which a logarithmic one has ticks as a linear one has
 MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
 """Largest sizes of names along x and y, relative to the axis's label, and the smallest that can be read [points]."""
 LINE_HEIGHT = 1.25  # distance of names over their size
 MODELS = {"before": "nominal", "after": "identified"}  # model that errors before and after calibration are of
 MANY_ROWS = 100  # above it each row is a small point without a name
-TIMES = ((86400.0, "days"), (3600.0, "hours"))  # units of an axis of time [s]
+TIMES = ((86400.0, "days"), (3600.0, "hours"), (1.0, "seconds"))  # units of an axis of time [s]
 CELLS, SHADES = 24, 5  # of a map: cells along the longer side, and levels
 VIEWS = {"from above": (0, 1), "from the side": (0, 2)}  # axes to the right and up
 VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
@@ -61,23 +61,22 @@ def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) ->
     ax = _axes(ax)
     data = data or result.problem.data
     after = 1e3 * result.errors(data)
-    finite = np.isfinite(after)  # rows that measure a length
-    lengths = {"before": 1e3 * result.nominal_errors(data)[finite], "after": after[finite]}
-    labels = [data.label[i] for i in np.flatnonzero(finite)]
-    every = np.concatenate(list(lengths.values()))
-    low = max(0.5 * float(every.min()), 1e-4 * float(every.max()), 1e-7)
-    drawn = {when: np.maximum(each, low) for when, each in lengths.items()}
+    finite = np.flatnonzero(np.isfinite(after))  # rows that measure a length
+    labels = [data.label[i] for i in finite]
+    both = np.array([1e3 * result.nominal_errors(data)[finite], after[finite]])
+    low = max(0.5 * float(both.min()), 1e-4 * float(both.max()), 1e-7)
+    before, after = np.maximum(both, low)
     place = np.arange(1.0, len(labels) + 1)
     few = len(labels) <= MANY_ROWS
     if few:
-        ax.vlines(place, drawn["before"], drawn["after"], color=COLORS["before"])
-    for when, each in drawn.items():
+        ax.vlines(place, before, after, color=COLORS["before"])
+    for when, each in {"before": before, "after": after}.items():
         _dots(ax, place, each, when, MODELS[when], ms=5.0 if few else 2.0)
     flagged = {flag.label for flag in result.flagged} if data is result.problem.data else set()
     at = [i for i, label in enumerate(labels) if label in flagged]
     if at:
-        _dots(ax, place[at], drawn["after"][at], "mark", "flagged")
-    cut = int(np.sum(every < low))
+        _dots(ax, place[at], after[at], "mark", "flagged")
+    cut = np.count_nonzero(both < low)
     note = f"\n{cut} errors below {low:.2g} mm are drawn at the lower edge." if cut else ""
     ax.set(xlabel=f"row{note}", ylabel="error [mm]")
     if few:
@@ -147,10 +146,8 @@ def parameters(result: Calibration, dimension: str = "length", confidence: float
         at = np.tile(place[bounded], 2)
         ax.vlines(ends, at - 0.35, at + 0.35, color=COLORS["mark"], label="tolerance")
     # an interval that ends far out would hide all others: it is cut at the edge
-    reach = max(float(np.max(np.abs(x), initial=1e-9)), float(np.max(bound[bounded], initial=0.0)))
-    if len(x):
-        reach = max(reach, float(np.median(np.abs(x) + spread)))
-    reach *= 1.1
+    middle = np.median(np.abs(x) + spread) if len(x) else 0.0
+    reach = 1.1 * max([1e-9, *np.abs(x), *bound[bounded], middle])
     cut = "\nIntervals beyond the axis are clipped." if (np.abs(x) + spread > reach).any() else ""
     ax.set(xlim=(-reach, reach), xlabel=f"deviation from nominal [{unit}]{cut}")
     _name(ax, "y", [free.names[i] for i in own])
@@ -260,10 +257,9 @@ def checks(found: Monitoring, ax: Axes) -> None:
     """Draw every check against its limit."""
     place = _times(found, ax)
     ax.plot(place, found.allowed, color=COLORS["mark"], lw=1.5, label="limit, checks beyond it")
-    beyond = found.sigmas > found.allowed
-    for at, role, label in ((~beyond, "after", "check"), (beyond, "mark", "")):
-        if at.any():
-            _dots(ax, place[at], found.sigmas[at], role, label)
+    _dots(ax, place, found.sigmas, "after", "check")
+    beyond = list(found.beyond)
+    _dots(ax, place[beyond], found.sigmas[beyond], "mark")
     ax.set(ylabel="residual [standard deviations]")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
@@ -275,8 +271,7 @@ def cumulative_sum(found: Monitoring, ax: Axes) -> None:
     ax.axhline(found.limit, color=COLORS["mark"], lw=1.5, label="limit, alarm")
     ax.plot(place, found.sums, color=COLORS["after"], lw=1.5, label="sum")
     if found.alarm is not None:
-        at = [found.alarm]
-        _dots(ax, place[at], found.sums[at], "mark")
+        _dots(ax, [place[found.alarm]], [found.sums[found.alarm]], "mark")
     ax.set(ylabel="cumulative sum")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
@@ -287,8 +282,7 @@ def _times(found: Monitoring, ax: Axes) -> Array:
     if found.when is None or not np.ptp(found.when) > 0:
         ax.set_xlabel("check")
         return np.arange(1, len(found.label) + 1, dtype=float)
-    span = float(np.ptp(found.when))
-    unit, name = next(((size, name) for size, name in TIMES if span > 2 * size), (1.0, "seconds"))
+    unit, name = next((size, name) for size, name in TIMES if np.ptp(found.when) > 2 * size or size == 1)
     ax.set_xlabel(f"{name} since the first check")
     return (found.when - found.when[0]) / unit
 
@@ -310,16 +304,13 @@ def _dots(ax: Axes, x: Any, y: Any, role: str, label: str = "", ms: float = 5.0)
 
 def logarithmic(ax: Axes, which: str) -> None:
     """Make an axis logarithmic, with as many ticks a power of ten as it has room for."""
-    from matplotlib.ticker import LogLocator
+    from matplotlib.ticker import LogLocator, MaxNLocator
 
     ax.set(**{f"{which}scale": "log"})
     low, high = getattr(ax, f"get_{which}lim")()
     axis = getattr(ax, f"{which}axis")
     powers = np.floor(np.log10(high)) - np.ceil(np.log10(low)) + 1
-    ticks: Any = (1, 2, 5) if powers < 3 else (1,)
-    if high / low < CLOSE:
-        ticks = np.arange(10, 100) / 10 if high / low < VERY_CLOSE else (1, 1.2, 1.5, 2, 2.5, 3, 5, 6, 7, 8, 9)
-    axis.set_major_locator(LogLocator(subs=ticks))
+    axis.set_major_locator(MaxNLocator(6) if high / low < CLOSE else LogLocator(subs=(1, 2, 5) if powers < 3 else (1,)))
     axis.set_major_formatter("{x:g}")
     axis.minorticks_off()
 

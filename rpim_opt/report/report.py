@@ -281,28 +281,22 @@ def _parameters(content: Content) -> Iterator[Block]:
     at_bound = {each.name for each in result.active_bounds}
     columns = len(head) - (not np.isfinite(tolerance).any())
     rows = []
-    bounds = free.rows({"U": half, "tolerance": tolerance})
-    for i, row in enumerate(result.parameter_rows()):
-        if free.of_curves[i]:
-            continue
-        name = f"{row['name']} [{row['unit']}]"
-        if row["name"] in at_bound:
-            name += ", at its bound"
-        if words.rotated(row):
-            name += " *"
-        expanded = "" if bounds[i]["U"] is None else f"±{bounds[i]['U']:.4f}"
-        bound = "" if bounds[i]["tolerance"] is None else f"±{bounds[i]['tolerance']:.4g}"
-        figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
-        rows.append([name, *figures, expanded, bound][:columns])
+    own = free.take(np.flatnonzero(~free.of_curves))
+    bounds = own.rows({"U": half[~free.of_curves], "tolerance": tolerance[~free.of_curves]})
+    for (name, unit, *figures, _), bound in zip(words.columns(result)[1], bounds, strict=True):
+        edge = ", at its bound" if bound["parameter"] in at_bound else ""
+        expanded = "" if bound["U"] is None else f"±{bound['U']:.4f}"
+        allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
+        rows.append([f"{name} [{unit}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)
     yield "text", [note, *words.turned_frames(result)]
-    own = np.array(free.dimensions)[~free.of_frames & ~free.of_curves]
+    count = Counter(np.array(own.dimensions)[~own.of_frames].tolist())
     drawn = []
     for dimension in ("length", "angle"):
-        if dimension in own:
+        if count[dimension]:
             draw = partial(plot.parameters, result, dimension)
             title, caption = f"Deviations of the {dimension} parameters", f"The robot's {dimension} parameters."
-            drawn.append(figure(draw, title, caption, 80.0 + 17 * np.count_nonzero(own == dimension)))
+            drawn.append(figure(draw, title, caption, 80.0 + 17 * count[dimension]))
     yield "beside", [("table", Table("Identified parameters", head[:columns], rows)), ("figures", drawn)]
     yield from _transmission(result)
 
@@ -413,15 +407,14 @@ def _provenance(content: Content) -> Iterator[Block]:
     for name, robot in result.problem.arms.items():
         named = f"{name}: {robot.name}" if name else robot.name
         robots.append(" - ".join(filter(None, [named, f"{robot.dof} joints", robot.source])))
-    facts = {
-        "Source": record.source or "not stated",
-        "Measurements": "simulated" if record.simulated else "not marked as simulated",
-        "Robot": "; ".join(robots),
-        "Formulation": f"{result.formulation.name}: {_formulation(result)}",
-        "Made": record.made,
-        "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
-    }
-    yield "facts", list(facts.items())
+    yield "facts", [
+        ("Source", record.source or "not stated"),
+        ("Measurements", "simulated" if record.simulated else "not marked as simulated"),
+        ("Robot", "; ".join(robots)),
+        ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
+        ("Made", record.made),
+        ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
+    ]
     count: Counter[tuple[str, str]] = Counter()
     for name, data in summary.sets(result).items():
         for block in data.blocks:
