@@ -407,14 +407,17 @@ def _provenance(content: Content) -> Iterator[Block]:
     for name, robot in result.problem.arms.items():
         named = f"{name}: {robot.name}" if name else robot.name
         robots.append(" - ".join(filter(None, [named, f"{robot.dof} joints", robot.source])))
-    yield "facts", [
-        ("Source", record.source or "not stated"),
-        ("Measurements", "simulated" if record.simulated else "not marked as simulated"),
-        ("Robot", "; ".join(robots)),
-        ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
-        ("Made", record.made),
-        ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
-    ]
+    yield (
+        "facts",
+        [
+            ("Source", record.source or "not stated"),
+            ("Measurements", "simulated" if record.simulated else "not marked as simulated"),
+            ("Robot", "; ".join(robots)),
+            ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
+            ("Made", record.made),
+            ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
+        ],
+    )
     count: Counter[tuple[str, str]] = Counter()
     for name, data in summary.sets(result).items():
         for block in data.blocks:

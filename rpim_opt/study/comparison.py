@@ -15,7 +15,6 @@ from typing import Any
 import numpy as np
 from scipy.special import ndtr, stdtrit
 
-from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import csv_text, frame_of
@@ -244,14 +243,7 @@ class Comparison:
         Arguments and errors as for `summary`.
         """
         summary = self.summary(metric, against)
-        of = figures(self.rows, summary.metric)
-        other = of[summary.reference]
-        ratios, means = {}, {}
-        for each in summary.standings:
-            own = of[each.method]
-            ratios[each.method] = np.array([own[pair] / other[pair] for pair in own if other.get(pair)])
-            means[each.method] = each.ratio, each.low, each.high
-        return _ratios(ratios, means, f"{summary.metric} over that of {summary.reference}, same replicate")
+        return _ratios(summary, figures(self.rows, summary.metric))
 
     def report(self, folder: str | Path, metric: str | None = None, against: str | None = None) -> Path:
         """Write ``README.md`` with the summary and the medians by problem, the figure, and ``replicates.csv``.
@@ -417,19 +409,22 @@ def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[s
     other = pick(of, reference, "against")
     if not other:
         raise InputError("against", f"'{against}', which has no results", "a method with results")
-    least = np.finfo(float).tiny  # figures that are zero are as good as a rounding error
+
+    def size(figure: float | None) -> float:  # figures that are zero are as good as a rounding error
+        return math.inf if figure is None else math.log(max(figure, np.finfo(float).tiny))
+
     known = []
     for method in with_figures:
         own = of[method]
         mine = [row for row in rows if row["method"] == method]
-        logs = {pair: math.log(max(own[pair], least) / max(other[pair], least)) for pair in own if pair in other}
-        compared = {_pair(row) for row in mine} & (set(own) | set(other))
-        wins = sum(pair in own and (pair not in other or logs[pair] < -TIE) for pair in compared)
-        losses = sum(pair in other and (pair not in own or logs[pair] > TIE) for pair in compared)
+        logs = {pair: size(own.get(pair)) - size(other.get(pair)) for pair in own.keys() | other.keys()}
+        wins = sum(log < -TIE for log in logs.values())
+        losses = sum(log > TIE for log in logs.values())
+        paired = {pair: logs[pair] for pair in own if pair in other}
         unconverged = sum(row["status"] == UNCONVERGED for row in mine)
         standing = Standing(
             method, len(mine), len(mine) - len(own), unconverged, float(np.median(list(own.values()))),
-            max(own.values()), *interval(logs, drawn), wins, len(compared) - wins - losses, losses,
+            max(own.values()), *interval(paired, drawn), wins, len(logs) - wins - losses, losses,
         )  # fmt: skip
         known.append(standing)
     known.sort(key=lambda each: (each.ratio is None, each.ratio, each.median))
@@ -543,27 +538,28 @@ def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     return _finished(ax, list(values), label)
 
 
-def _ratios(ratios: Mapping[str, Array], means: Mapping[str, Sequence[float | None]], label: str) -> Any:
+def _ratios(summary: Summary, of: Mapping[str, Mapping[Pair, float]]) -> Any:
     """Return the figure: methods from top to bottom, their ratios as dots, the mean with the ends of its interval."""
-    ax = _axes(max(ROW_INCHES * len(ratios) + 1.5, 3.5), dpi=150)
+    other = of[summary.reference]
+    ax = _axes(max(ROW_INCHES * len(summary.standings) + 1.5, 3.5), dpi=150)
     ax.axvline(1, color="0.4", lw=1, zorder=1)
-    for y, (method, values) in enumerate(ratios.items()):
+    for y, each in enumerate(summary.standings):
+        values = [own / other[pair] for pair, own in of[each.method].items() if other.get(pair)]
         alpha = min(0.5, 3 / max(len(values), 1) ** 0.5)
         ax.plot(_inside(values), np.full(len(values), y), "o", ms=3.5, color="C0", alpha=alpha, mew=0, zorder=2)
-        if (values > LARGEST_RATIO).any():
-            ax.plot([LARGEST_RATIO], [y], ">", ms=6, color="C0", zorder=2)
-        if (values < 1 / LARGEST_RATIO).any():
-            ax.plot([1 / LARGEST_RATIO], [y], "<", ms=6, color="C0", zorder=2)
-        mean, low, high = means[method]
+        for edge, marker in ((LARGEST_RATIO, ">"), (1 / LARGEST_RATIO, "<")):
+            if any((value - edge) * (edge - 1) > 0 for value in values):
+                ax.plot([edge], [y], marker, ms=6, color="C0", zorder=2)
         colour = "0.3"
-        if low is not None and high is not None:
-            if high < 1 or low > 1:
-                colour = "C2" if high < 1 else "C3"
-            ax.plot(_inside([low, high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
-        if mean is not None:
-            ax.plot(_inside([mean]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
+        if each.low is not None and each.high is not None:
+            if each.different:
+                colour = "C2" if each.high < 1 else "C3"
+            ax.plot(_inside([each.low, each.high]), [y, y], lw=2, color=colour, zorder=3, solid_capstyle="butt")
+        if each.ratio is not None:
+            ax.plot(_inside([each.ratio]), [y], "D", ms=5, color=colour, mec="white", mew=0.6, zorder=4)
     ax.set_title("dots: replicates; marks: geometric mean, 95 % interval", fontsize=9)
-    return _finished(ax, list(ratios), label)
+    label = f"{summary.metric} over that of {summary.reference}, same replicate"
+    return _finished(ax, [each.method for each in summary.standings], label)
 
 
 def _axes(height: float, **options: Any) -> Any:
