@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -11,9 +12,10 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.robot.extensions import gravity_torques
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.library import find_robot
-from rpim_opt.robot.mdh import Robot
+from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameters import model_parameters
 
 KINDS = {"ur10e": ["beta[23]"], "irb120": ["beta2"], "iiwa7": []}
@@ -84,7 +86,7 @@ def simulated_arm(
     moved = _moved(robot, effects, np.random.default_rng([seed, 5]))
 
     def measured(joints: Array, level: float, stream: int) -> Dataset:
-        T = base @ frames(robot, moved(joints), errors)[-1]
+        T = base @ flange(robot, moved(joints), errors)
         points = T[:, :3, :3] @ tool + T[:, :3, 3]
         draws = np.random.default_rng([seed, stream]).standard_normal(points.shape)
         return Dataset.of(joints, points + level * draws, noise)
@@ -95,47 +97,36 @@ def simulated_arm(
     return SimulatedArm(problem, measured(there, 0.0, 4), measured(there, noise, 4))
 
 
-def frames(robot: Robot, q: Array, errors: Array) -> list[Array]:
-    """Return the frames (N, 4, 4) behind revolute joints, each with a small transform, a row of (dof, 6), behind it."""
+def flange(robot: Robot, q: Array, errors: Array) -> Array:
+    """Return the frames (N, 4, 4) behind the last of revolute joints, each with a small transform behind it."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
-    behind_joints = []
     for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, (q @ robot.joint_map.T).T, errors, strict=True):
         turn = np.tile(np.eye(4), (len(q), 1, 1))
         turn[:, :3, :3] = scipy.spatial.transform.Rotation.from_euler("z", (theta + angle)[:, None]).as_matrix()
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ behind @ _small(error)
-        behind_joints.append(T)
-    return behind_joints
+    return T
 
 
 def _moved(robot: Robot, size: float, rng: np.random.Generator) -> Callable[[Array], Array]:
     """Return the function from encoder to joint values (N, dof) [rad]: sag under gravity, and eccentric encoders."""
-    mass = np.asarray(np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1], dtype=float)
+    masses = np.asarray(np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1], dtype=float).tolist()
     phase = rng.uniform(0, 2 * np.pi, robot.dof)
     compliance = rng.uniform(0.3, 1.0, robot.dof)
-    largest = np.abs(_torque(robot, mass, rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
+    alpha, a, _, d, _ = robot.mdh.T
+    halves = np.column_stack([a, -d * np.sin(alpha), d * np.cos(alpha)]) / 2  # of the way to the next joint
+    centres = [(x, y, z) for x, y, z in halves[1:].tolist()] + [(0.0, 0.0, 0.0)]
+    heavy = replace(robot, gravity=Gravity(masses=tuple(masses), centres=tuple(centres)))
+    largest = np.abs(gravity_torques(heavy, rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
 
     def joints(q: Array) -> Array:
         if not size:
             return q
-        sag = compliance * _torque(robot, mass, q) / np.maximum(largest, 1e-9 * largest.max())
+        sag = compliance * gravity_torques(heavy, q) / np.maximum(largest, 1e-9 * largest.max())
         off = size * (sag + np.cos(q @ robot.joint_map.T + phase) / 3)
         return q + off @ np.linalg.inv(robot.joint_map).T
 
     return joints
-
-
-def _torque(robot: Robot, mass: Array, q: Array) -> Array:
-    """Return torques (N, dof) of gravity about the joints; links' masses sit half way to the next joint."""
-    behind = frames(robot, q, np.zeros((robot.dof, 6)))
-    places = [frame[:, :3, 3] for frame in behind]
-    centres = [(here + there) / 2 for here, there in zip(places, [*places[1:], places[-1]], strict=True)]
-    down = np.array([0.0, 0.0, -1.0])
-    torque = np.zeros(q.shape)
-    for i, frame in enumerate(behind):
-        for each, centre in zip(mass[i:], centres[i:], strict=True):
-            torque[:, i] += each * np.sum(np.cross(centre - places[i], down) * frame[:, :3, 2], axis=1)
-    return torque
 
 
 def _small(numbers: Array) -> Array:

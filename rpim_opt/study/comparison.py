@@ -141,7 +141,9 @@ def compare(
     code: dict[str, str] = {}
     if path is not None:
         own = {name: metric for name, metric in figured.items() if METRICS.get(name) is not metric}
-        code = studies.code_of({"problems given": asked, "methods": compared, "metrics": (tuple(figured), own)})
+        inputs = {"problems given": asked, "methods": compared, "metrics": (tuple(figured), own)}
+        hashes = {f"set of {name}": studies.content_hash(value, "journal") for name, value in inputs.items()}
+        code = studies.package_code() | studies.script_code() | hashes
         with refused(path):
             path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:
@@ -396,10 +398,7 @@ def number(value: float | None) -> str:
 
 
 def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[str]) -> Summary:
-    """Return the methods in order, each against a reference, by default the first method that has figures.
-
-    ``drawn`` are problems that depend on a seed. InputError for a reference that is unknown or has no figures.
-    """
+    """Return `Comparison.summary`; ``drawn`` are problems that depend on a seed."""
     of = figures(rows, metric)
     with_figures = [method for method, values in of.items() if values]
     if against is None and not with_figures:

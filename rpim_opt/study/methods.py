@@ -163,10 +163,7 @@ def _held_out(data: Dataset, split: float, fold: int, seed: int) -> np.ndarray:
 
 
 def _divided(instance: Instance, split: float, case: Mapping[str, Any]) -> tuple[Instance, Dataset]:
-    """Return an instance with the data to fit, and the held-out data; InputError where nothing is held out.
-
-    Of the configurations that the split leaves, ``count`` are fitted, drawn at random, or all.
-    """
+    """Return an instance with the data to fit, and the held-out data; InputError where nothing is held out."""
     seed = case["seed"]
     data = instance.problem.data
     held_out = instance.validation
@@ -339,10 +336,6 @@ class Fitted:
         return self.errors_of(self.problem.data, "length")
 
 
-def _statistic(name: str, fitted: Fitted) -> float | None:
-    return statistics(fitted.errors())[name]
-
-
 def _coverage(fitted: Fitted) -> float | None:
     if fitted.result is None:
         return None
@@ -351,7 +344,10 @@ def _coverage(fitted: Fitted) -> float | None:
 
 
 METRICS: dict[str, Callable[[Fitted], float | None]] = {
-    **{name: partial(_statistic, name) for name in ("rms_mm", "mean_mm", "p95_mm", "max_mm")},
+    "rms_mm": lambda fitted: statistics(fitted.errors())["rms_mm"],
+    "mean_mm": lambda fitted: statistics(fitted.errors())["mean_mm"],
+    "p95_mm": lambda fitted: statistics(fitted.errors())["p95_mm"],
+    "max_mm": lambda fitted: statistics(fitted.errors())["max_mm"],
     "rms_mrad": lambda fitted: statistics(fitted.errors("angle"), "mrad")["rms_mrad"],
     "fit_rms_mm": lambda fitted: statistics(fitted.fit_errors())["rms_mm"],
     "covered_percent": _coverage,
@@ -371,10 +367,7 @@ def metrics_of(stated: Any) -> dict[str, Callable[[Fitted], float | None]]:
 def replicate(
     problem: Problem, split: float, method: Method, metrics: Mapping[str, Callable[..., Any]], case: Mapping[str, Any]
 ) -> Row:
-    """Return the metrics of a method on one split of a problem; a failure becomes a status and a reason.
-
-    A metric that is not finite is None.
-    """
+    """Return the metrics of a method on one split, None if not finite; a failure becomes a status and a reason."""
     row: Row = {"status": OK, "reason": "", "configurations": None, "parameters": None, "weight": None}
     try:
         label, seed = case["problem"], case["seed"]

@@ -34,7 +34,7 @@ from rpim_opt.data.record import PACKAGES
 from rpim_opt.store.problem_file import problems_folder
 
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
-"""What a study has: a text, a `Metric` for each figure that is held, and three functions."""
+"""What a study has; if it has prepare(quick), too, that is called once before the first case."""
 FILE = "study.py"  # the study of a folder
 MOST_FILES = 10_000
 """Of the files beside a study, each of which is read before its replicates are resumed."""
@@ -93,10 +93,7 @@ def studies_folder() -> Path | None:
 
 
 def find_study(name: str | Path) -> Path:
-    """Return the file of a study: of a path, of a folder with ``study.py``, or of a name.
-
-    A name is looked for among the studies of the checkout, and then in the current folder.
-    """
+    """Return the file of a path, of a folder with ``study.py``, or of a name in the checkout or the current folder."""
     text = str(name)
     if text.endswith(".py") or os.sep in text or "/" in text or text in (".", ".."):
         path = Path(text, FILE) if Path(text).is_dir() else Path(text)
@@ -124,10 +121,7 @@ def _label(path: Path, quick: bool = False) -> str:
 
 @lru_cache(maxsize=8)
 def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
-    """Return a study: a Python file with QUESTION, METRICS, cases(quick), run(**case), report(rows).
-
-    If it has prepare(quick), that is called once before the first case. It may import files beside it.
-    """
+    """Return a study: a Python file with the names that are ``needed``, which may import files beside it."""
     spec = importlib.util.spec_from_file_location(f"study_{path.stem}", path)
     if spec is None or spec.loader is None:
         raise InputError("the study", str(path), "a Python file")
@@ -308,10 +302,8 @@ def run_cases(
 ) -> list[Row]:
     """Return every case with its figures, in the order of the cases.
 
-    ``cases`` are plain tables, and ``work`` returns what computes one; ``workers`` is as `compute` has it,
-    ``progress`` is called whenever a replicate is done. Every finished replicate is written to the
-    ``journal`` before the next one counts; ``code`` are digests of what replicates follow from, and those of other code
-    are refused. Replicates of an interrupted run are resumed (true), dropped (false), or refused (None).
+    ``cases`` are plain tables, and ``work`` returns what computes one; ``code`` are digests of what replicates follow
+    from. Those of an interrupted run are resumed (true), dropped (false), or refused (None), as those of other code.
     """
     keyed = [(json.dumps(case, sort_keys=True), case) for case in cases]
     code = code or {}
@@ -375,11 +367,7 @@ def remove_journal(path: Path) -> None:
 
 
 def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:
-    """Yield keys and results as they are finished.
-
-    ``workers`` are processes on this machine, -1 for all processors; or those of the backend that
-    ``joblib.parallel_config`` names, ``"dask"`` for a cluster.
-    """
+    """Yield keys and results as they are finished; ``workers`` are as `compare` has them."""
     if workers == 0:
         raise InputError("workers", "0", "one or more, or -1 for all processors")
     if workers == 1:
@@ -471,18 +459,8 @@ def provenance() -> dict[str, str]:
 # --- what a comparison's replicates follow from ---------------------------------------------------------------------
 
 
-def code_of(inputs: Mapping[str, Any]) -> dict[str, str]:
-    """Return digests of the package, of a script, and of what it compares, by what that is called."""
-    library("joblib", "journal", "studies")
-    hashes = {f"set of {name}": content_hash(value, "journal") for name, value in inputs.items()}
-    return package_code() | script_code() | hashes
-
-
 def script_code() -> dict[str, str]:
-    """Return digests of the Python files that are loaded besides installed ones, and of what a script was called with.
-
-    Together they stand for the code of a script's functions, and for the globals that these read.
-    """
+    """Return digests of the Python files that are loaded besides installed ones, and what a script was called with."""
     codes = {}
     for module in list(sys.modules.values()):
         file = Path(getattr(module, "__file__", None) or "")
@@ -500,9 +478,8 @@ def content_hash(thing: Any, where: str) -> str:
     Functions count by their names: their code is that of `script_code`. InputError for what cannot be pickled, such as
     a lambda or a generator, and for functions of an interactive session, which has no file.
     """
-    from joblib.hashing import NumpyHasher
 
-    class Hasher(NumpyHasher):
+    class Hasher(library("joblib.hashing", where, "studies").NumpyHasher):
         def reducer_override(self, obj: Any) -> Any:
             own = type(obj).__module__.startswith("rpim_opt.") and type(obj).__reduce__ is object.__reduce__
             if own and is_dataclass(obj) and not isinstance(obj, type):  # without what it cached

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.study.arms import KINDS, frames
+from rpim_opt.study.arms import KINDS, flange
 
 
 @pytest.mark.parametrize("seed", range(len(KINDS)))
@@ -14,7 +14,7 @@ def test_an_arm_without_errors_is_its_drawing(seed: int) -> None:
     robot = ro.study.simulated_arm(seed, 10).problem.robot
     q = np.random.default_rng(1).uniform(-2, 2, (20, robot.dof))
     expected = ro.robot.forward_kinematics(robot, q)
-    np.testing.assert_allclose(frames(robot, q, np.zeros((robot.dof, 6)))[-1], expected, atol=1e-12)
+    np.testing.assert_allclose(flange(robot, q, np.zeros((robot.dof, 6))), expected, atol=1e-12)
 
 
 def test_an_error_is_behind_its_link() -> None:
@@ -24,7 +24,7 @@ def test_an_error_is_behind_its_link() -> None:
     errors[-1, 2] = 1e-3
     errors[-1, 5] = 0.1
     T = ro.robot.forward_kinematics(robot, q)
-    moved = frames(robot, q, errors)[-1]
+    moved = flange(robot, q, errors)
     np.testing.assert_allclose(moved[:, :3, 3], T[:, :3, 3] + 1e-3 * T[:, :3, 2], atol=1e-12)
     np.testing.assert_allclose(np.einsum("nij,nij->n", moved[:, :3, :3], T[:, :3, :3]), 1 + 2 * np.cos(0.1))
 
