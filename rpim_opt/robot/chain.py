@@ -22,8 +22,6 @@ from rpim_opt.robot.kinematics import (
     frame_numbers,
     numeric_frame,
     numeric_link,
-    rotation_z,
-    translation,
 )
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.terms import Joint, Symbol, Term
@@ -36,8 +34,8 @@ beyond three times, prior scales would be wrong (with axes 10 degrees apart erro
 0.20 mm on five simulated sets).
 """
 ANOTHER_ARM = 0.1  # a robot whose parameters deviate by more than this [m or rad] from a file's is not the file's
-ORIGIN, MOUNT, MIMIC = OF_JOINTS = "origin_", "mount_", "mimic_"
-"""Prefixes of the parameters of joints that move, of fixed joints at the ends of a chain, and of mimic joints."""
+ORIGIN, MOUNT = OF_JOINTS = "origin_", "mount_"
+"""Prefixes of the parameters of joints that move, and of fixed joints at the ends of a chain."""
 ORIGIN_SCALES = {ORIGIN: 1.0, MOUNT: 10.0}  # prior standard deviations of their deviations [mm and mrad]
 SAME_PLACE = (0.01, 0.1)  # two frames nearer than this [m], [rad] are one and the same, known twice
 
@@ -279,48 +277,30 @@ class Origin(NamedTuple):
     up: bool  # whether the chain goes up through the joint
 
 
-class Mimic(NamedTuple):
-    """A row's joint that follows another: deviations of its multiplier and offset are parameters."""
-
-    prefix: str  # of its parameters, mimic_finger_joint_
-    multiplier: float
-    kind: str  # revolute or prismatic
-    frame: Array  # (4, 4) of the joint's axis z in the frame behind the row
-
-
 class Carried(NamedTuple):
-    """The origins after a row (from 1) of a robot's table, in order, and how its joint follows another."""
+    """The origins after a row (from 1) of a robot's table, in order."""
 
     row: int
     origins: tuple[Origin, ...]
-    mimics: tuple[Mimic, ...] = ()  # one, or none
 
 
 def displaced(carried: Carried) -> Term:
     """Return the term of the origins after a row of the table, which displace the following frames in order.
 
-    A joint at m q + o moves further by the deviations of m, times q, and of o before them. With F the parent link's
-    frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed up by F D^-1 F^-1;
-    D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx) is zero's identity.
+    With F the parent link's frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed
+    up by F D^-1 F^-1; D = Trans(x, y, z) Rot(rz) Rot(ry) Rot(rx).
     """
     units = dict(zip(FRAME, ("mm",) * 3 + ("mrad",) * 3, strict=True))
     scales = {}
-    for mimic in carried.mimics:
-        unit = "mrad" if mimic.kind == "revolute" else "mm"
-        scales |= {f"{mimic.prefix}multiplier_ppm": 1000.0, f"{mimic.prefix}offset_{unit}": 1.0}
     for origin in carried.origins:
         scale = ORIGIN_SCALES[ORIGIN if origin.prefix.startswith(ORIGIN) else MOUNT]
         scales |= {f"{origin.prefix}{axis}_{unit}": scale for axis, unit in units.items()}
     return Term(partial(_moves, carried), scales, at="link", joints=(carried.row,), made_of=carried)
 
 
-def _moves(carried: Carried, link: Joint, *sizes: Symbol) -> Symbol:
+def _moves(carried: Carried, _link: Joint, *sizes: Symbol) -> Symbol:
     """Return the product of the displacements as six numbers."""
     T = ca.SX.eye(4)
-    for _, multiplier, kind, F in carried.mimics:
-        further = sizes[0] * link.q / multiplier + sizes[1]
-        T = F @ (rotation_z(further) if kind == "revolute" else translation(0, 0, further)) @ np.linalg.inv(F)
-    sizes = sizes[2 * len(carried.mimics) :]
     for k, (_, F, up) in enumerate(carried.origins):
         six = sizes[6 * k : 6 * k + 6]
         if not all(ca.SX(size).is_zero() for size in six):

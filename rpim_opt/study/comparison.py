@@ -69,37 +69,32 @@ def compare(
 ) -> Comparison:
     """Compare formulations, selectors and user-defined methods on problems, by errors on held-out data.
 
-    Every problem with every formulation and every selector, every split and every seed: one replicate each. What cannot
-    be (a lasso with REML) and what fails is a replicate with its reason. All methods see the same data: the same
-    configurations held out, drawn and disturbed, so that their errors are compared in pairs.
+    Every problem with every formulation, selector, split and seed is one replicate; what cannot be (a lasso with REML)
+    and what fails has its reason in it. All methods see the same data, so that errors are compared in pairs.
 
     ``problems`` are a folder, a name that comes with the package, ``ro.load(...)``, a problem, a pair of a problem and
-    validation data, a folder of problem folders, a generator (a function of a seed that returns one of these, or a
-    `SimulatedArm`); or several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``. ``formulations`` are
-    ready ones by name, objects, ``"folder"`` for the folder's own; ``selectors`` names, selectors, numbers,
-    ``"learned"``, ``"folder"``; one or several, or by names of your own. A formulation without penalty has no weight
-    and is there once, with the selector ``none``. ``methods`` are others: baselines by name (``"levenberg_marquardt"``;
-    ``"nominal"`` fits frames alone) and functions of the problem that return deviations (n,) [SI], a calibration, or a
-    function from joint values (N, dof) to positions (N, 3) [m]. ``options`` are further ones of every calibration:
-    ``{"model": "auto"}``.
+    validation data, a folder of problem folders, a function of a seed that returns one of these or a `SimulatedArm`; or
+    several, in a list or by names of your own, ``{"cell 7": "data/cell7"}``. ``formulations`` are ready ones by name,
+    objects, ``"folder"`` for the folder's own; ``selectors`` names, selectors, numbers, ``"learned"``, ``"folder"``. A
+    formulation without penalty is there once, with the selector ``none``. ``methods`` are baselines by name
+    (``"levenberg_marquardt"``; ``"nominal"`` fits frames alone) and functions of the problem that return deviations
+    (n,) [SI], a calibration, or a function from joint values (N, dof) to positions (N, 3) [m]. ``options`` are further
+    ones of every calibration: ``{"model": "auto"}``.
 
-    ``splits`` say what is held out, always whole configurations: ``"folder"``, the validation data of the problem; a
-    part of its data (``0.25``); in how many folds (``5``), one replicate a fold; or several of them. ``counts`` are of
-    how many configurations to identify from, drawn from those that are not held out; all of them by default. ``noise``
-    are factors, 1 or more, on the noise of the data to fit: the missing part is added, and declared. ``seeds`` are how
-    many, or which: of generated problems, of splits, of draws and of noise. What no seed changes is there once.
+    ``splits`` say which configurations are held out: ``"folder"``, the validation data of the problem; a part of its
+    data (``0.25``); in how many folds (``5``), one replicate a fold. ``counts`` are of how many of the others to
+    identify from, by default all. ``noise`` are factors, 1 or more, on the noise of the data to fit: the missing part
+    is added, and declared. ``seeds`` are how many, or which: of generated problems, splits, draws and noise.
 
     ``metrics`` are of the rows held out: ``"rms_mm"``, ``"mean_mm"``, ``"p95_mm"``, ``"max_mm"``, ``"rms_mrad"``,
     ``"fit_rms_mm"`` (of the rows that were fitted), ``"covered_percent"`` (of 95 % intervals), ``"seconds"``; or
     functions of a `Fitted`, by names that carry their unit. Summaries are of the first one, of which less is better.
 
     ``workers`` are processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config``
-    names one. Every finished replicate is written to the file ``journal`` at once. A call with the same code and
-    arguments goes on with it (more seeds, splits, counts and factors may be asked); one of other code or arguments is
-    refused, and so is an argument that cannot be pickled. Code is that of the Python files that are loaded; other files
-    that a function reads are not known to it. ``resume`` is False to begin the journal anew; None refuses to drop what
-    an interrupted run has computed. ``progress`` is whether a bar with the time left is shown where a person is
-    watching; or a function that is told how many replicates of how many are done.
+    names one. Finished replicates are written to the file ``journal``, with which a call with the same code (of the
+    Python files that are loaded) and arguments goes on: more seeds, splits, counts and factors may be asked. It refuses
+    other code and arguments, and those that cannot be pickled. ``resume`` is False to begin it anew; None refuses to
+    drop what it has. ``progress`` is whether a bar is shown, or is told how many replicates of how many are done.
 
     InputError before anything is computed: for unknown names, words and numbers, and a journal of something else.
 
@@ -187,9 +182,9 @@ class Comparison:
 
     ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
     and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not converged``, ``impossible``, ``failed``) with
-    its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``, of the
-    first of which summaries are. ``drawn`` are problems that every seed draws anew, ``asked`` the axes of the grid in
-    words, ``made`` what made the rows: script, package, versions and time.
+    its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``.
+    ``drawn`` are problems that every seed draws anew, ``asked`` the grid in words, ``made`` script, package, versions
+    and time.
 
     >>> import rpim_opt as ro
     >>> def arms(seed):

@@ -28,7 +28,7 @@ from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.chain import MIMIC, OF_JOINTS, Described, placed, same_place
+from rpim_opt.robot.chain import OF_JOINTS, Described, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
@@ -371,11 +371,9 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
     others = [name for name in moved if not own_name(name).startswith(OF_JOINTS)]
     foreign = [name for name in others if of_joint(name) or name in p.terms]
     if foreign:
-        raise InputError("the calibration", listed(foreign, 6), "origins and multipliers: a URDF holds nothing else")
-    parts: dict[str, Array] = {}
-    for prefix in {frame_of(name) for name in of if name.startswith(OF_JOINTS)}:
-        numbers = ("multiplier", "offset") if prefix.startswith(MIMIC) else FRAME
-        parts[prefix] = np.array([of.get(prefix + number, 0.0) for number in numbers])
+        raise InputError("the calibration", listed(foreign, 6), "origins: a URDF holds nothing else")
+    prefixes = {frame_of(name) for name in of if name.startswith(OF_JOINTS)}
+    parts = {prefix: np.array([of.get(prefix + axis, 0.0) for axis in FRAME]) for prefix in prefixes}
     write_origins(source, parts, target)
     frames = sorted({own_name(name).partition("_")[0] for name in others})
     return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []

@@ -58,7 +58,7 @@ def random_tree(seed: int) -> tuple[str, list[str]]:
 
 
 def with_errors(path: Path, target: Path, seed: int) -> None:
-    """Write the file with errors of 1 mm and 1 mrad in the origin of every joint that moves, and in multipliers."""
+    """Write the file with errors of 1 mm and 1 mrad in the origin of every joint that moves."""
     rng = np.random.default_rng([seed, 2])
     tree = ElementTree.parse(path)
     for joint in tree.getroot().findall("joint"):
@@ -69,9 +69,6 @@ def with_errors(path: Path, target: Path, seed: int) -> None:
         six = frame_numbers(numeric_frame(1e-3 * rng.normal(size=6)) @ numeric_frame(place))
         origin.set("xyz", text(six[:3]))
         origin.set("rpy", text(six[3:]))
-        mimic = joint.find("mimic")
-        if mimic is not None:
-            mimic.set("multiplier", repr(float(mimic.get("multiplier")) + 1e-3 * float(rng.normal())))
     tree.write(target)
 
 
@@ -116,8 +113,6 @@ def test_a_tree_is_calibrated_as_a_whole_and_written_into_one_file(
         ]
         Path(f"{name}.csv").write_text("\n".join(rows) + "\n")
         lines += [f"[chain.{name}]", f'urdf_base = "{base}"', f'urdf_tip = "{tip}"', f'identification = "{name}.csv"']
-        if any(term.startswith("mimic_") for term in arm.robot.model.names(arm.robot.joint_types)):
-            lines.append('identify = ["origin_*", "mimic_*"]')
     Path("problem.toml").write_text("\n".join(lines) + "\n")
 
     result = ro.load(".").calibrate()
@@ -322,13 +317,11 @@ def test_new_makes_a_tree_chain_by_chain(
         raw_table(side, "base", f"{side}_6", i)
         more = [*arms, "--data", f"{side}.csv", "--urdf-tip", f"{side}_6", "--chain", side]
         assert run(monkeypatch, "new", "cell", *more) == 0
-        text = Path("cell/problem.toml").read_text()
-        mimic = text.replace('identify = ["origin_*", ', 'identify = ["origin_*", "mimic_*", ')
-        Path("cell/problem.toml").write_text(mimic)
-    Path("cell/problem.toml").write_text(mimic.replace("shared = []", 'shared = ["base_*"]'))
+    text = Path("cell/problem.toml").read_text()
+    Path("cell/problem.toml").write_text(text.replace("shared = []", 'shared = ["base_*"]'))
     assert "shared" in capsys.readouterr().out
     parameters = ro.load("cell").problem.parameters
-    shown = {"left.mount_left_joint_6_x", "origin_torso_x", "left.mimic_left_joint_4_multiplier"}
+    shown = {"left.mount_left_joint_6_x", "origin_torso_x"}
     assert shown <= set(parameters.free.names)
     assert "base_x" in parameters.names
     assert run(monkeypatch, "calibrate", "cell", "--model", "geometry", "--out", "cell") == 0
@@ -350,22 +343,18 @@ def test_new_makes_a_tree_chain_by_chain(
     assert Path("cell/problem.toml").read_bytes() == before
 
 
-@pytest.mark.parametrize("chain", [False, True])
-def test_multipliers_of_joints_that_follow_are_identified(
-    chain: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As ratio of the table's row, or by the joint's name: the file's multiplier is what moved the joint."""
+def test_multipliers_of_joints_that_follow_are_identified(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As ratio of the table's row: the file's multiplier is what moved the joint."""
     monkeypatch.chdir(tmp_path)
     Path("arms.urdf").write_text(two_arms())
     Path("true.urdf").write_text(two_arms().replace("-0.5", "-0.49"))
     raw_table("left", "chest", "left_6", 3)
     options = ["--robot", "arms.urdf", "--data", "left.csv", "--urdf-base", "chest", "--urdf-tip", "left_6"]
-    assert run(monkeypatch, "new", "arm", *options, *(["--chain", "left"] if chain else [])) == 0
+    assert run(monkeypatch, "new", "arm", *options) == 0
     text = Path("arm/problem.toml").read_text()
-    wanted = '["mimic_*"]' if chain else '["ratio4"]'
     start = text.rindex("identify = ")
-    Path("arm/problem.toml").write_text(text[:start] + f"identify = {wanted}\n" + text[text.index("\n", start) :])
-    assert chain or "Joints 4 follow others" in text
+    Path("arm/problem.toml").write_text(text[:start] + 'identify = ["ratio4"]\n' + text[text.index("\n", start) :])
+    assert "Joints 4 follow others" in text
     assert run(monkeypatch, "calibrate", "arm", "--model", "geometry", "--out", "arm") == 0
     assert run(monkeypatch, "export", "arm", "--urdf", "arms.urdf", "--out", "new.urdf", *options[4:]) == 0
     assert off("left_6", "chest", "new.urdf") < 1e-4 < 1e-3 < off("left_6", "chest", "arms.urdf")
@@ -406,5 +395,5 @@ def test_what_a_urdf_does_not_hold_is_refused(tmp_path: Path, monkeypatch: pytes
     folder(monkeypatch, tmp_path, 'identify = ["origin_*", "ratio1"]')
     result = ro.calibrate(ro.load(".").problem, ro.tikhonov, weight=1.0)
     moved = replace(result, x=np.full(len(result.x), 1e-6))
-    with pytest.raises(ro.InputError, match=r"found left.ratio1, .*accepted: origins and multipliers"):
+    with pytest.raises(ro.InputError, match=r"found left.ratio1, .*accepted: origins"):
         ro.use.export_urdf(moved, "robot.urdf", "new.urdf", despite_verdict=True)

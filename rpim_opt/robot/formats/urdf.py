@@ -25,14 +25,12 @@ from rpim_opt.basics.exceptions import InputError, choices, of_file
 from rpim_opt.basics.files import read_bytes, write_bytes
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
-    MIMIC,
     MOUNT,
     ORIGIN,
     ROUNDING,
     Carried,
     Chain,
     Described,
-    Mimic,
     Origin,
     corrected,
     describe,
@@ -100,7 +98,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
         limits=np.array([urdf.joints[name].limits for name in way.names]),
         source=f"{Path(path).name}, {way.steps[0].start} to {way.steps[-1].end}",
         gravity=_masses(urdf, way, table, G).mounted("floor", (T_top_base @ T_base)[:3, :3]),
-        model=Model(_displacements(urdf, way, table, G) if origins else ()),
+        model=Model(_displacements(way, table, G) if origins else ()),
     )
     for name, i in zip(way.names, robot.leading, strict=True):
         joint = way.joints[i - origins]
@@ -151,7 +149,7 @@ def write_urdf(
     way = urdf.way(base, tip)
     table, T_base, T_tool, G = describe(way.chain)
     edits: dict[tuple[int, int], str] = {}
-    followers = urdf.followers().values()
+    followers = urdf.followers()
     for joint, old, new in zip(way.joints, way.joint_map, robot.joint_map, strict=False):
         if joint in followers and not np.array_equal(old, new):
             old[old != 0] = new[old != 0]  # the multiplier, and zeros
@@ -183,26 +181,19 @@ def write_urdf(
 
 @of_file
 def write_origins(source: str | Path, deviations: Mapping[str, Array], target: str | Path) -> None:
-    """Write a URDF file with displaced origins and other multipliers, every other byte as in the original.
+    """Write a URDF file with displaced origins, every other byte as in the original.
 
     ``deviations`` are six numbers each [m, rad], by the prefix of the parameters, ``origin_{joint}_``: x, y, z, roll,
-    pitch, yaw in the parent link's frame of what comes before the origin; of mimic joints, ``mimic_{joint}_``, two:
-    multiplier and offset. Prefixes that no joint has are refused.
+    pitch, yaw in the parent link's frame of what comes before the origin. Prefixes that no joint has are refused.
     """
     urdf = _read(Path(source))
     edits: dict[tuple[int, int], str] = {}
-    known = {**urdf.prefixes(), **urdf.followers()}
+    known = urdf.prefixes()
     for prefix, six in deviations.items():
         if prefix not in known:
             raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known))
-        joint = known[prefix]
-        if joint.mimic and prefix.startswith(MIMIC):
-            values = np.array(joint.mimic[1:]) + six
-            multiplier, offset = map(repr, values.tolist())
-            edits |= joint.edits(urdf.data, "mimic", {"multiplier": multiplier, "offset": offset})
-            continue
-        T = numeric_frame(six) @ joint.origin
-        edits |= joint.origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
+        T = numeric_frame(six) @ known[prefix].origin
+        edits |= known[prefix].origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
     write_bytes(Path(target), spliced(urdf.data, edits))
 
 
@@ -244,25 +235,19 @@ def _taker(part: Sequence[_Step]) -> int:
     return 0 if part and part[0].up and not part[-1].joint.kind else len(part) - 1
 
 
-def _displacements(urdf: _Urdf, way: _Way, table: Array, G: Array) -> list[Term]:
+def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
     """Return the terms of the origins of all joints that move, and of a fixed one where an end has no other."""
     terms = []
-    followers = {joint: prefix for prefix, joint in urdf.followers().items()}
     for row, part in enumerate(way.parts, start=1):
-        axis = numeric_link(beta=-table[row - 1, 4])
-        F = axis @ G[row - 1]
-        joint = way.joints[row - 2] if row > 1 else None  # the first row has none
-        mimics = (
-            [Mimic(followers[joint], joint.mimic[1], joint.kind, axis)] if joint in followers and joint.mimic else []
-        )
+        F = numeric_link(beta=-table[row - 1, 4]) @ G[row - 1]
         taker = _taker(part)
         origins = []
         for i, step in enumerate(part):
             before, F = F, F @ step.constant
             if step.joint.kind or i == taker:
                 origins.append(Origin(step.joint.prefix, F if step.up else before, step.up))
-        if origins or mimics:
-            terms.append(displaced(Carried(row, tuple(origins), tuple(mimics))))
+        if origins:
+            terms.append(displaced(Carried(row, tuple(origins))))
     return terms
 
 
@@ -335,7 +320,7 @@ class _Joint:
     @property
     def prefix(self) -> str:
         """Of the parameters of its origin: ``origin_torso_1_joint_``, of a fixed joint ``mount_..``."""
-        return f"{ORIGIN if self.kind else MOUNT}{_plain(self.name)}_"
+        return f"{ORIGIN if self.kind else MOUNT}{re.sub(r'[^0-9A-Za-z]+', '_', self.name)}_"
 
     @property
     def mimic(self) -> tuple[str, float, float] | None:
@@ -397,10 +382,6 @@ class _Joint:
         return edits
 
 
-def _plain(name: str) -> str:
-    return re.sub(r"[^0-9A-Za-z]+", "_", name)
-
-
 def _numbers(text: str, count: int, largest: float = LARGEST_NUMBER) -> Array | None:
     """Return the finite numbers of an attribute; None for other texts, or more or fewer of them."""
     numbers = np.array([numeral(part) for part in text.split()])
@@ -438,12 +419,12 @@ class _Urdf:
                 raise joint.error("name", found, "names that differ in letters or digits")
         return known
 
-    def followers(self) -> dict[str, _Joint]:
-        """Return the joints that follow one that moves on its own, and that none follows, by their prefixes."""
+    def followers(self) -> list[_Joint]:
+        """Return the joints that follow one that moves on its own, and that none follows."""
         mimics = {joint.name: joint.element.find("mimic") for joint in self.joints.values()}
         following = {name: mimic.get("joint", "") for name, mimic in mimics.items() if mimic is not None}
         ends = [name for name, led in following.items() if led not in following and name not in following.values()]
-        return {f"{MIMIC}{_plain(name)}_": self.joints[name] for name in ends}
+        return [self.joints[name] for name in ends]
 
     def steps_between(self, base: str | None, tip: str | None) -> list[_Step]:
         """Return the steps from link ``base`` to link ``tip``; by default from the root to the only leaf."""
