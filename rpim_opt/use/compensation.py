@@ -291,7 +291,10 @@ def compensate(
     whole["status"] = tuple(status.tolist())
     point = cell.point
     if targets.q is None:
-        point += " Targets without joint values may be reached in another arm configuration: state q1, ... beside them."
+        point += (
+            " Targets without joint values are looked for in the measured joint ranges first, and may be reached in "
+            "another arm configuration: state q1, ... beside them."
+        )
     found = Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=point, limit=limit
     )
@@ -542,11 +545,20 @@ class _Cell(NamedTuple):
         return found(every, best, attainable(self.nominal.at(best, load, poses)[2]))[0]
 
     def _starts(self, poses: Array, loads: int) -> Array:
-        """Return the nearest of many configurations within limits, or a turn, for every pose, (N, TRIALS, dof)."""
+        """Return configurations that come near every pose (N, 2 TRIALS, dof).
+
+        First those in the measured joint ranges, of the same elbow and wrist, then any within limits, or a turn.
+        """
         low, high = self.robot.limits.T
         low = np.where(np.isfinite(low), low, np.minimum(high, np.pi) - 2 * np.pi)
         high = np.where(np.isfinite(high), high, low + 2 * np.pi)
-        bank = random_candidates(replace(self.robot, limits=np.column_stack([low, high])), BANK)
+        q = np.vstack([block.q[:, 0] for block in self.problem.data.blocks])
+        ranges = (q.min(axis=0), q.max(axis=0)), (low, high)
+        return np.hstack([self._near(poses, loads, np.column_stack(limits)) for limits in ranges])
+
+    def _near(self, poses: Array, loads: int, limits: Array) -> Array:
+        """Return the nearest of many configurations within limits (dof, 2) for every pose, (N, TRIALS, dof)."""
+        bank = random_candidates(replace(self.robot, limits=limits), BANK)
         reached = self.nominal.at(bank, np.zeros((BANK, loads)), np.zeros((BANK, poses.shape[1])))[0]
         distance = scipy.spatial.distance.cdist(poses[:, :3], reached[:, :3], "sqeuclidean")
         if poses.shape[1] == 7:

@@ -266,6 +266,17 @@ def test_poses_are_reached_from_a_start_and_without_one() -> None:
     assert ok(ro.use.compensate(result, poses=poses[:, :3])).mean() > 0.98
 
 
+def test_poses_without_a_start_are_reached_in_the_arm_configuration_that_was_measured() -> None:
+    result, _ = limited()
+    middle = commands(ARM, 1, seed=5)[0]
+    q = middle + np.random.default_rng(1).uniform(-0.4, 0.4, (80, 6))
+    measured = ro.Dataset.of(q, reading(result, result.x, q)[:, :3], 1e-10)
+    result = replace(result, problem=result.problem.on(measured))
+    poses = nominal_poses(result, q[:30])
+    searched = ro.use.compensate(result, poses=poses)
+    assert np.abs(searched.nominal - q[:30]).max() < 1e-6  # of up to eight solutions
+
+
 def nominal_poses(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
     """Return the nominal poses (N, 7) of the identified tool in the robot's base."""
     return reading(result, frames_of(result, "tool_"), q)  # the simulated base is stated at the origin
