@@ -275,6 +275,20 @@ def _worse(result: Outcome) -> Iterator[str]:
         return
     if worse_than_nominal(nominal, identified):
         yield worse_sentence(nominal, identified)
+    elif rms(result.errors()) < rms(identified) and (moved := elsewhere(result, identified)):
+        yield moved
+
+
+def elsewhere(result: Outcome, error: Array) -> str:
+    """Say that most rows, of errors (N,) [m], are further off than any robot is by itself; empty if they are not."""
+    if not np.isfinite(error).any() or np.nanmedian(error) <= REACH * arm_length(result.problem):
+        return ""
+    return (
+        f"Median error on {len(error)} held-out rows {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's "
+        f"own errors stay below {100 * REACH:g} % of the arm's length. The instrument or the base may have moved "
+        "(`validate` and `accept` register such rows again with --register, as a table beside the folder), or these are "
+        "another robot's measurements."
+    )
 
 
 def _computed(result: Outcome) -> Iterator[str]:

@@ -10,11 +10,11 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
-from rpim_opt.basics.text import listed, table, three_digits
+from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import compared, displaced, registered, required_coverage
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import REACH, arm_length, misread, worse_sentence, worse_than_nominal
+from rpim_opt.calibration.verdict import elsewhere, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
@@ -168,17 +168,6 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         outside=result.outside(data),
         touched=touched,
         remarks=tuple(remarks),
-        mistake=misread(result, data) or moved or _elsewhere(result, held.error),
+        mistake=misread(result, data) or moved or elsewhere(result, held.error),
         no_intervals=result.no_intervals,
-    )
-
-
-def _elsewhere(result: Calibration, error: Array) -> str:
-    """Say that most rows are further off than any robot is by itself; empty if they are not."""
-    if not np.isfinite(error).any() or np.nanmedian(error) <= REACH * arm_length(result.problem):
-        return ""
-    return (
-        f"Median error {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's own errors stay below "
-        f"{100 * REACH:g} % of the arm's length. The instrument or the base may have moved (--register registers it "
-        "again), or these are another robot's measurements."
     )

@@ -56,6 +56,18 @@ def test_a_good_one_is_delivered_with_outliers_and_few_rows() -> None:
         assert ro.calibrate(each).verdict == ro.calibration.Verdict()
 
 
+def test_held_out_rows_that_no_robot_misses_so_far_are_a_reason() -> None:
+    """A tracker that moved before the second table: nominal and identified robot miss its rows alike."""
+    instance = ro.load("position")
+    block = instance.validation.blocks[0]
+    moved = replace(instance.validation, blocks=(replace(block, y=block.y + [0.0, 0.05, 0.0]),))
+    result = instance.calibrate()
+    verdict = replace(result, record=replace(result.record, validation=moved)).verdict
+    assert len(verdict.reasons) == 1
+    assert "held-out rows" in verdict.reasons[0]
+    assert "--register" in verdict.reasons[0]
+
+
 def test_joint_zeros_are_not_limited() -> None:
     """An arm whose zeros are 45 mrad off is as good as another."""
     problem = simulated_arm("irb120")
