@@ -376,7 +376,7 @@ def _limit(found: LackOfFit) -> str:
             f"{found.alike.z:.0f}): the model lacks an effect, which averaging more readings does not remove."
         )
     if found.robot > GROSS * found.instrument:
-        return "No robot has such poor repeatability: check units, signs, frames and rows first (`inspect`)."
+        return "No robot has such poor repeatability: check units, signs, frames and rows first."
     if found.robot > ROUGH * found.instrument:
         limit = "The robot, not the instrument, limits the result"
         if found.repeated is not None:

@@ -251,7 +251,7 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         warnings.append(better.sentence)
     else:
         warnings += exchanged_rows(problem)
-        warnings += first(moved_far(problem), shown_by_fit(whole))
+        warnings += first(part_way(problem), moved_far(problem), shown_by_fit(whole))
     return Inspection(
         problem=problem,
         residual=residual,
