@@ -257,6 +257,7 @@ HOSTILE = {
     "nan": (PLAIN.replace("0.5 0 0", "nan 0 0"), "'nan 0 0', accepted: 3 finite numbers"),
     "metres as no unit has them": (PLAIN.replace("0.5 0 0", "1e300 0 0"), "'1e300 0 0'"),
     "infinite": (PLAIN.replace("0.5 0 0", "1e999 0 0"), "'1e999 0 0'"),
+    "degrees": (PLAIN.replace("0.5 0 0", '0.5 0 0" rpy="-90 0 0'), r"'-90 0 0' \(degrees\?\), accepted: radians"),
     "two numbers": (PLAIN.replace("0.5 0 0", "0.5 0"), "'0.5 0', accepted: 3 finite numbers"),
     "comma": (PLAIN.replace("0.5 0 0", "0,5 0 0"), "'0,5 0 0'"),
     "underscore": (PLAIN.replace("0.5 0 0", "1_0 0 0"), "'1_0 0 0'"),

@@ -47,6 +47,7 @@ from rpim_opt.robot.terms import Model, Term
 EXPANDED = "what ROS's command makes of it: xacro arm.urdf.xacro > arm.urdf"
 DEEPEST = 100  # how deep elements may be nested
 LARGEST_NUMBER = 1e6  # size [m or rad] that no number of an origin or axis reaches
+TURN = math.tau + 1e-3  # angle of an origin [rad] that none exceeds; degrees mostly do
 KINDS = {"revolute": "revolute", "continuous": "revolute", "prismatic": "prismatic", "fixed": ""}
 ATTRIBUTE = re.compile(rb"([^\s=/<>\"']+)\s*=\s*(\"[^\"]*\"|'[^']*')")
 TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")  # a tag: quoted values may hold a '>'
@@ -336,8 +337,12 @@ class _Joint:
 
     @cached_property
     def origin(self) -> Array:
-        """Transform (4, 4) from the parent's frame to the joint's."""
-        return numeric_frame([*self._numbers("origin", "xyz", "0 0 0", 3), *self._numbers("origin", "rpy", "0 0 0", 3)])
+        """Transform (4, 4) from the parent's frame to the joint's; InputError for angles beyond a turn, in degrees."""
+        place, angles = (self._numbers("origin", attribute, "0 0 0", 3) for attribute in ("xyz", "rpy"))
+        if np.abs(angles).max() > TURN:
+            found = " ".join(f"{angle:g}" for angle in angles)
+            raise self.error("origin rpy", f"'{found}' (degrees?)", "radians, a turn at most")
+        return numeric_frame([*place, *angles])
 
     @property
     def axis(self) -> Array:
