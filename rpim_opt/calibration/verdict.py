@@ -286,7 +286,7 @@ def elsewhere(result: Outcome, error: Array) -> str:
     return (
         f"Median error on {len(error)} held-out rows {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's "
         f"own errors stay below {100 * REACH:g} % of the arm's length. The instrument or the base may have moved "
-        "(`validate` and `accept` register such rows again with --register, as a table beside the folder), or these are "
+        "(`validate` and `accept` register such rows with --register, as a table beside the folder), or these are "
         "another robot's measurements."
     )
 

@@ -60,7 +60,7 @@ def test_held_out_rows_that_no_robot_misses_so_far_are_a_reason() -> None:
     """A tracker that moved before the second table: nominal and identified robot miss its rows alike."""
     instance = ro.load("position")
     block = instance.validation.blocks[0]
-    moved = replace(instance.validation, blocks=(replace(block, y=block.y + [0.0, 0.05, 0.0]),))
+    moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([0.0, 0.05, 0.0])),))
     result = instance.calibrate()
     verdict = replace(result, record=replace(result.record, validation=moved)).verdict
     assert len(verdict.reasons) == 1
