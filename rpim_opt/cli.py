@@ -12,12 +12,14 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
 from importlib import import_module
+from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import typer
 from typer import Argument, Option
+from typer.core import TyperGroup
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
@@ -35,7 +37,44 @@ acceptance inconclusive.
 """
 
 
-app = typer.Typer(no_args_is_help=True, help=HELP, rich_markup_mode=None, pretty_exceptions_enable=False)
+OTHERS = "rpim_opt.commands"  # entry points that are commands of other packages
+PLAIN: Any = {"rich_markup_mode": None, "pretty_exceptions_enable": False}
+
+
+class Commands(TyperGroup):
+    """Our commands, then those of other packages, which are loaded where they are asked for."""
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """Return the names of the commands; of two with one name ours is meant."""
+        return list(dict.fromkeys([*super().list_commands(ctx), *sorted(entry_points(group=OTHERS).names)]))
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """Return the command of a name; one that cannot be loaded says so, and hides no other."""
+        others = () if cmd_name in self.commands else entry_points(group=OTHERS, name=cmd_name)
+        for each in others:
+            alone = typer.Typer(add_completion=False, **PLAIN)
+            try:
+                _add(alone, cmd_name, each.load())
+            except Exception as error:  # code of somebody else may raise anything
+                _add(alone, cmd_name, _failing(f"cannot be loaded: {str(error) or type(error).__name__}"))
+            self.commands[cmd_name] = typer.main.get_command(alone)
+        return super().get_command(ctx, cmd_name)
+
+
+def _add(to: typer.Typer, name: str, function: Callable[..., Any]) -> None:
+    """Add a command, which the list of commands shows with the whole first line of its docstring."""
+    to.command(name, short_help=(function.__doc__ or "").partition("\n\n")[0])(function)
+
+
+def _failing(text: str) -> Callable[[], None]:
+    def fail() -> None:
+        raise RpimError(f"The command {text}.")
+
+    fail.__doc__ = text
+    return fail
+
+
+app = typer.Typer(cls=Commands, no_args_is_help=True, help=HELP, **PLAIN)
 # click's, or typer's own copy, depending on typer's version
 USAGE: Any = next(c for c in typer.BadParameter.__mro__ if c.__name__ == "ClickException")
 INTERRUPTED = 130
@@ -206,8 +245,7 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
             raise typer.Exit(answer.code)
 
     vars(run)["__signature__"] = signature(run).replace(parameters=options)
-    first = (function.__doc__ or "").partition("\n\n")[0]  # whole in the list of commands, where typer would cut it
-    app.command(function.__name__, short_help=first)(run)
+    _add(app, function.__name__, run)
     return function
 
 
