@@ -174,17 +174,17 @@ def noise_test(squares: float, freedom: float, learned: bool = False, factor: fl
     ``learned``: the repeatability is known beside the noise; ``factor``: what is estimated on the stated noise.
     """
     if freedom < 1:
-        return NoiseTest(1.0, 1.0, "No degrees of freedom remain to test the stated measurement noise.")
+        return NoiseTest(1.0, 1.0, "No degrees of freedom remain to test the measurement noise.")
     ratio = float(np.sqrt(squares / freedom))
     upper = float(chdtrc(freedom, squares))
     probability = 2 * min(upper, 1 - upper)
     if probability >= UNLIKELY:
-        return NoiseTest(ratio, probability, f"Residuals agree with the stated measurement noise (ratio {ratio:.2f}).")
-    cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"
+        return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise (ratio {ratio:.2f}).")
+    cause = "the noise is larger than assumed, rows are wrong, or the model lacks an effect (backlash, compliance)"
     if upper >= 0.5:
-        cause = "the noise is stated too large"
+        cause = "the noise is smaller than assumed"
         if learned and factor == 1.0:
             cause += ' (--noise free, or repeatability = "free" in problem.toml, estimates it)'
     elif learned:
         cause = "the difference is the robot's repeatability, or an effect that the model lacks"
-    return NoiseTest(ratio, probability, f"Residuals are {ratio:.2f} times the stated measurement noise: {cause}.")
+    return NoiseTest(ratio, probability, f"Residuals are {ratio:.2f} times the measurement noise: {cause}.")

@@ -203,16 +203,16 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     share = size / arm_length(result.problem)
     for each, ratio_of in residuals.values():
         if each > COMPUTED_RMS and 0 < ratio_of < OVERSTATED:  # 0 where the dimension was not measured
-            yield f"Residuals are {ratio_of:.2g} times the stated noise: it is in another unit, or far too large."
+            yield f"Residuals are {ratio_of:.2g} times the measurement noise: it is in another unit, or far too large."
     if ratio > NOISY and share > REACH:
         yield (
-            f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the stated noise and "
+            f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the measurement noise and "
             f"{three_digits(100 * share)} % of the arm's length; a robot's own errors stay below {100 * REACH:g} %."
         )
     size, ratio = residuals["angle"]
     if ratio > NOISY and size > ANGULAR:
         yield (
-            f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the stated noise; a "
+            f"Residual RMS {three_digits(1e3 * size)} mrad: {three_digits(ratio)} times the measurement noise; a "
             f"robot's own errors stay below {1e3 * ANGULAR:g} mrad."
         )
 
@@ -307,7 +307,7 @@ def _computed(result: Outcome) -> Iterator[str]:
         rounding.append(0.0 if decimals is None else 1e-3 * 10.0**-decimals * np.sqrt(len(lengths) / 12))
     if nominal < COMPUTED_RMS and noise_ratio(problem, errors) < COMPUTED:
         yield (
-            f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, far below the stated noise: the "
+            f"The error of the nominal robot is {1e3 * nominal:.2g} mm RMS, far below the measurement noise: the "
             "data seem to be computed from this robot, not measured."
         )
     elif min(rounding) > 0 and nominal < ROUNDED * max(rounding):
@@ -386,14 +386,14 @@ def _large_residuals(result: Outcome, residuals: Mapping[str, tuple[float, float
     for dimension, (size, ratio) in residuals.items():
         unit, si = UNITS[dimension]
         if ratio > NOISY:
-            yield f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the stated noise"
+            yield f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the measurement noise"
     if result.learned is None or result.learned.curves is None:
         return
     size, ratio = result.learned.curves.size.value, result.noise_test().ratio
     if size > LARGEST_CURVE:
         yield f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)"
     if ratio > NOISY:
-        noise = f"{three_digits(ratio)} times the stated noise"
+        noise = f"{three_digits(ratio)} times the measurement noise"
         yield f"residuals {noise}, counting the degrees of freedom of transmission errors"
 
 
@@ -424,9 +424,9 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
     remedy = f"loosen its constraints ({joined(names)}) or use" if names else "use"
     return [
-        f"the formulation, not the robot, limits the fit: residuals are {three_digits(now)} times the stated noise, "
-        f"but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint; {remedy} a smaller "
-        "weight."
+        f"the formulation, not the robot, limits the fit: residuals are {three_digits(now)} times the measurement "
+        f"noise, but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint; {remedy} a "
+        "smaller weight."
     ]
 
 
@@ -519,8 +519,8 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
     ratio = max(noise_ratio(alone, alone.errors(x, each), each) for each in UNITS)
     if single and result.squared_loss and ratio <= NOISY:
         yield (
-            f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the stated noise. "
-            "They bias a squared loss: use formulation 'robust', or leave them out ([exclude])."
+            f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the measurement "
+            "noise. They bias a squared loss: use formulation 'robust', or leave them out ([exclude])."
         )
         return
     added = () if result.learned is None else result.learned.added

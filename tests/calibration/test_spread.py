@@ -60,9 +60,9 @@ def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
 @pytest.mark.parametrize(
     ("variance", "said"),
     [
-        (1.0, "agree with the stated"),
-        (0.3, "stated too large"),
-        (3.0, "times the stated measurement noise: the noise is larger"),
+        (1.0, "agree with the measurement"),
+        (0.3, "smaller than assumed"),
+        (3.0, "times the measurement noise: the noise is larger"),
     ],
 )
 def test_the_noise_is_judged_by_its_distribution(variance: float, said: str) -> None:
@@ -82,8 +82,8 @@ def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
     for tail in (0.005, 0.995):
         edge = chi2.ppf(tail, 40) / 40
         inner, outer = (edge * (1 + by * (0.5 - tail)) for by in (1e-6, -1e-6))
-        assert "agree with the stated measurement noise (" in stand_in(60, 20.0, inner).result.noise_test().verdict
-        assert "agree with the stated measurement noise (" not in stand_in(60, 20.0, outer).result.noise_test().verdict
+        assert "agree with the measurement noise (" in stand_in(60, 20.0, inner).result.noise_test().verdict
+        assert "agree with the measurement noise (" not in stand_in(60, 20.0, outer).result.noise_test().verdict
 
 
 @pytest.mark.parametrize(("left", "tells"), [(0.0, False), (0.9, False), (1.0, True), (1.5, True)])

@@ -214,9 +214,9 @@ def test_sessions_are_a_component_of_their_own_size() -> None:
         for found in (with_sessions.predict(q, columns=first), without.predict(q))
     ]
     assert error[0] < 3.5e-5 < 1e-4 < error[1]
-    assert "Residuals agree with the stated measurement noise" in str(with_sessions)
+    assert "Residuals agree with the measurement noise" in str(with_sessions)
     # tenths of a millimetre over 0.03 mm
-    assert re.search(r"Residuals are [3-6]\.\d+ times the stated measurement noise", str(without))
+    assert re.search(r"Residuals are [3-6]\.\d+ times the measurement noise", str(without))
     assert "noon_* evening_* night_*" in str(with_sessions)
 
 
