@@ -338,7 +338,8 @@ def _problem_text(arm: Described, kind: Measurement, rows: Dataset, chain: str, 
         touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
     known = {direction: word for word, direction in MOUNTINGS.items()}
     template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
-    template.filters |= {"toml": toml, "key": _key, "frame": _frame}
+    bare = re.compile(r"[\w-]+", re.ASCII)
+    template.filters |= {"toml": toml, "frame": _frame, "key": lambda k: k if bare.fullmatch(k) else toml(k)}
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         **context,
         chain=chain,
@@ -426,7 +427,3 @@ def _frame(place: Array) -> str:
         for name, number in zip(FRAME[part], numbers, strict=True):
             lines.append(f"{name}_{unit} = {round(number, 12) + 0.0!r}")
     return "\n".join(lines)
-
-
-def _key(text: str) -> str:
-    return text if re.fullmatch(r"[\w-]+", text, re.ASCII) else toml(text)

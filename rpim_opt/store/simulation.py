@@ -85,8 +85,6 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
         raise InputError("table simulation", "nothing", "seed, configurations, ...", definition.path)
     plan = validate(Simulation, definition.table.simulation, definition.path, "simulation")
     rng = np.random.default_rng(plan.seed if seed is None else seed)
-    if not np.isfinite(definition.robot.limits).all():
-        raise InputError("key limits", "a joint without limits", "limits for every joint", definition.path)
     taken: set[Path] = set()  # nothing else may have a table's name
     for each, role in product(definition.observations, ("identification", "validation")):
         file = getattr(each, role)
@@ -105,8 +103,9 @@ def simulate(name: str | Path, seed: int | None = None) -> Simulated:
     tables: dict[str, Columns] = {}
     blunders: list[str] = []
     for role, count in (("identification", plan.configurations), ("validation", plan.validation)):
-        # drawn where no table of that role is, too: other tables of the same seed stay as they are
-        q = random_candidates(definition.robot, 2 * count, rng, plan.joint_share)
+        with in_file(definition.path):
+            # drawn where no table of that role is, too: other tables of the same seed stay as they are
+            q = random_candidates(definition.robot, 2 * count, rng, plan.joint_share)
         for each, of in zip(definition.observations, fixtures, strict=True):
             file = getattr(each, role)
             markers = tuple(plan.markers.get(each.identification, definition.tools))
@@ -330,13 +329,11 @@ class _Table:
 
     def _on(self, square: PlaneTable, count: int) -> Array:
         """Return places (count, 3) [m] uniform on a square plane."""
-        normal = _unit(np.array(square.normal, dtype=float))
+        normal = np.array(square.normal, dtype=float)
+        normal /= np.linalg.norm(normal)
         axis = np.eye(3)[int(np.argmin(np.abs(normal)))]
-        first = _unit(axis - normal * np.sum(axis * normal))
+        first = axis - normal * np.sum(axis * normal)
+        first /= np.linalg.norm(first)
         second = np.cross(normal, first)
         places = square.size * (self.rng.uniform(size=(count, 2)) - 0.5)
         return np.array(square.at_mm) / 1e3 + places[:, :1] * first + places[:, 1:] * second
-
-
-def _unit(vector: Array) -> Array:
-    return np.asarray(vector / np.sqrt(np.sum(vector**2)), dtype=float)
