@@ -44,7 +44,6 @@ SHARED = (
 )
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
-FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
 UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
 
@@ -382,8 +381,6 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
         how = f"Guessed: the base was registered {offset:.1f} mm from the robot's own: data are in its frame."
         return arm.base, how
-    if np.linalg.norm(located[:3]) > FARTHEST:
-        verdict = "implausibly far away: are the units right?"
     how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
     down = -numeric_frame(located)[2, :3]
     if down @ arm.robot.gravity.direction < UPRIGHT and not kind.by_camera:
