@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 from tests.store.fresh_files import FRESH
-from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl
+from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, STRANGERS, krl
 from tests.store.raw_files import (
     HEAD,
     JOINTS,
