@@ -125,7 +125,6 @@ class Feature:
 
 
 CLOSE = 0.05  # touches that spread by less [m] do not show how large a robot is, whatever else is known
-ROUNDING = 1e-12  # relative size of a covariance that is none
 Features = Sequence[Feature]
 
 
@@ -280,42 +279,31 @@ class Touches:
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Features, stop: np.ndarray) -> list[Stack]:
-    """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops.
-
-    Equations of a configuration whose noise is independent of each other's come in several.
-    """
+    """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops."""
     mask = touches.kept(where)
     place = np.cumsum(mask) - 1
     noise = touches.noise(where)
     own = np.ones(touches.equations, dtype=bool)
     for tie in touches.ties:
         own[tie.equations] = False  # its touches vary, and not what is stated
-    by_size: dict[tuple[int, int], list[tuple[Array, ...]]] = {}
+    by_size: dict[tuple[int, ...], list[tuple[Array, ...]]] = {}
     for stack in stacks:
         for n, index in enumerate(stack.index):
-            rows = index[mask[index]]
+            kept = mask[index]
+            rows = index[kept]
+            if not len(rows):
+                continue
             W = noise[place[rows]][:, index].toarray()
-            instrument = W @ stack.instrument[n] @ W.T
-            unit = (W * (stack.length[n] & own[index])) @ W.T
             stops = np.unique(stop[index], return_inverse=True)[1]
             joint = np.zeros((len(index), stops.max() + 1, stack.joint.shape[2]))
             joint[np.arange(len(index)), stops] = stack.joint[n] * own[index, None]
             joint = W @ joint.reshape(len(index), -1)
             if joint.shape[1] > len(joint):  # as many columns as equations have the same J J'
                 joint = np.asarray(np.linalg.qr(joint.T, mode="r")).T
-            groups = np.zeros(len(rows), dtype=int)
-            if not joint.shape[1]:
-                related = (np.abs(instrument) > ROUNDING * np.abs(instrument).max(initial=0.0)) | (
-                    np.abs(unit) > ROUNDING
-                )
-                groups = scipy.sparse.csgraph.connected_components(related | np.eye(len(rows), dtype=bool))[1]
-            for group in np.unique(groups):
-                some = np.flatnonzero(groups == group)
-                both = np.ix_(some, some)
-                e = rows[some]
-                dimensions = (each[n][np.isin(index, e)] & own[e] for each in (stack.length, stack.angle))
-                each = (place[e], instrument[both], *dimensions, joint[some], unit[both])
-                by_size.setdefault((len(some), joint.shape[1]), []).append(each)
+            dimensions = (each[n][kept] & own[rows] for each in (stack.length, stack.angle))
+            unit = (W * (stack.length[n] & own[index])) @ W.T
+            each = (place[rows], W @ stack.instrument[n] @ W.T, *dimensions, joint, unit)
+            by_size.setdefault(joint.shape, []).append(each)
     return [Stack(*map(np.stack, zip(*same, strict=True))) for same in by_size.values()]
 
 

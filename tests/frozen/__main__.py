@@ -39,6 +39,7 @@ INTENDED = {
     "constrained:offsets": ("expanded", "std"),
     "blunders": ("expanded", "std"),
     "distance": ("std",),
+    "datum_cube": ("expanded",),  # 3e-6: what a drawing states of planes is no reading, and no longer counts as one
     # residuals are whitened in one way, which rounds differently: where a search for the weight, or for hyperparameters
     # (to 1e-3), ends follows
     "paper_arm": ("x", "weight", "objective", "std"),
