@@ -22,8 +22,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 MOST_ROWS = 300  # rows that are tried, evenly spread where there are more
-STEPS, FIRST_STEPS, MANY = 20, 8, 40
-"""Steps of a fit of base and reflectors, joint zeros too if they are free; of many first ones choose a quarter."""
+STEPS = 20  # of a fit of base and reflectors, joint zeros too if they are free
 FEWEST_ROWS = 6
 LONGEST = 3.0  # a reflector farther from the flange [m] is none
 LEVER = 0.3  # length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions
@@ -225,32 +224,20 @@ def misfit(points: Points) -> float:
 
 
 def misfits(tries: Sequence[Points], zeros: bool = True) -> Array:
-    """Return the same (B,) of many readings of a table, joint zeros fitted by default.
-
-    Of more than `MANY` the quarter that fits best after `FIRST_STEPS` is fitted to the end: only the best one counts.
-    """
+    """Return the same (B,) of many readings of a table, joint zeros fitted by default."""
     errors = np.full(len(tries), np.inf)
     kinds = [(id(points.robot), len(points.row)) for points in tries]
     for kind in dict.fromkeys(kinds):
-        some = np.flatnonzero([each == kind for each in kinds])
-        candidates = Candidates.of([tries[int(i)] for i in some])
-        extent = np.array([tries[int(i)].extent for i in some])
-        steps = STEPS
-        if len(some) > MANY:
-            fits = fit_arms(candidates, FIRST_STEPS, zeros=zeros, robust=True)
-            errors[some] = rms(fits) / extent
-            best = np.argsort(errors[some])[: max(MANY, len(some) // 4)]
-            candidates = candidates._replace(zero=fits.zero, tools=fits.tools).take(best)
-            some, extent, steps = some[best], extent[best], STEPS - FIRST_STEPS
-        errors[some] = rms(fit_arms(candidates, steps, zeros=zeros, robust=True)) / extent
+        some = [i for i, each in enumerate(kinds) if each == kind]
+        alike = [tries[i] for i in some]
+        fits = fit_arms(Candidates.of(alike), STEPS, zeros=zeros, robust=True)
+        errors[some] = rms(fits) / [points.extent for points in alike]
     return errors
 
 
 class _State(NamedTuple):
     """Candidates at one point: numbers of a candidate (B, ...), and of its points (..., B, NK) or rows (..., B, N)."""
 
-    zero: Array
-    tools: Array
     base: Array  # (B, 3, 3) from the instrument's frame to the robot's
     cost: Array
     offset: Array  # (B,) of lengths
@@ -260,14 +247,6 @@ class _State(NamedTuple):
     origins: Array  # (dof, 3, B, NK) of joints
     away: Array  # (3, B, N) from the points' mean, from the anchor, or from one point to the other
     residual: Array  # (3, B, N) or (1, B, N)
-
-    def where(self, better: np.ndarray, other: _State) -> _State:
-        """Return the other's candidates where they are better."""
-        each = []
-        for k, (mine, theirs) in enumerate(zip(self, other, strict=True)):
-            of_candidate = better.reshape(-1, *[1] * (mine.ndim - 1))
-            each.append(np.where(of_candidate if k < 5 else better[:, None], theirs, mine))
-        return _State(*each)
 
 
 def _registered(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Array, Array]:
@@ -295,6 +274,11 @@ def _anchored(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Ar
         return base, np.zeros(B), away, np.linalg.norm(away, axis=0) - y
     root = np.sqrt(weights)
 
+    def beside(anchor: Array, offset: Array) -> tuple[Array, Array, Array]:
+        away = points - anchor[..., None]
+        length = np.maximum(np.linalg.norm(away, axis=0), 1e-9)
+        return away, length, length + offset[:, None] - y[0]
+
     def least_squares(columns: Array, right: Array) -> Array:
         A = (columns * root).transpose(1, 0, 2)
         H = A @ A.transpose(0, 2, 1)
@@ -302,20 +286,11 @@ def _anchored(points: Array, y: Array, weights: Array) -> tuple[Array, Array, Ar
         return np.linalg.solve(H, A @ (right * root)[..., None])[..., 0].T
 
     start = least_squares(np.concatenate([2 * points, -2 * y, np.ones_like(y)]), (points**2).sum(axis=0) - y[0] ** 2)
-    anchor, offset = start[:3], start[3]
-
-    def beside(anchor: Array, offset: Array) -> tuple[Array, Array, Array]:
-        away = points - anchor[..., None]
-        length = np.maximum(np.linalg.norm(away, axis=0), 1e-9)
-        return away, length, length + offset[:, None] - y[0]
-
-    away, length, residual = beside(anchor, offset)
+    away, length, residual = beside(start[:3], start[3])
     step = least_squares(np.concatenate([away / length, -np.ones_like(y)]), residual)
-    finer = beside(anchor + step[:3], offset + step[3])
-    better = (weights * finer[2] ** 2).sum(axis=1) < (weights * residual**2).sum(axis=1)
-    away = np.where(better[:, None], finer[0], away)
-    residual = np.where(better[:, None], finer[2], residual)
-    return base, offset + better * step[3], away, residual[None]
+    anchor, offset = start[:3] + step[:3], start[3] + step[3]
+    away, _, residual = beside(anchor, offset)
+    return base, offset, away, residual[None]
 
 
 def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise: float) -> Fit:
@@ -326,57 +301,50 @@ def _fitted(candidates: Candidates, steps: int, zeros: bool, robust: bool, noise
     y = np.moveaxis(candidates.y, -1, 0)
     eliminated = _anchored if coordinates == 1 else _registered
 
-    def weighted(
-        weights: Array, zero: Array, tools: Array, points: Array, turn: Array, axes: Array, origins: Array
-    ) -> _State:
-        """Return the state of points whose kinematics are known."""
-        base, offset, away, residual = eliminated(points, y, weights)
-        off = tools - candidates.stated
-        cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
-        return _State(zero, tools, base, cost, offset, points, turn, axes, origins, away, residual)
-
-    def at(weights: Array, zero: Array, tools: Array) -> _State:
+    def at(zero: Array, tools: Array) -> _State:
         """Return the state at joint zeros (B, dof) and reflectors (B, M, 3)."""
         turn, p, axes, origins = _flange(candidates.robot, candidates.q + zero[:, None])
         tau = np.moveaxis(tools[np.arange(B)[:, None], candidates.marker], -1, 0)
         points = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
-        return weighted(weights, zero, tools, points, turn, axes, origins)
+        base, offset, away, residual = eliminated(points, y, weights)
+        off = tools - candidates.stated
+        cost = (weights * residual**2).sum(axis=(0, 2)) + (pull[:, None] * off**2).sum(axis=(1, 2))
+        return _State(base, cost, offset, points, turn, axes, origins, away, residual)
 
-    state = at(weights, candidates.zero, candidates.tools)
-    size = candidates.tools[0].size
-    columns = size + zeros * candidates.zero.shape[1]
+    zero, tools = candidates.zero, candidates.tools
+    size = tools[0].size
+    state = at(zero, tools)
     stalled = 0
     for k in range(steps):
         if robust and k % 2 == 0:
             error = np.linalg.norm(state.residual, axis=0)
             limit = FULL_WEIGHT * np.median(error, axis=1, keepdims=True) + 1e-12
             weights = np.minimum(1.0, limit / np.maximum(error, 1e-300))
-            kinematics = state.points, state.turn, state.axes, state.origins
-            state = weighted(weights, state.zero, state.tools, *kinematics)
-        step = _step(candidates, pull, weights, state, damping, zeros)
-        tools = state.tools + step[:, :size].reshape(state.tools.shape)
-        zero = state.zero
-        if zeros:
-            zero = zero + step[:, size:columns]
-        candidate = at(weights, zero, tools)
+            state = at(zero, tools)
+        step = _step(candidates, pull, weights, state, tools, damping, zeros)
+        other_tools = tools + step[:, :size].reshape(tools.shape)
+        other_zero = zero + step[:, size : size + zero.shape[1]] if zeros else zero
+        candidate = at(other_zero, other_tools)
         better = candidate.cost < state.cost
-        before = state.cost
+        fell = state.cost - candidate.cost > 1e-9 * state.cost
         damping = np.where(better, np.maximum(damping / 4, 1e-9), np.minimum(damping * 4, 1e6))
-        state = candidate if better.all() else state.where(better, candidate)
-        stalled = 0 if (before - state.cost > 1e-9 * before).any() else stalled + 1
+        zero = np.where(better[:, None], other_zero, zero)
+        tools = np.where(better[:, None, None], other_tools, tools)
+        state = candidate if better.all() else at(zero, tools)
+        stalled = 0 if fell.any() else stalled + 1
         if stalled == 5:
             break
     if coordinates == 1:
         modelled = candidates.y + np.moveaxis(state.residual, 0, -1)
         base = rigid(state.base, (state.away[..., 0] - state.points[..., 0]).T)
-        return Fit(modelled, np.abs(state.residual[0]), state.cost, base, state.tools, state.zero, state.offset)
+        return Fit(modelled, np.abs(state.residual[0]), state.cost, base, tools, zero, state.offset)
     turn = np.swapaxes(state.base, 1, 2)
     seen = np.einsum("bij,jbn->bni", turn, state.points)
     weight = weights / weights.sum(axis=1, keepdims=True)
     base = rigid(turn, np.einsum("bn,bni->bi", weight, candidates.y - seen))
     modelled = seen + base[:, None, :3, 3]
     error = np.linalg.norm(candidates.y - modelled, axis=2)
-    return Fit(modelled, error, state.cost, base, state.tools, state.zero, state.offset)
+    return Fit(modelled, error, state.cost, base, tools, zero, state.offset)
 
 
 def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
@@ -407,11 +375,13 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
     return np.stack([x, y, z]), p, axes, origins
 
 
-def _step(candidates: Candidates, pull: Array, weights: Array, state: _State, damping: Array, zeros: bool) -> Array:
+def _step(
+    candidates: Candidates, pull: Array, weights: Array, state: _State, tools: Array, damping: Array, zeros: bool
+) -> Array:
     """Return the damped Gauss-Newton steps (B, columns): reflectors, joint zeros, then what was eliminated."""
     B, N, coordinates = candidates.y.shape
     M = len(candidates.stated)
-    dof = state.zero.shape[1] if zeros else 0
+    dof = candidates.zero.shape[1] if zeros else 0
     turning = 3 * (coordinates == 3)
     J = np.zeros((B, 3 * M + dof + turning, 3, candidates.q.shape[1]))
     for m in range(M):
@@ -443,7 +413,7 @@ def _step(candidates: Candidates, pull: Array, weights: Array, state: _State, da
     g = (A @ r)[..., 0]
     at = np.arange(3 * M)
     H[:, at, at] += np.repeat(pull, 3)
-    g[:, at] += (pull[:, None] * (state.tools - candidates.stated)).reshape(B, -1)
+    g[:, at] += (pull[:, None] * (tools - candidates.stated)).reshape(B, -1)
     diagonal = np.einsum("bii->bi", H)
     largest = diagonal.max(axis=1, keepdims=True)
     extra = damping[:, None] * (diagonal + 1e-3 * largest) + 1e-12 * largest
