@@ -384,14 +384,11 @@ def filled_rows(data: Dataset) -> Iterator[str]:
 
     The data are in the order of the table.
     """
-    of_points = [block for block in data.blocks if block.y.shape[1] >= 3]
-    for kind in dict.fromkeys((block.robot, block.markers) for block in of_points):
-        blocks = [block for block in of_points if (block.robot, block.markers) == kind]
-        row, q, y = (
-            np.concatenate(each) for each in zip(*((b.row, b.q[:, 0], b.y[:, :3]) for b in blocks), strict=True)
-        )
-        order = np.argsort(row, kind="stable")
-        q, y, labels = q[order], y[order], np.array(data.label)[row[order]]
+    for block in data.blocks:
+        if block.y.shape[1] < 3:
+            continue
+        order = np.argsort(block.row)
+        q, y, labels = block.q[order, 0], block.y[order, :3], np.array(data.label)[block.row[order]]
         moves = np.linalg.norm(np.diff(y, axis=0), axis=1)
         middle = np.linalg.norm(y[1:-1] - (y[:-2] + y[2:]) / 2, axis=1) < EXACT
         between = labels[1:-1][middle & (np.minimum(moves[:-1], moves[1:]) > FILLED)].tolist()
@@ -754,16 +751,8 @@ class Addition(NamedTuple):
     largest: float = np.inf
 
 
-class Explained(NamedTuple):
-    """The addition that explains a residual best, by which coefficients, and which part of its norm is left."""
-
-    addition: Addition
-    coefficients: Array
-    left: float
-
-
-def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> Explained | None:
-    """Return which addition explains the residual of a model at x (n,) best.
+def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> tuple[float, Addition, Array] | None:
+    """Return which part of a model's residual at x (n,) is left, by which addition, with which coefficients (c,).
 
     Beside the parameters with their prior it must explain half of the sum of squares, more than chance does once in a
     million (F test, all additions counted): None where none does.
@@ -772,22 +761,22 @@ def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> E
     whole = float(r @ r)
     without = _without_parameters(model)
     rest = without(r[:, None])[:, 0]
-    tried: list[tuple[float, float, Explained]] = []  # by the variance that is left: of many columns against few
+    tried: list[tuple[float, float, Addition, Array]] = []  # by the variance that is left: of many columns against few
     for addition in additions:
         G = without(addition.columns)
         step = np.asarray(np.linalg.lstsq(G, rest, rcond=1e-9)[0], dtype=float)
         gain = float(rest @ rest - np.sum((rest - G @ step) ** 2))
         spare = max(len(model.A) - len(x) - len(step), 1)
-        left = float(np.sqrt(max(whole - gain, 1e-300) / max(whole, 1e-300)))
-        tried.append(((float(rest @ rest) - gain) / spare, gain, Explained(addition, step, left)))
+        tried.append(((float(rest @ rest) - gain) / spare, gain, addition, step))
     if not tried or not whole:
         return None
-    _, gain, best = min(tried, key=lambda each: each[0])
-    spare = max(len(model.A) - len(x) - len(best.coefficients), 1)
-    chance = fdtrc(len(best.coefficients), spare, gain / len(best.coefficients) / (max(whole - gain, 1e-300) / spare))
+    _, gain, addition, step = min(tried, key=lambda each: each[0])
+    spare = max(len(model.A) - len(x) - len(step), 1)
+    left = max(whole - gain, 1e-300)
+    chance = fdtrc(len(step), spare, gain / len(step) / (left / spare))
     if gain <= (1 - MOVED) * whole or chance * len(tried) >= RARE:
         return None
-    return best
+    return float(np.sqrt(left / whole)), addition, step
 
 
 def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
@@ -831,15 +820,17 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
     changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, least=3)
     several = _explained(model, x, changes)
-    if several is not None and (best is None or several.left < SEVERAL * best.left):
-        best = several
+    left = np.inf if best is None else best[0]
+    if several is not None and several[0] < SEVERAL * left:
+        best, left = several, several[0]
     kinds = _two_kinds(problem, x)
-    if kinds is not None and best is not None:  # what changed at a row is named by itself where that is enough
-        enough = MOVED if kinds.consecutive else kinds.left / MOVED
-        kinds = None if best.left <= enough else kinds
-    if kinds is None and best is not None and abs(best.coefficients[0]) <= best.addition.largest:
-        what, remedy = best.addition.said(best.coefficients)
-        yield f"{what} (that leaves {100 * best.left:.0f} % of the residuals): {remedy}."
+    # what changed at a row is named by itself where that is enough
+    if kinds is not None and left <= (MOVED if kinds.consecutive else kinds.left / MOVED):
+        kinds = None
+    if kinds is None and best is not None and abs(best[2][0]) <= best[1].largest:
+        _, addition, coefficients = best
+        what, remedy = addition.said(coefficients)
+        yield f"{what} (that leaves {100 * left:.0f} % of the residuals): {remedy}."
     elif kinds is not None or transmission:
         most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
@@ -1096,19 +1087,6 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
     remedy = "check the instrument's zero and the reflector's radius"
     offset = "measured distances are {} mm too long"
     yield Addition(along[:, [1]], lambda c: (offset.format(three_digits(1e3 * c[0])), remedy), SMALL)
-    if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
-        flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
-        radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
-        turn = np.column_stack([-y[:, 1], y[:, 0], np.zeros(len(y))])
-        rise = np.column_stack([-y[:, :2] * y[:, [2]] / np.maximum(flat, 1e-9), flat])
-        sines = np.hstack([y[:, :2] / np.maximum(flat, 1e-9), flat / radius, y[:, [2]] / radius])
-        parts = [rise, *(sines[:, [k]] * (turn if k < 2 else rise) for k in range(4))]
-        circles = np.column_stack([np.sum(of_axis * each, axis=1) for each in parts])
-        said = (
-            "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of its circles)"
-        )
-        remedy = "measure in both faces, and have it checked"
-        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), remedy), SMALL)
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is {{}} too long", "check its scale")
         if i != j:

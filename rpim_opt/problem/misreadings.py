@@ -6,7 +6,7 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial, reduce
 from itertools import combinations, permutations, product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -65,16 +65,17 @@ DEGREES_PER_MM = np.radians(1) / 1e-3  # radians that a metre stands for where m
 
 
 class Misreading(NamedTuple):
-    """Another interpretation: the mistake, the remedy, the resulting points, and equally good interpretations.
-
-    ``zeros``: whether joint zeros are fitted, which on another nominal robot they are not.
-    """
+    """Another interpretation: the mistake, the remedy, the resulting points, and equally good interpretations."""
 
     what: str
     remedy: str
     change: Callable[[Points], Points]
-    zeros: bool = True
     others: tuple[Misreading, ...] = ()
+
+
+MIRRORED = Misreading(
+    "the measured frame mirrored (left-handed)", "change the sign of one coordinate, or exchange two", mirrored
+)
 
 
 class Better(NamedTuple):
@@ -219,8 +220,7 @@ def _of_positions() -> Iterator[Misreading]:
         if zenith or unit:
             remedy = f"convert the angles to azimuth and elevation in degrees, and {remedy}"
         yield Misreading(what, remedy, partial(from_angles, degrees, zenith))
-    remedy = "change the sign of one coordinate, or exchange two"
-    yield Misreading("the measured frame mirrored (left-handed)", remedy, mirrored)
+    yield MIRRORED
 
 
 def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
@@ -230,8 +230,8 @@ def _scaled(what: str, remedy: str, factors: Array | float) -> Misreading:
 def _of_poses() -> Iterator[Misreading]:
     """Yield readings with other orientations."""
 
-    def turned(what: str, remedy: str, change: Callable[[Array], Array]) -> Misreading:
-        return Misreading(what, remedy, lambda of: of if of.turns is None else replace(of, turns=change(of.turns)))
+    def turned(what: str, remedy: str, change: Callable[[Any], Array]) -> Misreading:
+        return Misreading(what, remedy, lambda points: replace(points, turns=change(points.turns)))
 
     def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: float = 1.0) -> Callable[[Array], Array]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
@@ -372,35 +372,32 @@ def _orders(points: Points) -> Iterator[Misreading]:
 
 
 def _other_robots(points: Points) -> Iterator[Misreading]:
-    """Yield the table in the other Denavit-Hartenberg convention, and the ready robots with such joints."""
+    """Yield other readings of the Denavit-Hartenberg table, and the ready robots with such joints."""
     robot = points.robot
-
-    def read_as(what: str, remedy: str, other: Robot) -> Misreading:
-        return Misreading(what, remedy, lambda points: replace(points, robot=other), zeros=False)
-
-    for which, shift, end, remedy in (
-        ("standard (distal)", 1, 0, "move alpha and a of every row to the next row (the first row's are 0)"),
-        ("modified (proximal)", -1, -1, "move alpha and a of every row to the row before"),
-    ):
-        mdh = robot.mdh.copy()
-        mdh[:, :2] = np.roll(mdh[:, :2], shift, axis=0)
-        mdh[end, :2] = 0.0
-        what = f"a table in the {which} Denavit-Hartenberg convention"
-        yield read_as(what, remedy, replace(robot, mdh=mdh))
+    mdh = robot.mdh
+    links, still = mdh[:, :2], np.zeros((1, 2))
+    standard = np.hstack([np.vstack([still, links[:-1]]), mdh[:, 2:]])
+    modified = np.hstack([np.vstack([links[1:], still]), mdh[:, 2:]])
+    convention = "a table in the {} Denavit-Hartenberg convention"
+    distal, proximal = map(convention.format, ("standard (distal)", "modified (proximal)"))
+    tables = [
+        (distal, "move alpha and a of every row to the next row (the first row's are 0)", standard),
+        (proximal, "move alpha and a of every row to the row before", modified),
+        ("columns a and d of the DH table exchanged", "exchange them", mdh[:, [0, 3, 2, 1, 4]]),
+        ("alpha of the other sign in the DH table", "change the signs of alpha", mdh * [-1, 1, 1, 1, 1]),
+    ]
     for (k, column), (by, low, back) in product(((0, "alpha"), (1, "a"), (3, "d")), SLIPPED):
-        mdh = robot.mdh.copy()
-        mdh[:, k] = np.roll(mdh[:, k], -by)
-        remedy = f"move column {column} one row {back} in the DH table"
-        yield read_as(f"column {column} one row too {low} in the DH table", remedy, replace(robot, mdh=mdh))
-    for what, remedy, mdh in (
-        ("columns a and d of the DH table exchanged", "exchange them", robot.mdh[:, [0, 3, 2, 1, 4]]),
-        ("alpha of the other sign in the DH table", "change the signs of alpha", robot.mdh * [-1, 1, 1, 1, 1]),
-    ):
-        yield read_as(what, remedy, replace(robot, mdh=mdh))
+        slipped = mdh.copy()
+        slipped[:, k] = np.roll(mdh[:, k], -by)
+        what = f"column {column} one row too {low} in the DH table"
+        tables.append((what, f"move column {column} one row {back} in the DH table", slipped))
+    others = [(what, remedy, replace(robot, mdh=table)) for what, remedy, table in tables]
     for name in robots():
         ready = read_robot(READY / f"{name}.toml")
         if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
-            yield read_as(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready)
+            others.append((f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready))
+    for what, remedy, other in others:
+        yield Misreading(what, remedy, lambda points, other=other: replace(points, robot=other))
 
 
 # Which of these fits
@@ -446,7 +443,7 @@ def _of_mapping(mapping: JointMapping) -> Better:
     words = mapping.explanations
     remedy = WRITE
     if mapping.mirrored:
-        words = f"the measured frame mirrored (left-handed), or {words}"
+        words = f"{MIRRORED.what}, or {words}"
         remedy = (
             f"change the sign of one coordinate (or exchange two), or {remedy}; a known direction in the "
             "instrument's frame, up for instance, tells which"
@@ -458,7 +455,7 @@ def _mapping_behind(points: Points) -> Better | None:
     """Return signs and zeros of joints behind a mirrored frame, or behind a unit that makes the points as wide."""
     width = replace(points, y=forward_kinematics(points.robot, points.q)[:, :3, 3]).extent
     factor = min(LENGTHS, key=lambda each: abs(np.log(each * points.extent / width)))
-    behind = [Misreading("the measured frame mirrored (left-handed)", "change the sign of one coordinate", mirrored)]
+    behind = [MIRRORED]
     if abs(np.log(factor * points.extent / width)) < abs(np.log(points.extent / width)):
         behind.append(_scaled(f"measured lengths {LENGTHS[factor][0]}", LENGTHS[factor][1], factor))
     for each in behind:
@@ -549,8 +546,8 @@ def _best(points: Points, readings: list[Misreading]) -> tuple[list[Misreading],
 def _tried(points: Points, readings: Sequence[Misreading], most: int = FEW) -> Array:
     """Return how badly readings fit, from so many rows."""
     tries = [each.change(points).evenly(most) for each in readings]
-    zeros = np.array([each.zeros for each in readings], dtype=bool)
+    own = np.array([each.robot is points.robot for each in tries], dtype=bool)  # of another one zeros are not fitted
     errors = np.full(len(readings), np.inf)
-    for fitted in (True, False):
-        errors[zeros == fitted] = misfits([tries[i] for i in np.flatnonzero(zeros == fitted)], fitted)
+    for zeros in (True, False):
+        errors[own == zeros] = misfits([tries[i] for i in np.flatnonzero(own == zeros)], zeros)
     return errors
