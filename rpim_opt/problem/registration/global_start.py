@@ -167,6 +167,11 @@ def _turning(robot: Robot) -> np.ndarray:
     return np.array(robot.joint_types) == "revolute"
 
 
+def _one_reversed(n: int) -> Array:
+    """Return the signs (1 + n, n) of no joint reversed, and of each one."""
+    return np.vstack([np.ones(n), np.ones((n, n)) - 2 * np.eye(n)])
+
+
 def mapped(robot: Robot, sign: Array, zero: Array) -> Robot:
     """Return a robot whose joints are counted with signs (dof,) of the controller and zeros (dof,) of the model."""
     turning = _turning(robot)
@@ -208,11 +213,7 @@ def _anchor(problem: CalibrationProblem) -> list[str]:
 def explained(points: Points) -> bool:
     """Whether the nominal robot explains the points, apart from gross errors."""
     few = points.evenly(FEW)
-    candidates = Candidates.of([few])
-    # the registration alone tells it of most data, at a tenth of the cost
-    return any(
-        float(rms(fit_arms(candidates, steps, robust=True))[0]) <= UNEXPLAINED * few.extent for steps in (0, SHORT)
-    )
+    return bool(rms(fit_arms(Candidates.of([few]), SHORT, robust=True))[0] <= UNEXPLAINED * few.extent)
 
 
 def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapping) -> CalibrationProblem:
@@ -283,7 +284,7 @@ def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Arr
     zero = [np.zeros(n)]
     for i in np.flatnonzero(turning):
         zero += [angle * np.eye(n)[i] for angle in (QUARTER, -QUARTER, 2 * QUARTER)]
-    one = np.vstack([np.ones(n), np.ones((n, n)) - 2 * np.eye(n)])
+    one = _one_reversed(n)
     sign = np.vstack([signs, np.repeat(one, len(zero) - 1, axis=0)])
     return sign, np.vstack([np.zeros_like(signs), np.tile(zero[1:], (len(one), 1))])
 
@@ -358,24 +359,24 @@ def _judged(
     if plain[i][0] <= 2:  # as few changes as a mirror and a joint
         behind = [name for name in behind if name == AS_STATED]
     again = {plain[k]: k for k in alike[first] if plain[k][0] == plain[i][0] and plain[k] != plain[i]}
-    described_so = [Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof)) for _, k in sorted(again.items())]
-    found = JointMapping(robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others))
-    return replace(found, mirrored=AS_STATED in behind, behind=" or ".join(behind), same=tuple(described_so))
+    same_robot = [Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof)) for _, k in sorted(again.items())]
+    return JointMapping(
+        robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others),
+        mirrored=AS_STATED in behind, behind=" or ".join(behind), same=tuple(same_robot),
+    )  # fmt: skip
 
 
 def _behind_a_mirror(points: Points, largest: float) -> list[str]:
     """Return which joints, none or one reversed, explain a left-handed frame to ``largest`` [m]; none of lengths."""
     if points.lengths:
         return []
-    n = points.robot.dof
-    sign = np.vstack([np.ones(n), np.ones((n, n)) - 2 * np.eye(n)])
-    other = mirrored(points)
-    fits = fit_arms(
-        Candidates.of([replace(other, q=each * other.q) for each in sign]), LONG, zeros=True, noise=LEAST_NOISE
-    )
-    small = [np.abs(_gauged(points.robot, zero)).max() < NEAR_ZERO for zero in fits.zero]
+    robot, other = points.robot, mirrored(points)
+    sign = _one_reversed(robot.dof)
+    candidates = Candidates.of([replace(other, q=each * other.q) for each in sign])
+    fits = fit_arms(candidates, LONG, zeros=True, noise=LEAST_NOISE)
+    small = [np.abs(_gauged(robot, zero)).max() < NEAR_ZERO for zero in fits.zero]
     explained_so = np.flatnonzero(small & (rms(fits) < largest))
-    return [described(points.robot.joint_types, sign[k], np.zeros(n)) for k in explained_so]
+    return [described(robot.joint_types, sign[k], np.zeros(robot.dof)) for k in explained_so]
 
 
 def _apart(one: Array, other: Array, lengths: bool) -> float:
