@@ -82,10 +82,7 @@ def render(
     top: Iterable[Block],
     sections: Iterable[tuple[str, Iterable[Block]]],
 ) -> str:
-    """Return a page as HTML, with escaped texts and inline style, without scripts or external resources.
-
-    Pictures may stand in the page as data.
-    """
+    """Return a page as HTML, with escaped texts, inline style and pictures, without scripts or external resources."""
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")
     digest = base64.b64encode(sha256(style.encode()).digest()).decode()
     policy = f"default-src 'none'; img-src data:; style-src 'sha256-{digest}'"

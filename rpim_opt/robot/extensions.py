@@ -88,28 +88,24 @@ class Statics(Weight):
 
 @lru_cache(maxsize=64)
 def _function(joint_types: tuple[str, ...], gravity: Gravity) -> ca.Function:
-    """Build torques and slopes from the table, row by row, and from a row of joint values and payload."""
+    """Build torques and slopes from the table, row by row, and from joint values."""
     dof = len(joint_types)
     table, value = table_symbols(dof)
     q = ca.SX.sym("q", dof)
-    payload = ca.SX.sym("payload")
     nominal = value.__getitem__
-    statics = Statics(payload, joint_types=joint_types, q=ca.vertsplit(q), nominal=nominal, gravity=gravity)
+    statics = Statics(gravity.payload, joint_types=joint_types, q=ca.vertsplit(q), nominal=nominal, gravity=gravity)
     joints = range(1, dof + 1)
     torques = ca.vertcat(*(statics.torque(i) for i in joints))
     slopes = ca.vertcat(*(statics.moment(i, k, axis) for i in joints for k in joints for axis in AXES))
-    return ca.Function("statics", [table, ca.vertcat(q, payload)], [ca.densify(torques), ca.densify(slopes)])
+    return ca.Function("statics", [table, q], [ca.densify(torques), ca.densify(slopes)])
 
 
-def _evaluated(robot: Robot, q: Array, payload: float | Array | None) -> list[Array]:
-    q = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
-    if payload is None:
-        payload = robot.gravity.payload
-    rows = np.column_stack([q, np.broadcast_to(payload, len(q))])
+def _evaluated(robot: Robot, q: Array) -> list[Array]:
+    rows = np.atleast_2d(np.asarray(q, dtype=float)) @ robot.joint_map.T
     return call_rows(_function(robot.joint_types, robot.gravity), [robot.mdh.ravel()], rows)
 
 
-def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None) -> Array:
+def gravity_torques(robot: Robot, q: Array) -> Array:
     """Return the torques of gravity about the joints of the nominal arm.
 
     ::
@@ -118,9 +114,8 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
 
     Minus the slope of the potential energy: positive where gravity turns the joint the positive way.
 
-    At joint values q (N, dof) of the controller [rad or m]; ``payload`` is the mass at the flange [kg], one or (N,),
-    instead of that of the robot's `Gravity`. Returned are (N, dof) [Nm], about the axes of the table; zero for
-    prismatic joints.
+    At joint values q (N, dof) of the controller [rad or m], with the payload of the robot's `Gravity`. Returned are
+    (N, dof) [Nm], about the axes of the table; zero for prismatic joints.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -130,7 +125,7 @@ def gravity_torques(robot: Robot, q: Array, payload: float | Array | None = None
     >>> ro.robot.gravity_torques(arm, np.array([[0.0, 0.0]])).round(3)  # 1 kg at 0.6 m, and at 0.2 m
     array([[-5.884, -1.961]])
     """
-    return _evaluated(robot, q, payload)[0].reshape(-1, len(robot.mdh))
+    return _evaluated(robot, q)[0].reshape(-1, len(robot.mdh))
 
 
 def moment_slopes(robot: Robot, q: Array) -> Array:
@@ -139,7 +134,7 @@ def moment_slopes(robot: Robot, q: Array) -> Array:
     z_i . (R_k e_a x g_hat) of the nominal arm at q (N, dof) of the controller; zero for k < i and for prismatic joints.
     A joint's deflection is the sum of these times the parameters ``bend{i}_{k}{a}`` [rad].
     """
-    return _evaluated(robot, q, None)[1].reshape(-1, len(robot.mdh), len(robot.mdh), 3)
+    return _evaluated(robot, q)[1].reshape(-1, len(robot.mdh), len(robot.mdh), 3)
 
 
 # Parameters beyond the table

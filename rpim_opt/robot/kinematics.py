@@ -29,8 +29,7 @@ ZERO, ONE = ca.SX(0), ca.SX(1)
 """Made once: to make symbols of sixteen numbers takes longer than all the rest of a transform."""
 WIDTH = 256  # rows of one call: in the virtual machine their numbers stay in the processor's second cache
 SHARE = 16 * WIDTH  # rows that one thread evaluates before it takes more: enough to be worth handing over
-PAYS = 2_000
-"""Rows, at once or in all, from which a vectorized function pays: to build it takes as long as to evaluate them."""
+PAYS = 1_000  # rows from which a vectorized function pays: to build it takes as long as to evaluate twice as many
 
 
 def rotation_x(angle: Symbol) -> ca.SX:
@@ -210,14 +209,12 @@ def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
     """Evaluate a CasADi function of shared vectors and a row on every row (N, k) of a table, on all cores.
 
     Returned are its outputs, dense ones (r, c) as (N, c, r). CasADi's virtual machine spends most of its time between
-    operations: a function of scalars that is called often is rebuilt so that every operation is done on `WIDTH` rows
-    at once. Operations and their order stay, and with them every bit of the values.
+    operations: for many rows a function of scalars is rebuilt so that every operation is done on `WIDTH` of them at
+    once. Operations and their order stay, and with them every bit of the values.
     """
     results = [np.zeros((len(rows), *reversed(function.size_out(i)))) for i in range(function.n_out())]
     arguments = [np.ascontiguousarray(values, dtype=float) for values in (*shared, rows)]
-    evaluated = _evaluated(function)
-    evaluated[0] += len(rows)
-    vectorized = _vectorized(function) if evaluated[0] >= PAYS and len(rows) >= WIDTH else None
+    vectorized = _vectorized(function) if len(rows) >= PAYS else None
 
     def evaluate(begin: int) -> None:
         buffers: dict[int, Any] = {}
@@ -238,12 +235,6 @@ def call_rows(function: ca.Function, shared: Sequence[Array], rows: Array) -> li
 
     on_all_cores(evaluate, range(0, len(rows), SHARE))
     return results
-
-
-@lru_cache(maxsize=256)
-def _evaluated(_: ca.Function) -> list[int]:
-    """Return a list with the number of rows at which a function was evaluated, to be counted up."""
-    return [0]
 
 
 @lru_cache(maxsize=512)

@@ -212,10 +212,7 @@ class Method:
 
 
 def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mapping[str, Any]) -> dict[str, Method]:
-    """Return every formulation with every selector, then the functions; InputError for unknown or repeated names.
-
-    A formulation without penalty has no weight: it is there once.
-    """
+    """Return every formulation with every selector, then the functions; InputError for unknown or repeated names."""
     methods: list[tuple[str, Method]] = []
     weights = [_weight(label, each) for label, each in listed(selectors)]
     for own_name, each in listed(formulations):

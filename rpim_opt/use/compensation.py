@@ -326,10 +326,7 @@ def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
 def tool_uncertainty(
     result: Calibration, q: Array, tool: Sequence[float] | Array | None = None, marker: str = ""
 ) -> tuple[Array, Array]:
-    """Return the standard uncertainties (N,) of position [m] and orientation [rad] of the tool at commands q (N, dof).
-
-    In the instrument's frame, as ``std`` and ``orientation_std`` of a `Compensation`; arguments as for `compensate`.
-    """
+    """Return ``std`` and ``orientation_std`` of a `Compensation` (N,) at commands q (N, dof)."""
     cell = _Cell.of(result, "", result.problem.robot, pose, tool, marker, False, False)
     return cell.uncertainty(q, None, None)
 
@@ -373,11 +370,7 @@ def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> 
 def _tooled(
     result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str
 ) -> tuple[Parameters, Array, Array | None, str, str]:
-    """Return a robot's parameters with the tool, deviations (p,), covariance, reflector, and which point is moved.
-
-    A stated tool takes the place of the first reflector; a reflector is as identified. The covariance is that of the
-    identified parameters.
-    """
+    """Return a robot's parameters with the tool, deviations (p,), their covariance, reflector, and the point moved."""
     whole = result.problem.parameters
     places = whole.places_of(robot)
     p = whole.of_robot(robot)
@@ -415,25 +408,20 @@ def _tooled(
 
 
 class _Cell(NamedTuple):
-    """The controller's robot, the identified one, and the uncertainty of where that is.
-
-    ``problem`` has the robot's data, ``x`` are the deviations (n,) of its identified parameters and ``covariance``
-    theirs; ``noise`` is the covariance (k, k) [SI] of a reading, ``level`` the noise's variance over it, and ``point``
-    a sentence on the point that is moved.
-    """
+    """The controller's robot, the identified one, and the uncertainty of where that is."""
 
     robot: Robot
     kind: Measurement
     nominal: Arm
     identified: Arm
     loads: Loads
-    problem: CalibrationProblem
-    x: Array
-    covariance: Array | None
+    problem: CalibrationProblem  # with the robot's data
+    x: Array  # deviations (n,) of its identified parameters
+    covariance: Array | None  # of x
     marker: str
-    noise: Array
-    level: float
-    point: str
+    noise: Array  # covariance (k, k) [SI] of a reading
+    level: float  # the noise's variance over that
+    point: str  # sentence on the point that is moved
 
     @classmethod
     def of(

@@ -22,12 +22,9 @@ MAX_ITERATIONS = 50
 
 
 class Arm(NamedTuple):
-    """A robot with all its parameters known.
+    """A robot with all its parameters known."""
 
-    ``function`` maps model joint values, loads (`Loads`) and target, side by side, to the pose, its error and J'.
-    """
-
-    function: ca.Function
+    function: ca.Function  # of model joint values, loads (`Loads`) and target, side by side: pose, its error, and J'
     joint_map: Array
 
     @classmethod
@@ -123,11 +120,7 @@ def nearest(
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """Return steps d (N, n) that minimize d'Hd/2 - g'd within low <= 0 <= high, nearly.
-
-    Entries at a bound that the gradient pushes out stay; those that leave the box are set on its border and the others
-    solved for again, until none leaves. The next step's gradient decides which bounds are active.
-    """
+    """Return steps d (N, n) that minimize d'Hd/2 - g'd within low <= 0 <= high, nearly: the next ones mend bounds."""
     n = g.shape[1]
     free = ~(((low >= 0) & (g < 0)) | ((high <= 0) & (g > 0)))
     step = np.zeros_like(g)

@@ -33,15 +33,12 @@ HIGHEST_LIMIT = 50.0
 
 
 class Drift(NamedTuple):
-    """A change during checks: its cause, the first check after it, whether it is steady from the first to the last.
-
-    ``moved`` is by how much a single parameter moved in all; None for a frame.
-    """
+    """A change during checks."""
 
     cause: recalibration.Cause
-    first: int
-    steady: bool
-    moved: recalibration.Moved | None
+    first: int  # check after it
+    steady: bool  # from the first check to the last
+    moved: recalibration.Moved | None  # by how much a single parameter moved in all; None for a frame
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
@@ -247,10 +244,7 @@ def cusum(deviate: Array) -> Array:
 
 
 def cusum_limit(count: int, level: float) -> float:
-    """Return the limit that sums of so many independent standard normal deviates exceed with probability ``level``.
-
-    By Brook and Evans' Markov chain (1972).
-    """
+    """Return what sums of so many normal deviates exceed with probability ``level`` (Brook and Evans 1972)."""
 
     def alarms(limit: float) -> float:
         """Return by how much the probability of an alarm exceeds the level."""

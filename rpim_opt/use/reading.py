@@ -30,16 +30,13 @@ from rpim_opt.store.raw import Understanding, rows_of, understand_of
 
 
 class Targets(NamedTuple):
-    """Rows of a table: labels; joint values (N, dof), poses (N, 7) or positions (N, 3), torques, payloads, or None.
-
-    Torques are (N, dof), payloads (N,).
-    """
+    """Rows of a table; None for what it does not have."""
 
     label: tuple[str, ...]
-    q: Array | None
-    poses: Array | None
-    torque: Array | None
-    payload: Array | None = None
+    q: Array | None  # (N, dof)
+    poses: Array | None  # (N, 7), or positions (N, 3)
+    torque: Array | None  # (N, dof)
+    payload: Array | None = None  # (N,)
 
 
 def read_targets(
@@ -94,15 +91,12 @@ def read_targets(
 
 
 class Measured(NamedTuple):
-    """Measurements of tables: rows, columns left out, how tables were joined, what was left out, the column of times.
-
-    ``clock`` is that column's name and cells, the first that is called time, timestamp or date; None without one.
-    """
+    """Measurements of tables: rows, columns left out, how tables were joined and what was left out."""
 
     data: Dataset
     left_out: tuple[str, ...]
     notes: tuple[str, ...]
-    clock: tuple[str, tuple[str, ...]] | None
+    clock: tuple[str, tuple[str, ...]] | None  # name and cells of the column called time, timestamp or date
 
     @property
     def when(self) -> Array | None:

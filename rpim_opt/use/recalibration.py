@@ -66,18 +66,14 @@ class Fit(NamedTuple):
 
 
 class Cause(NamedTuple):
-    """A change that may explain the deviation of readings from their predictions.
-
-    Its name, kind (``joint offset``, ``parameter``, ``frame``, ``reading``), parameters or rows; by how much
-    chi-squared falls with it, the p-value of that where nothing changed, and the posterior probability.
-    """
+    """A change that may explain the deviation of readings from their predictions."""
 
     name: str
-    kind: str
-    members: tuple[str, ...]
-    gain: float = 0.0
-    p_value: float = 1.0
-    probability: float = 0.0
+    kind: str  # joint offset, parameter, frame, reading
+    members: tuple[str, ...]  # parameters, or rows
+    gain: float = 0.0  # by which chi-squared falls
+    p_value: float = 1.0  # of that where nothing changed
+    probability: float = 0.0  # posterior
 
 
 class Moved(NamedTuple):
@@ -280,10 +276,8 @@ def update(
 
 
 def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
-    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else.
-
-    Evidence is linear in the deviations: of a base that turned far, it is none.
-    """
+    """Say where the base is and was, if readings that are displaced together put it out of its place; empty else."""
+    # evidence is linear in the deviations: of a base that turned far, it is none
     base = [name for name in problem.parameters.free.names if name.startswith(BASE)]
     if not base or not displaced(result, problem.data, compared(result, problem.data))[0]:
         return ""
@@ -436,10 +430,7 @@ def candidates(free: Parameters, reset: Sequence[str] = ()) -> list[Cause]:
 
 
 def _weighed(result: Calibration, updated: Calibration, released: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:
-    """Return all causes with their evidence, the most probable first, and how well readings and prior fit.
-
-    Kinds of causes are as likely as each other before the readings, and so are the causes of a kind.
-    """
+    """Return all causes with their evidence, the most probable first, and how well readings and prior fit."""
     model = updated.program.model
     free = updated.problem.parameters.free
     prior = updated.program.penalty_form or identity(len(updated.x))
@@ -461,7 +452,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
         change = misfit.projected(equations, np.eye(len(equations)))
         causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
         logs.append(_log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
-    kinds = [cause.kind for cause in causes]
+    kinds = [cause.kind for cause in causes]  # each as likely before the readings, and so are the causes of a kind
     share = (1 - UNCHANGED) / len(set(kinds))
     posterior = np.array(logs) + np.log([share / kinds.count(kind) for kind in kinds])
     whole = logsumexp([np.log(UNCHANGED), *posterior])

@@ -202,33 +202,25 @@ def write_origins(source: str | Path, deviations: Mapping[str, Array], target: s
 
 
 class _Step(NamedTuple):
-    """A joint on the way between two links, passed down the tree or up, where its motion and origin are inverted.
-
-    ``constant`` is the transform (4, 4) of its origin: before its motion, or after it where it is passed up.
-    """
+    """A joint on the way between two links, passed down the tree or up, where its motion and origin are inverted."""
 
     joint: _Joint
     up: bool
     start: str
     end: str
-    constant: Array
+    constant: Array  # transform (4, 4) of its origin: before its motion, or after it where it is passed up
 
 
 class _Way(NamedTuple):
-    """The steps from one link to another, and the n joints that move.
-
-    ``parts`` are the steps whose origins stand before the first motion, between the motions and after the last one,
-    ``chain`` is the geometry; ``names`` are k joints that these follow, by the ``joint_map`` (n, k) and ``offsets``
-    (n, 5) of theta and d: a mimic joint is at multiplier times the followed joint's value plus offset.
-    """
+    """The steps from one link to another, and the n joints that move."""
 
     steps: Sequence[_Step]
-    parts: list[list[_Step]]
+    parts: list[list[_Step]]  # whose origins stand before the first motion, between the motions and after the last one
     chain: Chain
     joints: list[_Joint]
-    names: tuple[str, ...]
-    joint_map: Array
-    offsets: Array
+    names: tuple[str, ...]  # of the k joints that these follow
+    joint_map: Array  # (n, k)
+    offsets: Array  # (n, 5) of theta and d: a mimic joint is at multiplier times the followed joint's value plus offset
 
 
 def _taker(part: Sequence[_Step]) -> int:
