@@ -683,7 +683,7 @@ def compare(
     """
     from rpim_opt.study.methods import USUAL
 
-    journal = None if out is None else out / "replicates.sqlite"
+    journal = None if out is None else out / "replicates.jsonl"
     words, numbers = console.listed_words, console.listed_numbers
     comparison = ro.compare(
         problems, words(formulations), numbers(selector), methods=words(methods), splits=numbers(splits),

@@ -10,13 +10,12 @@ import os
 import pickle
 import platform
 import signal
-import sqlite3
 import subprocess
 import sys
 import sysconfig
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import BrokenExecutor
-from contextlib import closing, contextmanager, suppress
+from contextlib import suppress
 from dataclasses import dataclass, field, fields, is_dataclass
 from datetime import UTC, datetime
 from functools import lru_cache, partial
@@ -27,7 +26,7 @@ from types import ModuleType
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError, choices
-from rpim_opt.basics.files import LARGEST_DATA, json_text, read_json, refused, require_file, sha256_of, write_files
+from rpim_opt.basics.files import LARGEST_DATA, json_text, read_bytes, read_json, refused, require_file, write_files
 from rpim_opt.basics.tables import library
 from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
@@ -75,12 +74,6 @@ PACKAGE = Path(__file__).resolve().parents[1]
 LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
 """Where Python files lie that the versions of packages stand for."""
 SHORT = 12  # digits of a digest that a reader compares by eye
-SCHEMA = """
-BEGIN IMMEDIATE;
-CREATE TABLE IF NOT EXISTS code (part TEXT PRIMARY KEY, digest TEXT);
-CREATE TABLE IF NOT EXISTS replicates (key TEXT PRIMARY KEY, found TEXT);
-COMMIT;
-"""
 
 
 # --- where a study is ------------------------------------------------------------------------------------------------
@@ -232,7 +225,7 @@ def run_study(
     files = files_of(path, study)
     made = made_by(path, quick, len(cases), files)  # of what is here now, whatever becomes of it meanwhile
     code = {**{f"file {file}": digest for file, digest in files.items()}, **package_code()}
-    journal = folder / f"{REPLICATES}.sqlite"
+    journal = folder / f"{REPLICATES}.jsonl"
     rows = run_cases(cases, lambda case: partial(_run, path, case), workers, progress, journal, code, resume)
     report = study.report(rows)
     columns = list(dict.fromkeys(key for row in rows for key in row))
@@ -240,7 +233,8 @@ def run_study(
     stream = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
     write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})
-    remove_journal(journal)
+    with refused(journal):
+        journal.unlink()
     return report, folder
 
 
@@ -307,38 +301,34 @@ def run_cases(
     """
     keyed = [(json.dumps(case, sort_keys=True), case) for case in cases]
     code = code or {}
-    if journal is not None and (journal.exists() or journal.is_symlink()):
-        if resume is False:
-            remove_journal(journal)
-        else:
-            require_file(journal, LARGEST_DATA)
-    with _sentence(journal):
-        base = sqlite3.connect(journal or ":memory:", isolation_level=None)
-    with closing(base):
-        with _sentence(journal):
-            base.execute("PRAGMA trusted_schema = OFF")
-            base.executescript(SCHEMA)
-            stored = _resumed(base, journal, code, resume)
-        done = {key: stored[key] for key, _ in keyed if key in stored}
+    stored = {} if journal is None or resume is False else _resumed(journal, code, resume)
+    done = {key: stored[key] for key, _ in keyed if key in stored}
+    if journal is not None:  # anew: without a line that was not finished
+        lines = "".join(f"{json.dumps(line)}\n" for line in {"code": code, **stored}.items())
+        with refused(journal):
+            write_files({journal: lines.encode()})
+    with Path(journal or os.devnull).open("ab", buffering=0) as stream:
         progress(len(done), len(cases))
         tasks = [(key, work(case)) for key, case in keyed if key not in done]
         for key, row in compute(tasks, workers):
-            with _sentence(journal):
-                base.execute("INSERT INTO replicates VALUES (?, ?)", (key, json.dumps(row)))
+            with refused(journal):
+                stream.write(f"{json.dumps([key, row])}\n".encode())
             done[key] = row
             progress(len(done), len(cases))
     return [{**case, **done[key]} for key, case in keyed]
 
 
-def _resumed(
-    base: sqlite3.Connection, path: Path | None, code: Mapping[str, str], resume: bool | None
-) -> dict[str, Row]:
+def _resumed(path: Path, code: Mapping[str, str], resume: bool | None) -> dict[str, Row]:
     """Return the replicates of an interrupted run by their keys; refuse those of other code."""
-    known = dict(base.execute("SELECT part, digest FROM code"))
-    stored = base.execute("SELECT key, found FROM replicates").fetchall()
+    if not (path.exists() or path.is_symlink()):
+        return {}
+    content = read_bytes(path, LARGEST_DATA)
+    try:  # of the lines that were finished
+        stored = dict(json.loads(line) for line in content[: content.rfind(b"\n") + 1 or None].splitlines())
+    except (TypeError, ValueError):
+        raise InputError("the file", "no journal of replicates", "--no-resume to start again", path) from None
+    known = stored.pop("code", {})
     if not stored:
-        base.execute("DELETE FROM code")
-        base.executemany("INSERT INTO code VALUES (?, ?)", list(code.items()))
         return {}
     if resume is None:
         accepted = "--resume to continue with them, or --no-resume to start again"
@@ -347,23 +337,7 @@ def _resumed(
         if code.get(part) != known.get(part):
             accepted = "the same code, data and versions, or --no-resume to start again"
             raise InputError("resume", f"replicates of another {part}", accepted, path)
-    return {key: json.loads(text) for key, text in stored}
-
-
-@contextmanager
-def _sentence(path: Path | None) -> Iterator[None]:
-    """Turn an error of the database, or of a text in it, into a sentence."""
-    try:
-        yield
-    except (sqlite3.Error, ValueError) as error:
-        raise RpimError(f"{path}: the journal cannot be read or written: {error}.") from None
-
-
-def remove_journal(path: Path) -> None:
-    """Remove a journal, and the auxiliary file that an interrupted process may leave."""
-    with refused(path):
-        path.unlink(missing_ok=True)
-        path.with_name(f"{path.name}-journal").unlink(missing_ok=True)
+    return stored
 
 
 def compute(tasks: Sequence[tuple[str, Work]], workers: int) -> Iterator[tuple[str, Row]]:
@@ -417,7 +391,7 @@ def versions() -> str:
 
 def file_state(path: Path) -> str:
     """Return a file's name with its digest and its commit."""
-    return f"{path.name} with SHA-256 {sha256_of(path)[:SHORT]} ({commit(path)})"
+    return f"{path.name} with SHA-256 {sha256(path.read_bytes()).hexdigest()[:SHORT]} ({commit(path)})"
 
 
 def package_state() -> str:
@@ -466,7 +440,7 @@ def script_code() -> dict[str, str]:
         file = Path(getattr(module, "__file__", None) or "")
         own = PACKAGE not in file.parents and not any(folder in file.resolve().parents for folder in LIBRARIES)
         if file.suffix == ".py" and own and file.is_file():
-            codes[f"file {file.name} ({module.__name__})"] = sha256_of(file)
+            codes[f"file {file.name} ({module.__name__})"] = sha256(file.read_bytes()).hexdigest()
             if module.__name__ == "__main__":
                 codes["set of arguments of the script"] = repr(sys.argv[1:])
     return codes

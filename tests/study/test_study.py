@@ -5,9 +5,7 @@ from __future__ import annotations
 import json
 import os
 import signal
-import sqlite3
 import subprocess
-from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -99,10 +97,9 @@ def test_results_do_not_depend_on_the_workers(toy, tmp_path: Path) -> None:
         assert part in text
 
 
-def entries(journal: Path) -> list[tuple[str, str]]:
+def entries(journal: Path) -> list[tuple[str, dict]]:
     """Return what a journal holds of replicates."""
-    with closing(sqlite3.connect(journal)) as base:
-        return base.execute("SELECT key, found FROM replicates").fetchall()
+    return [json.loads(line) for line in journal.read_text().splitlines()[1:]]
 
 
 def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
@@ -110,7 +107,7 @@ def test_a_killed_study_resumes_and_loses_nothing(toy, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out)
-    journal = out / "replicates.sqlite"
+    journal = out / "replicates.jsonl"
     assert len(entries(journal)) == 3
     with pytest.raises(ro.InputError, match="resume: found 3 replicates of an interrupted run"):
         run_study("toy", out=out)  # nobody has said that they may be dropped
@@ -228,29 +225,23 @@ def interrupted(toy, out: Path) -> Path:
     with pytest.raises(KeyboardInterrupt):
         run_study("toy", out=out)
     toy(stop=False)
-    return out / "replicates.sqlite"
+    return out / "replicates.jsonl"
 
 
-def change(journal: Path, statement: str) -> None:
-    with closing(sqlite3.connect(journal, isolation_level=None)) as base:
-        base.executescript(statement)
+def test_a_full_disk_below_a_journal_is_a_sentence(toy, tmp_path: Path) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    journal.unlink()
+    journal.symlink_to("/dev/full")
+    with pytest.raises(RpimError, match=r"replicates.jsonl: cannot be written: .*No space left"):
+        run_study("toy", out=tmp_path / "out", resume=False)
 
 
-def test_a_full_disk_below_a_journal_is_a_sentence(toy, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """And what was finished before it is resumed."""
-    toy()
-    real = studies.SCHEMA
-    monkeypatch.setattr(studies, "SCHEMA", f"{real}\nPRAGMA max_page_count = 5;")
-    path = tmp_path / "studies" / "toy.py"
-    path.write_text(path.read_text().replace('    return {"value"', '    return {"long": 3000 * "x", "value"'))
-    with pytest.raises(RpimError, match=r"replicates.sqlite: the journal cannot be read or written: .* full"):
-        run_study("toy", out=tmp_path / "out")
-    monkeypatch.setattr(studies, "SCHEMA", real)
-    done = [json.loads(key)["seed"] for key, _ in entries(tmp_path / "out" / "replicates.sqlite")]
-    assert done
+def test_a_line_that_was_not_finished_is_computed_again(toy, tmp_path: Path) -> None:
+    journal = interrupted(toy, tmp_path / "out")
+    journal.write_bytes(journal.read_bytes()[:-5])
     (tmp_path / "log.txt").unlink()
     run_study("toy", out=tmp_path / "out", resume=True)
-    assert [int(k) for k in (tmp_path / "log.txt").read_text().split()] == sorted({*range(12)} - {*done})
+    assert (tmp_path / "log.txt").read_text().split() == [str(k) for k in range(2, 12)]
 
 
 def test_a_journal_of_other_code_is_refused(toy, tmp_path: Path) -> None:
@@ -269,7 +260,7 @@ ODD = {
     "a table": b"label,q1_deg\nA,1\n",
     "zero bytes": b"\0" * 4096,
     "no text": b"\xff\xfe",
-    "half a database": b"SQLite format 3\0" + b"\x10\0\1\1",
+    "half a journal": b'["code", {}]\n["a", {"b": 1}\n',
     "a link to a device": b"",
 }
 
@@ -283,7 +274,7 @@ def test_odd_journals_are_one_sentence(toy, tmp_path: Path, monkeypatch, capsys,
         journal.symlink_to("/dev/null")
     assert run(monkeypatch, "study", "toy", "--resume", "--out", str(tmp_path / "out")) == 2
     said = capsys.readouterr().err
-    assert "replicates.sqlite" in said
+    assert "replicates.jsonl" in said
     assert said.count("\n") == 1
     assert journal.read_bytes() == ODD[odd]
 
@@ -291,10 +282,8 @@ def test_odd_journals_are_one_sentence(toy, tmp_path: Path, monkeypatch, capsys,
 def test_a_journal_that_was_only_begun_begins_anew(toy, tmp_path: Path) -> None:
     journal = interrupted(toy, tmp_path / "out")
     fresh = run_study("toy", out=tmp_path / "fresh")[0].metrics
-    for content in (b"", None):
-        journal.write_bytes(b"")
-        if content is None:
-            change(journal, "CREATE TABLE code (part TEXT PRIMARY KEY, digest TEXT)")
+    for content in (b"", b'["code", {}]\n'):
+        journal.write_bytes(content)
         assert run_study("toy", out=tmp_path / "out", resume=True)[0].metrics == fresh
 
 
@@ -324,7 +313,7 @@ def test_a_study_writes_all_its_results_or_none(toy, tmp_path: Path, monkeypatch
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(ro.basics.RpimError, match="No space left"):
         run_study("toy", out=out)
-    after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "replicates.sqlite"}
+    after = {path.name: path.read_bytes() for path in out.iterdir() if path.name != "replicates.jsonl"}
     assert after == before
     monkeypatch.setattr(os, "fsync", real)
     resumed, _ = run_study("toy", out=out, resume=True)  # nothing is computed again
