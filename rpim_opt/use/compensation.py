@@ -30,7 +30,7 @@ from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
-from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, joint_units, nearest, times
+from rpim_opt.use.inverse_kinematics import Arm, attainable, correction_weights, nearest, times
 from rpim_opt.use.reading import Targets
 
 SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
@@ -220,7 +220,7 @@ def compensate(
     only those rotations count that need not move the point. With the singular values s of the Jacobian at q, P is zero
     but where the exact correction e / s of an error e would be longer than ``largest`` (near singular): there it is
     (e / largest)^2 - s^2, so that the part (s largest / e)^2 is made; and, slightly, where nothing moves (more joints
-    than needed), so that the correction is the shortest to first order, in units of the joints' ranges.
+    than needed), so that the correction is the shortest to first order.
 
     **Which frame.** What a calibration identified of the base is where the instrument stands and is not compensated:
     targets hold in the base as identified. A turn of joint 1 and one of the base are the same to the data; what the
@@ -477,14 +477,13 @@ class _Cell(NamedTuple):
                 beside = self._norms(self.nominal.at(q, load, poses)[1])[0]
         _, before, J = self.identified.at(commands, load, target)
         W = attainable(J)
-        unit = joint_units(self.robot, J.shape[1])
         reached = self._reached(missed, W)
         due = np.where(reached[:, None], before - missed, 0.0)
-        P = correction_weights(W @ J * unit, times(W, due), largest)
+        P = correction_weights(W @ J, times(W, due), largest)
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
-        corrected, left, active = nearest(self.identified, load, target, commands, limits, unit, W, P)
+        corrected, left, active = nearest(self.identified, load, target, commands, limits, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
         cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
@@ -515,7 +514,7 @@ class _Cell(NamedTuple):
 
         def found(rows: np.ndarray, start: Array, W: Array) -> tuple[Array, Array, np.ndarray]:
             limits = self.robot.limits[:, 0], self.robot.limits[:, 1]
-            return nearest(self.nominal, load[rows], poses[rows], start, limits, np.ones(n), W, np.zeros((1, n, n)))
+            return nearest(self.nominal, load[rows], poses[rows], start, limits, W, np.zeros((1, n, n)))
 
         all_count = np.eye(len(self.kind.components))[None]
         starts = self._starts(poses, load.shape[1]) if q is None else q[:, None]

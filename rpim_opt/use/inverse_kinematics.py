@@ -62,28 +62,28 @@ class Arm(NamedTuple):
 
 
 def nearest(
-    arm: Arm, load: Array, y: Array, start: Array, limits: tuple[Array, Array], unit: Array, W: Array, P: Array
+    arm: Arm, load: Array, y: Array, start: Array, limits: tuple[Array, Array], W: Array, P: Array
 ) -> tuple[Array, Array, np.ndarray]:
-    """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + unit D, row by row.
+    """Minimize |W error|^2 + D' P D over low <= q <= high, q = start + D, row by row.
 
     Gauss-Newton steps in the box, damped (Levenberg-Marquardt) in rows whose step does not lower the objective.
-    Shapes: start (N, n), limits (N, n) or (n,), unit (n,), W (N or 1, k, k), P (N or 1, n, n). Returned are joint
+    Shapes: start (N, n), limits (N, n) or (n,), W (N or 1, k, k), P (N or 1, n, n). Returned are joint
     values (N, n), their errors (N, k), and which joints are at an active limit (N, n).
     """
     N, n = start.shape
     W = np.broadcast_to(W, (N, *W.shape[1:]))
     P = np.broadcast_to(P, (N, n, n))
     low, high = (np.broadcast_to(limit, start.shape) for limit in limits)
-    to_low = (low - start) / unit
-    to_high = (high - start) / unit
+    to_low = low - start
+    to_high = high - start
 
     def state(rows: np.ndarray, D: Array) -> tuple[Array, Array, Array, Array]:
         """Return errors, weighted errors, their slopes, and the objectives."""
-        q = np.clip(start[rows] + unit * D, low[rows], high[rows])
+        q = np.clip(start[rows] + D, low[rows], high[rows])
         _, error, J = arm.at(q, load[rows], y[rows])
         weighted = times(W[rows], error)
         value = np.sum(weighted**2, axis=1) + np.sum(D * times(P[rows], D), axis=1)
-        return error, weighted, W[rows] @ (J * unit), value
+        return error, weighted, W[rows] @ J, value
 
     every = np.arange(N)
     D = np.clip(0.0, to_low, to_high)
@@ -116,7 +116,7 @@ def nearest(
         left = left[long & promising & (value[left] > 1e-24)]
     g = descent(every)
     active = ((to_low >= D) & (g < 0)) | ((to_high <= D) & (g > 0))
-    return np.clip(start + unit * D, low, high), error, active
+    return np.clip(start + D, low, high), error, active
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
@@ -138,18 +138,6 @@ def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
         if not len(rows):
             break
     return step
-
-
-def joint_units(robot: Robot, equations: int) -> Array:
-    """Return the unit of every joint: its range if there are more joints than equations, else 1."""
-    span = np.ptp(robot.limits, axis=1)
-    unit = np.ones(robot.dof)
-    if robot.dof > equations:
-        span[~np.isfinite(span)] = 2 * np.pi
-        for dimension in set(robot.joint_dimensions):
-            alike = np.array(robot.joint_dimensions) == dimension
-            unit[alike] = span[alike] / span[alike].min()
-    return unit
 
 
 def attainable(J: Array) -> Array:
