@@ -87,20 +87,20 @@ def studies_folder() -> Path | None:
 
 def find_study(name: str | Path) -> Path:
     """Return the file of a path, of a folder with ``study.py``, or of a name in the checkout or the current folder."""
-    text = str(name)
-    if text.endswith(".py") or os.sep in text or "/" in text or text in (".", ".."):
-        path = Path(text, FILE) if Path(text).is_dir() else Path(text)
-        if not path.is_file():
-            raise InputError("study", f"no file '{path}'", f"a Python file with a study, or a folder with {FILE}")
-        return path.resolve()
     own = studies_folder()
     known = {path.stem: path for path in sorted(own.glob("*.py"))} if own else {}
-    if text in known:
-        return known[text]
-    for place in (Path(f"{text}.py"), Path(text, FILE), Path("studies", f"{text}.py"), Path("studies", text, FILE)):
+    text = str(name)
+    places = [
+        Path(text),
+        Path(text, FILE),
+        Path(f"{text}.py"),
+        Path("studies", f"{text}.py"),
+        Path("studies", text, FILE),
+    ]
+    for place in [known[text]] if text in known else places:
         if place.is_file():
             return place.resolve()
-    accepted = f"a file {text}.py, or a folder with {FILE}"
+    accepted = f"a Python file, or a folder with {FILE}"
     if known:
         accepted += f", or a study of the checkout: {choices(text, known)}"
     raise InputError("study", f"'{text}'", accepted)

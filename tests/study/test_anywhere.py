@@ -83,9 +83,9 @@ def test_a_folder_is_a_study(place: Path, name: str) -> None:
 
 def test_a_study_without_one_is_a_sentence(place: Path, monkeypatch, capsys) -> None:
     for name, said in {
-        "nothing": "accepted: a file nothing.py, or a folder with study.py",
-        "./nothing.py": "no file 'nothing.py'",
-        "inside/": "no file 'inside/study.py'",
+        "nothing": "found 'nothing', accepted: a Python file, or a folder with study.py",
+        "./nothing.py": "found './nothing.py'",
+        "inside/": "found 'inside/'",
         "beside.py": "no 'QUESTION'",
     }.items():
         assert run(monkeypatch, "study", name) == 2
@@ -97,7 +97,7 @@ def test_a_study_without_one_is_a_sentence(place: Path, monkeypatch, capsys) -> 
 
 def test_an_installed_package_names_no_studies_of_its_own(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(studies, "studies_folder", lambda: None)
-    with pytest.raises(ro.InputError, match=r"accepted: a file paper.py, or a folder with study.py\.$"):
+    with pytest.raises(ro.InputError, match=r"accepted: a Python file, or a folder with study.py\.$"):
         studies.find_study("paper")
     assert run_study("mine", quick=True)[0].metrics == {"largest": 2}
 
