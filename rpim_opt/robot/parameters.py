@@ -118,13 +118,12 @@ def known_patterns(names: Sequence[str], pattern: str) -> str:
 class Parameters(Tabled):
     """A table of model parameters, one entry each in every field.
 
-    ``names`` are ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz`` and those
-    of the measurement; with several reflectors ``tool_A_x, ...``. ``dimensions`` are ``length``, ``angle``, ``ratio``
-    or ``compliance``. ``nominal`` (P,) are the values from which deviations count, ``scale`` (P,) their prior standard
-    deviations, ``tolerance`` (P,) the largest deviations that a bounded calibration allows, infinite where there are
-    none [SI]; ``identified`` (P,) says which a calibration may change. ``own_frames`` are prefixes of the frames of
-    measurements, ``plane_``: their rotations are angles as those of base and tool are; ``terms`` names of the
-    parameters of a user's own terms (`Model`), which are the robot's as those of the table are.
+    ``names`` are ``alpha1, a1, theta1, d1, beta1, alpha2, ..., base_x, ..., base_rz, tool_x, ..., tool_rz`` (of several
+    reflectors ``tool_A_x, ...``) and those of the measurement; ``dimensions`` ``length``, ``angle``, ``ratio`` or
+    ``compliance``. ``nominal`` (P,) are the values from which deviations count, ``scale`` (P,) their prior standard
+    deviations, ``tolerance`` (P,) the largest deviations that a bounded calibration allows, or infinite [SI];
+    ``identified`` (P,) says which a calibration may change. ``own_frames`` are prefixes of measurements' frames,
+    ``plane_``, ``terms`` names of the parameters of a user's own terms (`Model`).
 
     >>> import rpim_opt as ro
     >>> parameters = ro.load("position").problem.parameters

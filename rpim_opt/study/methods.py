@@ -328,10 +328,6 @@ class Fitted:
         """Return the errors (N,) of the rows that were held out, in m, or in rad for ``"angle"``; NaN without any."""
         return self.errors_of(self.held_out, dimension)
 
-    def fit_errors(self) -> Array:
-        """Return the errors (N,) [m] of the identification rows."""
-        return self.errors_of(self.problem.data, "length")
-
 
 def _coverage(fitted: Fitted) -> float | None:
     if fitted.result is None:
@@ -346,7 +342,7 @@ METRICS: dict[str, Callable[[Fitted], float | None]] = {
     "p95_mm": lambda fitted: statistics(fitted.errors())["p95_mm"],
     "max_mm": lambda fitted: statistics(fitted.errors())["max_mm"],
     "rms_mrad": lambda fitted: statistics(fitted.errors("angle"), "mrad")["rms_mrad"],
-    "fit_rms_mm": lambda fitted: statistics(fitted.fit_errors())["rms_mm"],
+    "fit_rms_mm": lambda fitted: statistics(fitted.errors_of(fitted.problem.data, "length"))["rms_mm"],
     "covered_percent": _coverage,
     "seconds": lambda fitted: fitted.seconds,
 }

@@ -104,19 +104,17 @@ def export_files(
 
     Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
 
-    ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS) and ``ur_calibration`` (``calibration.conf``) of a
-    Universal Robot and ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to
-    ``out``, of several a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`),
-    ``robodk`` (.csv, four numbers a joint, modified) and ``corrections`` are files to write, the last one the
-    transmission errors of the whole model: ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, ``std_mrad``.
-    A joint stands at its angle plus the correction: subtract it from a command. Without transmission errors the other
-    files are written, and a note says so. ``marker`` is the reflector, ``frames`` are ``root``, ``tip`` and
-    ``tip_measured`` of `export_urdf`; with ``despite_verdict`` a robot that is not delivered is written, too, with a
-    note in every file.
+    ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
+    ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
+    a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
+    numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
+    ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
+    ``marker`` is the reflector, ``frames`` are ``root``, ``tip`` and ``tip_measured`` of `export_urdf`.
 
     A robot that is neither accepted nor rejected, or no more certain than the nominal one errs, is written with the
     note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
-    requirement of its record, InputError where there is nothing to write, or a file cannot hold what was identified.
+    requirement of its record, unless ``despite_verdict``, which every file says then; InputError where there is nothing
+    to write, or a file cannot hold what was identified.
     """
     whole = result
     result, notes = geometry_alone(whole)
@@ -200,9 +198,8 @@ def _of_geometry(alone: Calibration, extensions: str, found: Workspace, limit: f
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     """Return the calibration without the model extensions selected by evidence, and a sentence on the loss of accuracy.
 
-    Files hold geometry alone, and the geometry of a calibration with gravity is not the best one without: the same
-    rows are calibrated once more, also those that only the extension explains. A calibration to which nothing was added
-    is returned as it is.
+    Its geometry is not the best one without them: the same rows are calibrated once more, also those that only the
+    extension explains. A calibration to which nothing was added is returned as it is.
     """
     if result.learned is None or not result.learned.added:
         return result, []

@@ -156,10 +156,9 @@ def read_robot(path: str | Path) -> Robot:
     """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
 
     TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
-    of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``, and
-    ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; an empty
-    cell is left out. A column ``convention`` says ``modified`` or ``standard``. InputError names the file, the key or
-    column, what was found and what is accepted.
+    of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``,
+    ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; a column
+    ``convention`` says ``modified`` or ``standard``. InputError names file, key or column.
 
     >>> import rpim_opt as ro
     >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")
@@ -261,13 +260,12 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
 def write_robot(robot: Robot, path: str | Path, convention: str = "modified") -> None:
     """Write a robot as ``.toml``, ``.json`` or ``.csv``, so that `read_robot` gives back exactly the same numbers.
 
-    Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere. ``convention`` is
-    stated in the file; ``"standard"`` (or another word for it) writes a CSV from axis 1 to the same last frame: without
-    alpha1 and a1, which place axis 1 in the base, and with zeros for a and alpha of the last row, which are the tool's.
-    Its columns are those of a data sheet, joint, theta, d, a, alpha, in mm and degrees with 15 digits.
+    Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere. With
+    ``convention`` ``"standard"`` (or another word for it) a CSV goes from axis 1 to the same last frame, without alpha1
+    and a1 and with zeros for a and alpha of the last row, in mm and degrees with 15 digits.
 
-    The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV, which
-    has no place for them, a coupling of joints, a mounting other than on the floor, and a payload.
+    The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV a
+    coupling of joints, a mounting other than on the floor, and a payload.
     """
     path = Path(path)
     ending = _ending(path)
@@ -296,13 +294,11 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
 def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     """Write the four modified DH numbers of every joint as CSV, ``joint,alpha_deg,a_mm,theta_deg,d_mm``.
 
-    For RoboDK's robot parameters, which are a modified DH table (Craig's, "DHM") in mm and degrees. Hayati's betas
-    are turned into common normals. Its API takes such a table with base and tool
-    (``SetRobotParams(robot, dhm, poseBase, poseTool)``, RoboDK/RoboDK-API, C#), but documents neither the columns'
-    order nor a file that can be read: transfer the numbers by name, and compare a pose before you rely on them.
-
-    Returned is a warning where axes are so nearly parallel that rounded numbers lose the robot; refused are signs or
-    couplings of joints, and a beta after the last joint.
+    For RoboDK's robot parameters, a modified DH table (Craig's, "DHM") in mm and degrees; Hayati's betas are turned
+    into common normals. Its API takes such a table (``SetRobotParams(robot, dhm, poseBase, poseTool)``,
+    RoboDK/RoboDK-API, C#), and documents neither the columns' order nor a file: transfer the numbers by name, and
+    compare a pose. Returned is a warning where axes are so nearly parallel that rounded numbers lose the robot; refused
+    are signs or couplings of joints, and a beta after the last joint.
     """
     table = without_beta(robot).mdh
     if not np.array_equal(robot.joint_map, np.eye(robot.dof)):

@@ -99,11 +99,9 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
 def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> None:
     """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
 
-    The betas are turned into common normals first, as the controller's parameters are. Not tried on a controller:
-    what else it checks (the file has checksums of the joints) is not documented. Keep the original.
-
-    ``robot`` is in the controller's Base, or with ``nominal`` in ROS's ``base_link``; ``source``, its own file, may be
-    the target, too. Refused are alpha1 or a1 that deviate (the base has to hold them), beta6, and axes too nearly
+    The betas are turned into common normals first. Not tried on a controller, whose checks (the file has checksums of
+    the joints) are not documented: keep the original. ``robot`` is in the controller's Base, or with ``nominal`` in
+    ROS's ``base_link``. Refused are alpha1 or a1 that deviate (the base has to hold them), beta6, and axes too nearly
     parallel.
     """
     path = Path(source)
@@ -180,11 +178,10 @@ def read_ur_kinematics(path: str | Path) -> Described:
 def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> None:
     """Write a ``kinematics.yaml`` with an identified robot's origins, everything else (and the hash) as in ``source``.
 
-    The driver compares the hash with the controller's own calibration; it is that of the robot, not of the numbers.
-
-    ``source`` is the original, or ur_description's default_kinematics.yaml of the model; its `read_ur_kinematics` has
-    to be the robot whose parameters were identified, in the controller's Base or in ROS's ``base_link``. Refused are
-    another robot, and a beta after the last joint.
+    The driver compares the hash, that of the robot, with the controller's. ``source`` is the original, or
+    ur_description's default_kinematics.yaml of the model; its `read_ur_kinematics` has to be the robot whose parameters
+    were identified, in the controller's Base or in ROS's ``base_link``. Refused are another robot, and a beta after the
+    last joint.
     """
     robot = _in_base(robot)
     path = Path(source)

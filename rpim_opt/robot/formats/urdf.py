@@ -139,12 +139,9 @@ def write_urdf(
     """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
 
     ``source`` is the original; its `read_urdf` with the same ``base`` and ``tip`` has to be the robot whose parameters
-    were identified. ``target`` may be ``source``. ``robot`` has the identified parameters
-    (`Calibration.robot`, `use.identified`), ``base_frame`` and ``tool_frame`` (6,) are identified base and tool, x, y,
-    z [m], roll, pitch, yaw [rad]; by default the original's.
-
-    An origin that does not change stays as it is written; numbers are written so that they read back exactly. Refused
-    are another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
+    were identified. ``robot`` has these (`use.identified`), ``base_frame`` and ``tool_frame`` (6,) are identified base
+    and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's. Numbers read back exactly. Refused are
+    another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
     """
     urdf = _read(Path(source))
     way = urdf.way(base, tip)
@@ -588,9 +585,8 @@ def _root_element(data: bytes) -> _Element:
 def _masses(urdf: _Urdf, way: _Way, table: Array, G: Array) -> Gravity:
     """Return the mass that each row of the table carries up to the next, and its centre in the table's frames.
 
-    Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero. What
-    cannot be read beside the chain is left out, as it is elsewhere. No masses where nothing that moves has one, or the
-    base itself is moved.
+    Links beside the chain and beyond its tip, a gripper's for instance, hang where their joints are at zero; what
+    cannot be read there is left out. No masses where nothing that moves has one, or the base itself is moved.
     """
     if any(step.up and step.joint.kind for step in way.steps):
         return Gravity()
