@@ -22,7 +22,6 @@ from rpim_opt.convex.constraints import within_tolerance
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import Selection, weight_grid
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.report.summary import mm
 
 if TYPE_CHECKING:
     from rpim_opt.use.monitoring import Monitoring
@@ -41,7 +40,7 @@ LINE_HEIGHT = 1.25  # distance of names over their size
 MODELS = {"before": "nominal", "after": "identified"}  # model that errors before and after calibration are of
 MANY_ROWS = 100  # above it each row is a small point without a name
 TIMES = ((86400.0, "days"), (3600.0, "hours"), (1.0, "seconds"))  # units of an axis of time [s]
-CELLS, SHADES = 24, 5  # of a map: cells along the longer side, and levels
+CELLS, FAINT = 24, "#dce8f5"  # of a map: cells along the longer side, and the colour of the least value
 VIEWS = {"from above": (0, 1), "from the side": (0, 2)}  # axes to the right and up
 VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a lasso has no deviation left there
 
@@ -224,33 +223,25 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
 def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | None, view: str, ax: Axes) -> None:
     """Draw a map of the expanded uncertainties (N,) at positions (N, 3), all in mm, as a `VIEWS` sees it.
 
-    Each cell has the largest one of its positions; it is marked above the limit. The box (3, 2) is drawn as a frame.
+    Each cell has the largest one of its positions; it is red above the limit. The box (3, 2) is drawn as a frame.
     """
-    low, high = float(bound.min()), float(bound.max())
-    levels = np.linspace(low, high, SHADES + 1)[1:]
-    decimals = 10.0 ** (int(np.ceil(-np.log10(max(high - low, 1e-3 * high)))) + 1)
-    levels = np.asarray(np.ceil(levels * decimals) / decimals, dtype=float)
+    from matplotlib.colors import LinearSegmentedColormap
+
     across, up = VIEWS[view]
     plane = at[:, [across, up]].T
     extent = np.ptp(plane, axis=1)
     count = np.maximum(np.ceil(extent / (extent.max() / CELLS) - 1e-9), 1).astype(int)
     grid, x, y, _ = scipy.stats.binned_statistic_2d(*plane, bound, "max", bins=count.tolist())
-    column, row = np.nonzero(np.isfinite(grid))
-    worst = grid[column, row]
-    shade = np.minimum(np.searchsorted(levels, worst), SHADES - 1)
-    above = worst > (np.inf if limit is None else limit)
-    for k, over in sorted(set(zip(shade.tolist(), above.tolist(), strict=True))):
-        which = (shade == k) & (above == over)
-        level = float(levels[k])
-        text = f"to {mm(level)} mm, above the limit" if over else f"to {mm(min(level, limit or np.inf))} mm"
-        style = {"color": COLORS["mark" if over else "after"], "alpha": (k + 1) / SHADES, "label": text}
-        i, j = column[which], row[which]
-        ax.bar(x[i], y[j + 1] - y[j], x[i + 1] - x[i], y[j], align="edge", lw=0, **style)
+    high = float(bound.max())
+    top = high if limit is None else min(high, limit)
+    colours = LinearSegmentedColormap.from_list("U", [FAINT, COLORS["after"]]).with_extremes(over=COLORS["mark"])
+    drawn = ax.pcolormesh(x, y, grid.T, cmap=colours, vmin=min(float(bound.min()), 0.9 * top), vmax=top)
+    said = {"label": "U [mm], above the limit in red", "extend": "max"} if high > top else {"label": "U [mm]"}
+    ax.figure.colorbar(drawn, ax=ax, **said)
     if box is not None:
         (a, b), (c, d) = box[across], box[up]
         ax.plot([a, b, b, a, a], [c, c, d, d, c], color=COLORS["ink"])
     ax.set(xlabel=f"{'xyz'[across]} [mm]", ylabel=f"{'xyz'[up]} [mm]", aspect="equal")
-    _with_legend(ax)
 
 
 def checks(found: Monitoring, ax: Axes) -> None:

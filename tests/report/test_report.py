@@ -283,7 +283,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
     assert "The maximum U is at joints" in words
-    assert ("mm, above the limit" in "".join(read.charts())) == (verdict != "Accepted")
+    assert ("[mm], above the limit in red" in "".join(read.charts())) == (verdict != "Accepted")
 
 
 @pytest.mark.usefixtures("undrawn")
