@@ -33,11 +33,6 @@ class SimulatedArm(NamedTuple):
 
     ``problem`` has the identification data and generic scales, ``true`` the positions of validation configurations as
     they are [m], ``read`` the same as the tracker reads them.
-
-    >>> import rpim_opt as ro
-    >>> arm = ro.study.simulated_arm(seed=0, count=10)
-    >>> len(arm.problem.data), len(arm.read), arm.problem.robot.name
-    (10, 200, 'Universal Robots UR10e')
     """
 
     problem: CalibrationProblem
@@ -64,8 +59,8 @@ def simulated_arm(
     >>> import rpim_opt as ro
     >>> arm = ro.study.simulated_arm(seed=1, count=25, offset=0.017)
     >>> result = ro.calibrate(arm.problem)
-    >>> len(arm.true), bool(result.errors(arm.true).mean() < 1e-4)
-    (200, True)
+    >>> arm.problem.robot.name, len(arm.true), bool(result.errors(arm.true).mean() < 1e-4)
+    ('ABB IRB 120-3/0.58', 200, True)
     """
     name = list(KINDS)[seed % len(KINDS)]
     robot = read_robot(find_robot(name))

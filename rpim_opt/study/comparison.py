@@ -301,12 +301,6 @@ class Standing:
     problem counting the same (None without pairs), ``low`` and ``high`` the ends of its 95 % interval (None where there
     is too little to say). On ``wins``, ``ties`` and ``losses`` replicates it is better than the reference, as good
     within 1 %, or worse; one without a figure loses against one with.
-
-    >>> import rpim_opt as ro
-    >>> found = ro.compare("position", ["tikhonov", "least_squares"], "reml", splits=5)
-    >>> second = found.summary().standings[1]
-    >>> second.method, second.replicates, second.wins + second.ties + second.losses, second.different
-    ('least_squares', 5, 5, False)
     """
 
     method: str
