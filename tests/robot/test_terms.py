@@ -38,6 +38,8 @@ def effects(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, dict]]:
     payload = rng.uniform(0, 3, len(Q))
     torque = rng.uniform(-10, 10, (len(Q), 1, 6))
     slopes = ro.robot.moment_slopes(ARM, Q)
+    loaded = [replace(ARM, gravity=ARM.gravity.carrying(mass)) for mass in payload]
+    borne = np.array([ro.robot.gravity_torques(robot, at)[0, 2] for robot, at in zip(loaded, Q, strict=True)])
     return {
         "ratio3": (q, {}),
         "ecc_cos3": (np.cos(q), {}),
@@ -46,7 +48,7 @@ def effects(rng: np.random.Generator) -> dict[str, tuple[np.ndarray, dict]]:
         "ecc2_sin3": (np.sin(2 * q), {}),
         "backlash3": (side[:, 0, 2], {"approach": side}),
         "compliance3": (ro.robot.gravity_torques(ARM, Q)[:, 2], {}),
-        "compliance3 and a payload": (ro.robot.gravity_torques(ARM, Q, payload)[:, 2], {"payload": payload}),
+        "compliance3 and a payload": (borne, {"payload": payload}),
         "compliance3 and torques": (torque[:, 0, 2], {"torque": torque}),
         "bend3_5y": (slopes[:, 2, 4, 1], {}),
     }
