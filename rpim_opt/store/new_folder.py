@@ -129,8 +129,7 @@ def new_problem(
         tell(other)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[validated] = other.columns
-    counts = {name: len(next(iter(each.values()), ())) for name, each in tables.items()}
-    tables = {name: each for name, each in tables.items() if counts[name]}
+    tables = {name: each for name, each in tables.items() if any(map(len, each.values()))}
     noise = usual_noise(kind)
     assumed = {} if any(name.startswith(("sigma", "u95")) for name in columns) else noise
     supplied = [*paths, *later]
@@ -155,7 +154,7 @@ def new_problem(
     added = f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}."
     of_chain = [SHARED if before else added] if chain else []
     notes = (*_remarks(arm, source, understanding, assumed), f"Measurement {kind.name}: {how}.", guessed, *of_chain)
-    counts = {name: counts[name] for name in tables}
+    counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     return Started(folder, counts, notes, replace(understanding, kind=kind), not dry_run)
 
 

@@ -170,17 +170,12 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
         return _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
     if pair:
         return pair
-    raise _without_key(joints, values, key, common)
-
-
-def _without_key(joints: Understood, values: Understood, key: str, common: Sequence[str]) -> InputError:
-    """Return the error that names the columns by which rows might be joined, with their first names."""
     found = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
     if key:
         found = f"'{key}', whose values no column of the other file has"
     for side in (joints, values):
         found += "".join(f"; {name} of {side.file}: {listed(keys, 3)}" for name, keys in _naming(side).items())
-    return InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
+    raise InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
 
 
 def _alike(own: set[str], others: set[str]) -> bool:

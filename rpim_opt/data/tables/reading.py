@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations_with_replacement
@@ -23,6 +24,7 @@ Numbers = dict[tuple[str, str], Array]
 TRACKER = {"range": ("length", "ratio"), "transverse": ("length",), "angle": ("angle",),
            "x": ("length",), "y": ("length",), "z": ("length",)}  # fmt: skip
 """The keys of ``[noise.tracker]`` and their dimensions."""
+APPROACH = re.compile(r"(?:to_)?approach\d+")  # columns of directions
 DEFINITE = 1e-9  # a correlation matrix whose smallest eigenvalue is not above this is no covariance
 SPREADS = {"sigma": 1.0, "u95": 2.0}  # coverage factors of standard and of expanded uncertainties, by their stems
 
@@ -75,7 +77,6 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         raise InputError(f"row {label[error.row]}", error.found, error.accepted) from None
     q, torque, approach = (_of_joints(stem, columns, robot, kind, N) for stem in ("q", "tau", "approach"))
     stated = {"torque": torque, "payload": columns.get(("payload", "")), "approach": approach}
-    _require_states(stated["payload"], approach, label)
     noise = covariances(columns, declared, kind, y, label)
     further = {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
     naming = _naming_column(table, kind)
@@ -85,17 +86,6 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     blocks = _by_markers(whole.blocks[0], table, kind, label)
     data = Dataset(blocks, label, _configurations(table, q.reshape(N, -1)))
     return data.grouped_by_points() if kind.touching else data
-
-
-def _require_states(payload: Array | None, approach: Array | None, label: Sequence[str]) -> None:
-    """Refuse negative payloads (N,) and directions (N, p, dof) that are none."""
-    if payload is not None and payload.min() < 0:
-        row = int(np.argmin(payload))
-        raise InputError(f"row {label[row]}, column payload_kg", f"{payload[row]:g}", "a mass that is not negative")
-    if approach is not None:
-        for row, point, joint in np.argwhere(~np.isin(approach, (-1.0, 0.0, 1.0))):
-            where = f"row {label[row]}, column approach{joint + 1}"
-            raise InputError(where, f"{approach[row, point, joint]:g}", "-1, 0 (not known) or 1")
 
 
 def _naming_column(table: Columns, kind: Measurement) -> str:
@@ -224,13 +214,16 @@ def quantities_of(
         if (stem, dimension) in columns:
             raise InputError("the header", f"column '{stem}' in two units", "one of them")
         values = si * numbers(table[name], name, label) + zero
-        fits = np.abs(values) <= LARGEST
-        accepted = f"a magnitude of at most {LARGEST / si:g}"
-        if stem.startswith(tuple(SPREADS)) and fits.all():
-            fits = values >= SMALLEST
-            accepted = f"an uncertainty greater than zero, from {SMALLEST / si:g} on"
-        for i in np.flatnonzero(~fits).tolist():
-            raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", accepted)
+        limits = [(np.abs(values) <= LARGEST, f"a magnitude of at most {LARGEST / si:g}")]
+        if stem.startswith(tuple(SPREADS)):
+            limits.append((values >= SMALLEST, f"an uncertainty greater than zero, from {SMALLEST / si:g} on"))
+        elif stem == "payload":
+            limits.append((values >= 0, "a mass that is not negative"))
+        elif APPROACH.fullmatch(stem):
+            limits.append((np.isin(values, (-1.0, 0.0, 1.0)), "-1, 0 (not known) or 1"))
+        for fits, accepted in limits:
+            for i in np.flatnonzero(~fits).tolist():
+                raise InputError(f"row {label[i]}, column {name}", f"{values[i] / si:g}", accepted)
         columns[stem, dimension] = values
         if len(known[stem]) == 1:
             columns[stem, ""] = values
