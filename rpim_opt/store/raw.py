@@ -52,7 +52,8 @@ class Understanding:
     @property
     def left_out(self) -> tuple[str, ...]:
         """The names of ignored columns of all files."""
-        return tuple(dict.fromkeys(name for table in self.tables for name in table.left_out))
+        unused = (each.column for table in self.tables for each in table.meant if each.meaning == "not used")
+        return tuple(dict.fromkeys(unused))
 
     @property
     def count(self) -> int:

@@ -86,11 +86,6 @@ class Understood:
         columns, raw = ({n: [cells[i] for i in rows] for n, cells in c.items()} for c in (self.columns, self.raw))
         return replace(self, columns=columns, raw=raw)
 
-    @property
-    def left_out(self) -> tuple[str, ...]:
-        """Ignored columns."""
-        return tuple(each.column for each in self.meant if each.meaning == "not used")
-
 
 def understand(
     raw: RawTable,
