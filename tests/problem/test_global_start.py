@@ -113,9 +113,21 @@ def test_another_description_of_the_same_robot_is_named() -> None:
     assert result.mapping is not None
     assert "zero of joint 4 +180.0 deg (" in result.message
     both = "zero of joint 4 +180.0 deg, or joint 5 reversed (sign = -1)"
-    said = f"Table and robot file count joint values differently: {both} (both explain the data equally well)."
+    said = f"Table and robot file count joint values differently: {both} (these explain the data equally well, "
     assert result.caution.startswith(said)
     assert both in inspect(problem.on(replace(problem.data, blocks=(turned,)))).warnings[-1]
+
+
+def test_of_two_descriptions_that_the_one_with_the_stated_reflector_is_taken() -> None:
+    """Half a turn of joint 5 and a reflector 360 mm behind the flange explain positions as a reversed joint 6 does."""
+    instance = ro.load("position")
+    robot, block = instance.problem.robot, instance.problem.data.blocks[0]
+    turned = replace(block, q=block.q * np.array([1, 1, 1, 1, 1, -1]))
+    result = ro.calibrate(instance.problem.on(replace(instance.problem.data, blocks=(turned,))))
+    assert result.mapping is not None
+    assert result.mapping.sign.tolist() == [1, 1, 1, 1, 1, -1]
+    assert "joint 6 reversed (sign = -1), or zero of joint 5 +180.0 deg (these explain" in result.caution
+    assert result.mapping.moved < 0.08 < 2 * robot.mdh[-1, 3] < result.mapping.same[0].moved
 
 
 def test_zeros_that_were_found_are_not_held_there() -> None:

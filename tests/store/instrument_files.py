@@ -36,6 +36,7 @@ from tests.store.raw_files import (
     joint_names,
     one,
     text,
+    two,
     write,
 )
 
@@ -188,6 +189,12 @@ REFUSED_THOUGH_RIGHT: dict[str, Shape] = {
         text([["Point", *joint_names("q{}"), "x", "y", "z", "rx", "ry", "rz"]],
              beside(NAMED, RADIANS, METRES, cells(Rotation.from_matrix(T[:, :3, :3]).as_rotvec()))),
         kind="pose", units="rad,m", rotation="vector",
+    ),
+    "joints and rotation vectors in two files": two(
+        text([HEAD[:7]], beside(NAMED, JOINTS)),
+        text([["Point", *HEAD[7:], "rx [rad]", "ry [rad]", "rz [rad]"]],
+             beside(NAMED, POINTS, cells(Rotation.from_matrix(T[:, :3, :3]).as_rotvec()))),
+        kind="pose", rotation="vector",
     ),
     "intrinsic Euler angles": one(
         text([[*HEAD, "rx [deg]", "ry [deg]", "rz [deg]"]],

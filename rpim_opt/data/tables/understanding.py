@@ -133,6 +133,8 @@ def understand(
 def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> tuple[Columns, list[Meant]]:
     """Return columns and meanings with a quaternion in the place of three turns."""
     names = {split_unit(name)[0]: name for name in columns}
+    if names.keys().isdisjoint(TURNED):  # a file of joint values, beside one of poses
+        return columns, list(meant)
     if any(turn not in names for turn in TURNED):
         raise InputError("the header", "no columns rx, ry, rz", "three of them, or no --rotation")
     turned = [names[turn] for turn in TURNED]

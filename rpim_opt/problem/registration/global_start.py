@@ -50,6 +50,7 @@ ODDS = 30.0  # difference of chi-squared up to which data do not tell two mappin
 GROSS = 6.0  # rows farther off than so many medians of the best fit's errors do not tell mappings apart
 FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
 MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
+SAME_TOOL = 0.05  # distances of a reflector from its stated place [m] whose multiples tell two descriptions apart
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
 COMPARED = 200  # configurations at which mappings are compared
 WRITE = "write sign, and add the zeros to theta_deg, of these joints in robot.toml"  # the remedy
@@ -66,6 +67,7 @@ class Alternative:
     apart: float  # RMS distance of their predictions at other configurations [m]
     deciding: Array  # (dof,) joint values of the controller at which these are farthest apart [rad or m]
     mirror: bool = False  # whether it is the mirror image of the first one, so that lengths are the same everywhere
+    moved: float = 0.0  # how far a reflector is from its stated place in the flange frame [m]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +90,7 @@ class JointMapping:
     mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
     behind: str = ""  # joints that fit as well in a left-handed frame, as stated or one of them reversed
     same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
+    moved: float = 0.0  # how far a reflector is from its stated place in the flange frame [m]
 
     @property
     def explanations(self) -> str:
@@ -97,7 +100,10 @@ class JointMapping:
     @property
     def caution(self) -> str:
         """Return that table and robot file count joint values differently, and what to check and to write."""
-        equally = " (both explain the data equally well)" if self.same else ""
+        equally = ""
+        if self.same:
+            far = ", or ".join(f"{three_digits(1e3 * each.moved)} mm" for each in (self, *self.same))
+            equally = f" (these explain the data equally well, with a reflector {far} from its stated place)"
         return (
             f"Table and robot file count joint values differently: {self.explanations}{equally}. The result holds for "
             f"joint values as the table counts them. Look at the pendant: if the controller counts so, {WRITE}; if it "
@@ -324,7 +330,8 @@ def _judged(
     low, high = np.where(_turning(robot), [[-np.pi], [np.pi]], [measured.min(axis=0), measured.max(axis=0)])
     elsewhere = rng.uniform(low, high, (COMPARED, robot.dof))
     zeros = [_gauged(robot, zero) for zero in fits.zero]
-    plain = [_plain(*each) for each in zip(sign, zeros, strict=True)]
+    moved = np.linalg.norm(fits.tools - Candidates.of([points]).stated, axis=-1).max(axis=-1)  # of reflectors
+    plain = [_plain(*each) for each in zip(sign, zeros, moved, strict=True)]
     same = 0.5 * max(least, LEAST_NOISE)
     alike: list[list[int]] = []  # fits that predict the same elsewhere, the plainest first, with that prediction
     predictions: list[Array] = []
@@ -358,11 +365,14 @@ def _judged(
     behind = _behind_a_mirror(points, MIRRORED * left[i])
     if plain[i][0] <= 2:  # as few changes as a mirror and a joint
         behind = [name for name in behind if name == AS_STATED]
-    again = {plain[k]: k for k in alike[first] if plain[k][0] == plain[i][0] and plain[k] != plain[i]}
-    same_robot = [Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof)) for _, k in sorted(again.items())]
+    again: dict[str, Alternative] = {}
+    for k in sorted(alike[first], key=plain.__getitem__):
+        if plain[k][0] == plain[i][0]:
+            also = Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof), moved=float(moved[k]))
+            again.setdefault(described(robot.joint_types, sign[k], zeros[k]), also)
     return JointMapping(
         robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others),
-        mirrored=AS_STATED in behind, behind=" or ".join(behind), same=tuple(same_robot),
+        mirrored=AS_STATED in behind, behind=" or ".join(behind), same=tuple(again.values())[1:], moved=float(moved[i]),
     )  # fmt: skip
 
 
@@ -399,7 +409,8 @@ def _gauged(robot: Robot, zero: Array) -> Array:
     return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < np.radians(2)), quarter, zero)
 
 
-def _plain(sign: Array, zero: Array) -> tuple[int, int, float, tuple[float, ...]]:
-    """How far a mapping is from the stated one: joints that change, reversed ones, size of the zeros, then signs."""
-    changed = (sign < 0) | (np.abs(zero) > NEAR_ZERO)
-    return int(changed.sum()), int((sign < 0).sum()), round(float(np.abs(zero).sum()), 2), tuple(sign.tolist())
+def _plain(sign: Array, zero: Array, moved: float) -> tuple[int, int, int, float, tuple[float, ...]]:
+    """How far a mapping is from the stated one: joints that change, reflectors, reversed joints, zeros, then signs."""
+    reverse = sign < 0
+    changed = int((reverse | (np.abs(zero) > NEAR_ZERO)).sum())
+    return changed, int(moved / SAME_TOOL), int(reverse.sum()), round(float(np.abs(zero).sum()), 2), tuple(sign.tolist())
