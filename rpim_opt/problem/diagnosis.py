@@ -662,18 +662,18 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     first, second = (fit_points(part) for part in parted[place])
     if points.lengths:
         far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
-        other, what = "anchor", "the anchor or the robot's base moved"
+        other, what, column = "anchor", "the anchor or the robot's base moved", "session"
     else:  # the second part's points by the other base
         there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
         far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
-        other, what = "base", "the instrument or the robot's base moved"
+        other, what, column = "base", "the instrument or the robot's base moved", "session"
     reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
     if reflectors > far:
-        other, what, far = "reflector", "the reflector was exchanged", reflectors
+        other, what, far, column = "reflector", "the reflector was exchanged", reflectors, "marker"
     yield (
         f"from row {problem.data.label[points.row[place]]} on the points fit another {other}, "
         f"{three_digits(1e3 * far)} mm away: {what}; calibrate the two parts separately, or name them "
-        "in a column `session`."
+        f"in a column `{column}` of the raw table (rpim-opt new)."
     )
 
 

@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source, in_parts
@@ -101,7 +102,9 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         own = turned & (marker == name)
         turn = (base @ flange[own])[:, :3, :3].transpose(0, 2, 1) @ measured[own, :3, :3]
         places[name] = frame_numbers(rigid(proper(turn.sum(axis=0)), places[name][:3]))
-    return frame_numbers(base), places, how
+    missed = transformed(base @ flange, np.array([places[name][:3] for name in marker.tolist()])) - y
+    error = 1e3 * float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
+    return frame_numbers(base), places, f"{how}; RMS error of the nominal robot {three_digits(error)} mm"
 
 
 APART = 0.1
