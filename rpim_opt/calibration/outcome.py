@@ -30,7 +30,7 @@ from rpim_opt.calibration.covariance import (
 )
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPrice
 from rpim_opt.calibration.loop import Iteration
-from rpim_opt.convex.constraints import Parsed
+from rpim_opt.convex.constraints import Box, Parsed, name_of
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
@@ -549,6 +549,15 @@ class Outcome:
     def _multipliers(self) -> Sequence[Array]:
         """Multipliers of the formulation's constraints."""
         return self.program.beginning(self.z).solve(self.weight).duals
+
+    @property
+    def active_constraints(self) -> list[str]:
+        """Names of the formulation's own constraint functions that hold the solution, on which intervals rest."""
+        functions = [each for each in enumerate(self.formulation.constraints) if not isinstance(each[1], Box | Parsed)]
+        if not functions or not self.formulation.solvable:
+            return []
+        least = ACTIVE * max(self.program.objective(self.z, self.weight), ACTIVE)
+        return [name_of(each, k) for k, each in functions if np.abs(self._multipliers[k]).max(initial=0.0) > least]
 
     @cached_property
     def actively_constrained(self) -> tuple[str, ...]:

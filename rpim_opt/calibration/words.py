@@ -147,6 +147,11 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
             f"Deviations beyond the tolerance ([tolerance]): {names}. Only formulation 'bounded' enforces them."
         )
     lines += [price.sentence() for price in result.shadow_prices]
+    if result.active_constraints:
+        lines.append(
+            f"Active constraints: {joined(result.active_constraints)}. Standard deviations and intervals are conditional "
+            "on them: too small where these do not hold for the robot."
+        )
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result file cannot hold: it cannot be solved again.")
     if result.record.noise_assumed:

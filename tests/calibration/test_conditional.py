@@ -33,6 +33,18 @@ def test_a_parameter_that_is_held_has_no_width_and_the_others_those_of_a_problem
     assert found == pytest.approx(expected, rel=1e-6)
 
 
+def test_intervals_say_on_which_own_constraints_they_rest() -> None:
+    def longer(_: Any, p: Any) -> Any:
+        return p.x["a3"] + p.x["d4"] >= 2e-3
+
+    def wide(z: Any, _: Any) -> Any:
+        return cp.norm(z) <= 1e3
+
+    result = ro.calibrate(PROBLEM, stated(longer, wide, lambda z, p: p.x["a2"] == 0), 1.0)
+    assert result.active_constraints == ["longer", "constraint 3"]
+    assert "Active constraints: longer and constraint 3. " in str(result)
+
+
 @pytest.mark.parametrize(
     "constraint",
     [
