@@ -149,8 +149,8 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
     lines += [price.sentence() for price in result.shadow_prices]
     if result.active_constraints:
         lines.append(
-            f"Active constraints: {joined(result.active_constraints)}. Standard deviations and intervals are conditional "
-            "on them: too small where these do not hold for the robot."
+            f"Active constraints: {joined(result.active_constraints)}. Standard deviations and intervals are "
+            "conditional on them: too small where these do not hold for the robot."
         )
     if not result.formulation.solvable:
         lines.append("The formulation has functions that the result file cannot hold: it cannot be solved again.")

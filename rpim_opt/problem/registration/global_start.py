@@ -413,4 +413,5 @@ def _plain(sign: Array, zero: Array, moved: float) -> tuple[int, int, int, float
     """How far a mapping is from the stated one: joints that change, reflectors, reversed joints, zeros, then signs."""
     reverse = sign < 0
     changed = int((reverse | (np.abs(zero) > NEAR_ZERO)).sum())
-    return changed, int(moved / SAME_TOOL), int(reverse.sum()), round(float(np.abs(zero).sum()), 2), tuple(sign.tolist())
+    size = round(float(np.abs(zero).sum()), 2)
+    return changed, int(moved / SAME_TOOL), int(reverse.sum()), size, tuple(sign.tolist())
