@@ -425,7 +425,7 @@ def _held_out(
     if not count:
         sentence = f"None of the {rows} held-out rows is in the region"
     if excluded:
-        sentence += f". Not counted: {listed(excluded, MOST)}, excluded from the fit to all rows"
+        sentence += f". Not counted: held-out rows {listed(excluded, MOST)}, excluded from the fit to all rows"
     document: dict[str, Any] = {"rows": rows, "in_region": count, "largest_mm": largest, "missing": missing}
     document |= {"beyond": beyond, "excluded": excluded, "coverage95": held.coverage, "sentence": f"{sentence}."}
     return document, missed, lacking

@@ -329,7 +329,9 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
         same = (y == y[:, :1]).all(axis=1)
         for value in np.unique(y[same, 0]):
             labels = [data.label[i] for i in block.row[same & (y[:, 0] == value)]]
-            what = f"{_rows(labels, 'has', 'have')} {value:g} for every measured coordinate"
+            unit, si = display("length")
+            number = f"{value / si:g} {unit}" if value else "0"
+            what = f"{_rows(labels, 'has', 'have')} {number} for every measured coordinate"
             yield f"{what}: missing measurements? Exclude such rows ([exclude])."
         arm = problem.arms[block.robot]
         sliding = np.array(arm.joint_dimensions) == "length"

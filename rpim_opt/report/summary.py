@@ -134,8 +134,8 @@ def headline(result: Calibration) -> str:
         excluded = excluded_by_fit(result)
         if excluded and np.isfinite(held.error).any():
             sentence += (
-                f" Not counted: {listed(excluded)}, excluded from the fit to all rows; with all held-out rows the mean "
-                f"error is {mm(1e3 * float(np.nanmean(held.error)))} mm."
+                f" Not counted: held-out rows {listed(excluded)}, excluded from the fit to all rows; with all "
+                f"of them the mean error is {mm(1e3 * float(np.nanmean(held.error)))} mm."
             )
     if result.record.earlier:
         last = result.record.earlier[-1]
