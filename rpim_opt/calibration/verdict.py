@@ -21,9 +21,9 @@ from rpim_opt.problem.diagnosis import NOTICED, decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.frames import ridge_deviations
+from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.row_functions import measured_torques
-from rpim_opt.robot.parameters import own_name
+from rpim_opt.robot.parameters import frame_of, own_name
 
 BAD = "Larger than expected"
 """Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
@@ -45,6 +45,7 @@ WORSE = 3.0  # standard errors by which squared errors on held-out rows are abov
 ROWS = 12  # rows below which a standard error of squares says too little, and only twice the nominal error counts
 UPWARD = 5.0  # standard deviations by which a compliance is below zero, which gravity cannot cause
 NOTABLE = 0.5  # effect of a joint's compliance over the largest, below which wrong masses explain its sign
+ELSEWHERE = 0.5  # part of the residuals that identifying the base may leave before its statement is called wrong
 HOPELESS = 20.0  # residuals over the stated noise from which something is said even if nothing explains them
 SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
@@ -352,7 +353,7 @@ def likely_causes(result: Outcome) -> list[str]:
     ordered = _in_table_order(result, problem)
     shared = _of_any_fit(result, problem)
     if signs or not result.converged:
-        causes = _limited_by_formulation(result, problem, kept)
+        causes = _held_base(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
     elif (other := _other_robot(result, problem)) is not None:
         causes = [other.sentence]
@@ -361,7 +362,8 @@ def likely_causes(result: Outcome) -> list[str]:
         if causes:
             causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
         if not causes and noticed and len(problem.arms) == 1:
-            limits = [f"{BAD}: residuals; {text}" for text in _limited_by_formulation(result, problem, kept)]
+            limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)]
+            limits = [f"{BAD}: residuals; {text}" for text in limits]
             causes = [] if limits else list(diagnosis.shown_by_residuals(*_without_outliers(result, ordered)))
             shared += limits
     if noticed:
@@ -409,6 +411,24 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
     if share[worst] > 1:
         unit = "mm" if free.dimensions[worst] == "length" else "mrad"
         yield f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}"
+
+
+def _held_base(result: Outcome, problem: CalibrationProblem) -> list[str]:
+    """Say that a base that is not identified is elsewhere than stated."""
+    p = problem.parameters
+    base = np.array([frame_of(name) == "base_" for name in p.names])
+    if p.identified[base].all() or len(problem.arms) > 1:
+        return []
+    freed = problem.identifying(p.identified | base)
+    located = fitted_frames(freed)[0].parameters
+    freed = freed.with_parameters(replace(located, identified=freed.parameters.identified))
+    now, then = (rms(each.errors(x)) for each, x in ((problem, result.x), (freed, ridge_deviations(freed))))
+    if then > ELSEWHERE * now:
+        return []
+    return [
+        "the base is not identified, and not where it is stated: with `base_*` in `identify` residuals are "
+        f"{three_digits(1e3 * then)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
+    ]
 
 
 def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: np.ndarray) -> list[str]:

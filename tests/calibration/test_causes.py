@@ -422,6 +422,16 @@ def test_another_unit_from_halfway_on_is_named() -> None:
         assert "as radians, not degrees" in said
 
 
+def test_a_base_that_is_held_elsewhere_is_named() -> None:
+    problem = simulated_arm("ur5e")
+    p = problem.parameters
+    base = np.array([name.startswith("base_") for name in p.names])
+    held = problem.with_parameters(replace(p, nominal=np.where(base, p.nominal + 0.5, p.nominal)))
+    found = ro.calibrate(held.identifying(p.identified & ~base))
+    assert not found.verdict.delivered
+    assert any("the base is not identified" in reason for reason in found.verdict.reasons)
+
+
 def test_misread_orientations_are_named() -> None:
     """Positions alone may fit well."""
     problem = ro.load("pose").problem
