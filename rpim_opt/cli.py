@@ -7,10 +7,11 @@ import atexit
 import gc
 import os
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from functools import wraps
+from importlib import import_module
 from importlib.metadata import entry_points
 from inspect import Parameter, signature
 from pathlib import Path
@@ -24,6 +25,7 @@ import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
 from rpim_opt.basics.files import inside, refused, sha256_of
 from rpim_opt.basics.text import listed, progress_bar, table
+from rpim_opt.basics.units import parse_units
 from rpim_opt.report import console
 
 HELP = """Robot calibration by convex optimization.
@@ -102,11 +104,21 @@ def _common(
         gc.set_threshold(GARBAGE_THRESHOLD)
 
 
+def _completed(names: Callable[[], Iterable[str]]) -> Callable[[str], list[str]]:
+    return lambda incomplete: [name for name in names() if name.startswith(incomplete)]
+
+
 Text = str | None
 Number = float | None
 File = Path | None
 Choice = bool | None
-Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.")]
+SHIPPED = _completed(lambda: sorted(path.parent.name for path in ro.store.problems_folder().glob("*/problem.toml")))
+FORMULATIONS = _completed(lambda: import_module("rpim_opt.convex.formulation").FORMULATIONS)
+SELECTORS = _completed(lambda: ["learned", *import_module("rpim_opt.convex.select").SELECTORS])
+ROBOTS = _completed(lambda: ro.robots())
+MODELS = _completed(lambda: ("auto", "geometry"))
+COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
+Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
 RULES = "learned (estimated prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
 PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated noise), free (both), declared (none)."
@@ -192,7 +204,7 @@ class Tables(NamedTuple):
     def options(self) -> "ro.data.TableOptions":
         """The options as functions take them."""
         stated: dict[str, Any] = self._asdict()
-        stated["within"] = stated.pop("time_tolerance")
+        stated |= {"units": parse_units(self.units), "within": stated.pop("time_tolerance")}
         stated["columns"] = tuple(map(str.strip, self.columns.split(","))) if self.columns else ()
         return ro.data.TableOptions(**{**stated, "constants": tuple(console.listed_words(self.constants))})
 
@@ -240,7 +252,7 @@ def command(function: Callable[..., Answer]) -> Callable[..., Answer]:
 @command
 def new(
     folder: Annotated[Path, Argument(help="Problem folder to create, or with --chain to extend.")],
-    robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.")],
+    robot: Annotated[str, Option(help="A ready robot (see rpim-opt robots), or a robot file.", autocompletion=ROBOTS)],
     data: Annotated[list[Path], Option(help="Joint and measured values: text, Excel, Parquet; stacked or joined.")],
     tables: Tables = TABLES,
     dry_run: Annotated[bool, Option("--dry-run", help="Check everything and write nothing.")] = False,
@@ -303,10 +315,10 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
 def calibrate(
     problem: Problem,
     variant: Variant = None,
-    selector: Annotated[Text, Option(help=RULES)] = None,
-    model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.")] = None,
-    formulation: Annotated[Text, Option(help=READY)] = None,
-    noise: Annotated[Text, Option(help=PARTS)] = None,
+    selector: Annotated[Text, Option(help=RULES, autocompletion=SELECTORS)] = None,
+    model: Annotated[Text, Option(help="auto: extensions by evidence; geometry: none.", autocompletion=MODELS)] = None,
+    formulation: Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)] = None,
+    noise: Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
     use_validation: Annotated[Choice, Option(help="Refit with the validation rows; default: if held out.")] = None,
     limit: Tolerance = None,

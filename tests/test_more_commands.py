@@ -34,7 +34,7 @@ def test_a_table_of_candidates_keeps_its_labels(monkeypatch: pytest.MonkeyPatch,
     assert all(float(q) == 10 * int(label[1:]) for label, q in zip(chosen["label"], chosen["q1_deg"], strict=True))
 
 
-def test_numbers_and_units_are_checked_before_a_folder_is_calibrated(
+def test_numbers_units_and_the_base_are_checked_before_a_folder_is_made(
     monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any
 ) -> None:
     problem = ro.load("position").problem
@@ -48,8 +48,10 @@ def test_numbers_and_units_are_checked_before_a_folder_is_calibrated(
     assert "--units m does not apply: the header has 'Z [mm]' in mm." in capsys.readouterr().out
     file.write_text("\n".join([names.format(""), *table]))
     assert run(monkeypatch, *arguments, "--units", "deg,m") == 0
-    assert run(monkeypatch, "inspect", arguments[1]) == 0
-    assert "with measured lengths a thousand times smaller" in capsys.readouterr().out
+    assert "implausibly far away: are the units right?" in capsys.readouterr().out
+    file.write_text("\n".join([names.format(" [um]"), *table]))
+    assert run(monkeypatch, *arguments[:1], str(tmp_path / "small"), *arguments[2:], "--dry-run") == 0
+    assert "mm RMS, those of the nominal flange by" in capsys.readouterr().out
     file.write_text("\n".join([names.format(" [mm]"), *table[:-1], table[-1].rpartition(",")[0] + ",abc"]))
     arguments[1] = str(tmp_path / "other")
     assert run(monkeypatch, *arguments, "--dry-run") == 2

@@ -43,7 +43,11 @@ class Table(BaseModel):
             key = error.where.removeprefix("key ") if error.where.startswith("key ") else ""
             raise Misfit(key, error.found, error.accepted) from None
         converted = {key: value for key, value in table.items() if key not in others}
-        return converted | {stem: value for (stem, _), value in values.items()}
+        for (stem, _), value in values.items():
+            if stem in converted:
+                raise Misfit(stem, "the same quantity twice", "one of them")
+            converted[stem] = value
+        return converted
 
 
 def validate(model: type[Model], content: dict[str, Any], file: object, table: str = "") -> Model:

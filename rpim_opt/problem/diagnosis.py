@@ -1089,6 +1089,19 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
     remedy = "check the instrument's zero and the reflector's radius"
     offset = "measured distances are {} mm too long"
     yield Addition(along[:, [1]], lambda c: (offset.format(three_digits(1e3 * c[0])), remedy), SMALL)
+    if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
+        flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
+        radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
+        turn = np.column_stack([-y[:, 1], y[:, 0], np.zeros(len(y))])
+        rise = np.column_stack([-y[:, :2] * y[:, [2]] / np.maximum(flat, 1e-9), flat])
+        sines = np.hstack([y[:, :2] / np.maximum(flat, 1e-9), flat / radius, y[:, [2]] / radius])
+        parts = [rise, *(sines[:, [k]] * (turn if k < 2 else rise) for k in range(4))]
+        circles = np.column_stack([np.sum(of_axis * each, axis=1) for each in parts])
+        said = (
+            "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of its circles)"
+        )
+        remedy = "measure in both faces, and have it checked"
+        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), remedy), SMALL)
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is {{}} too long", "check its scale")
         if i != j:

@@ -30,7 +30,7 @@ from rpim_opt.problem.registration.frames import locate, starting_cameras, start
 from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, placed, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
-from rpim_opt.robot.kinematics import FRAME, numeric_frame
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.library import READY, find_source, read_arm
 from rpim_opt.robot.mdh import MDH, MOUNTINGS
 from rpim_opt.robot.parameters import frame_of, model_parameters
@@ -44,6 +44,8 @@ SHARED = (
 )
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
+FARTHEST = 50.0  # distance from the instrument to a base beyond which the units are likely wrong [m]
+UNLIKE = 5.0  # ratio of the spreads of measured points and of the nominal flange from which on units are likely wrong
 UPRIGHT = 0.9  # Cosine of the angle between two directions of gravity above which they are the same mounting.
 
 
@@ -379,12 +381,23 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
         how = f"Guessed: the base was registered {offset:.1f} mm from the robot's own: data are in its frame."
         return arm.base, how
+    if np.linalg.norm(located[:3]) > FARTHEST:
+        verdict = "implausibly far away: are the units right?"
     how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
     down = -numeric_frame(located)[2, :3]
     if down @ arm.robot.gravity.direction < UPRIGHT and not kind.by_camera:
         close = [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]
         stated = toml(close[0] if close else down.round(3).tolist())
         how += f" If the instrument's z points up, the robot is mounted otherwise than assumed: mounting = {stated}."
+    blocks = [block for block in rows.blocks if block.measurement.registers]
+    seen = np.vstack([block.y[:, :3] for block in blocks])
+    flange = np.vstack([forward_kinematics(arm.robot, block.q[:, 0])[:, :3, 3] for block in blocks])
+    measured, nominal = (1e3 * float(np.linalg.norm(points.std(axis=0))) for points in (seen, flange))
+    if not nominal / UNLIKE < measured < nominal * UNLIKE:
+        how += (
+            f" The measured points spread by {measured:.3g} mm RMS, those of the nominal flange by {nominal:.3g} mm: "
+            "are the units right?"
+        )
     return None, how
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import permutations
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +29,14 @@ from rpim_opt.problem.misreadings import pose_misfit
 from rpim_opt.robot.chain import Described
 
 CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.
+USUAL = "extrinsic xyz"
 SINCE_1970 = 1e8  # times [s] that are larger; others may begin anew in every file
+READINGS = {
+    "quaternion": ORDERS,
+    "rotation": (USUAL, "vector", *(f"intrinsic {''.join(order)}" for order in permutations("xyz") if order[0] != "z"),
+                 "intrinsic zxy"),
+}  # fmt: skip
+"""What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
 Files = Sequence[tuple[Path | None, RawTable]]
 
 
@@ -126,9 +134,9 @@ def understand_of(
         tables = _tables(files, arm, kind, options, targets)
         stems = set().union(*(each.stems for each in tables))
         if known or any(set(form) <= stems for form in (kind.columns, *(form for form, _ in kind.forms))):
-            if kind.turning and not targets and any(each.doubt for each in tables):
-                return _with_order(files, arm, kind, options)
-            return _whole(files, arm, kind, options, tables)
+            understanding = _whole(files, arm, kind, options, tables)
+            doubt = next((each.doubt for each in tables if each.doubt and kind.turning and not targets), "")
+            return _checked(understanding, files, arm, doubt) if doubt else understanding
     names = ", ".join(name for _, raw in files for name in raw.columns)
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
@@ -207,19 +215,26 @@ def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: s
     return tuple(replace(table, meant=tuple(map(told, table.meant))) for table in tables)
 
 
-def _with_order(files: Files, arm: Described, kind: Measurement, options: TableOptions) -> Understanding:
-    """Return poses with the order of a quaternion's components that fits the nominal robot, and say both figures."""
-    orders: dict[str, Understanding] = {}
+def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:
+    """Return poses with the order of a quaternion that fits the nominal robot; refuse turns that are not as usual."""
+    alternatives: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}
-    for order in ORDERS:
-        stated = replace(options, quaternion=order)
-        orders[order] = _whole(files, arm, kind, stated, _tables(files, arm, kind, stated))
-        data = read_data(orders[order].columns, arm.robot, {"position_mm": 1.0, "orientation_mrad": 1.0}, kind)
-        misfit[order] = float(np.degrees(pose_misfit(arm.robot, data)))
-    best, second = sorted(ORDERS, key=lambda order: misfit[order])
-    figures = f"{best} {misfit[best]:.2f} deg, {second} {misfit[second]:.2f} deg"
+    noise = {"position_mm": 1.0, "orientation_mrad": 1.0}
+    for reading in READINGS[doubt]:
+        options = replace(first.options, **{doubt: reading})
+        alternatives[reading] = _whole(files, arm, first.kind, options, _tables(files, arm, first.kind, options))
+        data = read_data(alternatives[reading].columns, arm.robot, noise, first.kind)
+        misfit[reading] = float(np.degrees(pose_misfit(arm.robot, data)))
+    best, second = sorted(misfit, key=lambda reading: misfit[reading])[:2]
+    figures = ", ".join(f"{reading} {misfit[reading]:.2f} deg" for reading in (best, second))
+    if doubt == "rotation":
+        if misfit[USUAL] <= CLEARLY * misfit[best]:
+            return first
+        missed = f"rotations with nominal errors of {misfit[USUAL]:.2f} deg as {USUAL}, and {figures}"
+        accepted = f"--rotation '{best}' if correct, or '{USUAL}'"
+        raise InputError("rx, ry, rz", missed, accepted, first.file)
     if misfit[second] <= CLEARLY * misfit[best]:
         accepted = "--quaternion wxyz or xyzw, or names qw, qx, qy, qz"
-        raise InputError("the order of the quaternion", f"an ambiguous order ({figures})", accepted, orders[best].file)
+        raise InputError("the order of the quaternion", f"an ambiguous order ({figures})", accepted, first.file)
     note = f"the quaternion's order is {best}: nominal rotation errors {figures}."
-    return replace(orders[best], notes=(*orders[best].notes, note))
+    return replace(alternatives[best], notes=(*alternatives[best].notes, note))

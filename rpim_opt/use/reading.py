@@ -64,7 +64,7 @@ def read_targets(
     oriented = not stems.isdisjoint({"qw", "rx", "r11"})
     positions = oriented or not stems.isdisjoint("xyz")  # without x, y, z an orientation is refused as half a pose
     with in_file(source):
-        if any(each.doubt for each in understanding.tables):
+        if any(each.doubt == "quaternion" for each in understanding.tables):
             raise InputError("the header", "a quaternion whose components are numbered", "names qw, qx, qy, qz")
         if not joints and not positions:
             raise InputError("the header", "no targets", "columns q1_deg, ..., or x_mm, y_mm, z_mm, or both")

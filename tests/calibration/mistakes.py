@@ -345,6 +345,15 @@ def commanded(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
     return values(lambda y: reached.modelled(np.zeros(len(problem.parameters.free)))[0])(whole)
 
 
+def of_worn_circles(y: np.ndarray) -> np.ndarray:
+    """Return positions by an instrument whose vertical circle has an index error of 5 mrad, and an eccentric one."""
+    radius, azimuth = np.linalg.norm(y, axis=1), np.arctan2(y[:, 1], y[:, 0])
+    elevation = np.arcsin(y[:, 2] / radius) + 5e-3
+    azimuth += 3e-3 * np.sin(azimuth + 0.7)
+    flat = radius * np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.sin(elevation)])
+
+
 def to_zenith(y: np.ndarray) -> np.ndarray:
     """Return azimuth and zenith angle [gon], read as millimetres, and distance."""
     radius, azimuth = np.linalg.norm(y, axis=1), np.arctan2(y[:, 1], y[:, 0])
@@ -388,6 +397,7 @@ IN_TABLES |= {
         "fit the joint values of the next row",
     ),
     "commanded degrees": (commanded, "they are the commanded values"),
+    "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
     "mirrored, and joint 1 reversed": (
         both(values(lambda y: y * [1, -1, 1]), flipped(0)),
         "left-handed measured frame with joint 1 reversed",

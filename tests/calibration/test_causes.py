@@ -82,6 +82,7 @@ QUICK = {
         "a column in centimetres",
         "joint 2 from 90 degrees and joint 3 reversed",
         "tracker moved by 300 mm",
+        "worn circles of the instrument",
         "zenith angles in gon",
     ],
 }

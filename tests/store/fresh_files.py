@@ -178,8 +178,6 @@ FRESH: dict[str, Shape] = {
     "a row a joint": many(("axes.csv", text([["pose", "joint", "angle [deg]"]], JOINT_ROWS)), ("points.csv", text([["pose", *HEAD[7:]]], beside(NAMED, POINTS)))),
     "rows counted from 0 and from 1": many(("joints.csv", text([HEAD[:7]], beside([[str(i)] for i in range(COUNT)], JOINTS))), ("points.csv", text([[HEAD[0], *HEAD[7:]]], beside([[str(i + 1)] for i in range(COUNT)], POINTS)))),
     "LabVIEW": one(labview(), "raw.lvm", **BOTH),
-    "TUM trajectory, joints by time": many(
-        ("trajectory.txt", trajectory()), ("joints.csv", clocked_joints()), kind="pose", **IN_SI, **{"time-tolerance": "0.01"}
-    ),
+    "TUM trajectory, joints by time": many(("trajectory.txt", trajectory()), ("joints.csv", clocked_joints()), kind="pose", **IN_SI),
     "KUKA trace beside a tracker": one(trace(), **BOTH),
 }  # fmt: skip

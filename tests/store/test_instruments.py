@@ -13,7 +13,7 @@ import rpim_opt as ro
 from rpim_opt.robot.formats.tables import write_robot
 from tests.simulate import ARM
 from tests.store.fresh_files import FRESH
-from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, STRANGERS, krl
+from tests.store.instrument_files import INSTRUMENTS, REFUSED_THOUGH_RIGHT, RPY, STRANGERS, krl
 from tests.store.raw_files import (
     HEAD,
     JOINTS,
@@ -138,13 +138,14 @@ def turns(folder: Path, angles: Rows) -> None:
     (folder / "raw.csv").write_text(text([head], beside(ROWS, angles)))
 
 
-def test_what_turns_are_is_printed_and_another_convention_is_named(monkeypatch, capsys, empty) -> None:
+def test_turns_in_another_convention_are_asked_for_and_what_they_are_is_printed(monkeypatch, capsys, empty) -> None:
     intrinsic = cells(Rotation.from_matrix(T[:, :3, :3]).as_euler("XYZ", degrees=True))
     turns(empty, intrinsic)
+    assert new(monkeypatch, "raw.csv") == 2
+    assert "--rotation 'intrinsic xyz'" in capsys.readouterr().err
+    turns(empty, RPY)
     assert new(monkeypatch, "raw.csv") == 0
     assert "measured roll (extrinsic xyz)" in capsys.readouterr().out
-    assert run(monkeypatch, "inspect", "cell") == 0
-    assert "--rotation 'intrinsic xyz'" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(

@@ -32,6 +32,8 @@ SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 
 SAME = 0.8
 """Share of the shorter one's values that two columns of other names have in common where they are one key."""
 OTHER_KEYS = "--key row for rows in the same order, or --time-tolerance for the nearest time"
+SIMULTANEOUS = 0.01
+"""Times that differ by less than this part of the shortest time between rows are those of one row."""
 LOG, MOVED = 2, 0.01
 """Rows of joints a measured one from which on they are a log, and the change of a joint [deg] that is named."""
 SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
@@ -121,7 +123,7 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
 
 
 def _by_key(joints: Understood, values: Understood, key: str) -> Match:
-    """Return the rows of equal keys."""
+    """Return the rows of equal keys; where none are equal and all times nearly are, of the nearest times."""
     chosen = _key(joints, values, key)
     count = len(chosen.left)
     if sorted([chosen.left, chosen.right]) == [[str(i) for i in range(k, k + count)] for k in (0, 1)]:
@@ -132,6 +134,9 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
         raise InputError(f"the key {chosen.how}", f"'{twice}' twice in {joints.file}", "unique keys")
     right = [i for i, name in enumerate(chosen.right) if name in place]
     if not right:
+        within = _clock_tolerance(joints, values)
+        if within and not key:
+            return _by_time(joints, values, key, within)
         names = [f"{side.file} ({listed(keys, 3)})" for side, keys in ((joints, chosen.left), (values, chosen.right))]
         found = f"no common value in {' and '.join(names)}"
         raise InputError(f"the key {chosen.how}", found, f"--key with a column of common values, {OTHER_KEYS}")
@@ -290,6 +295,15 @@ def _motion(joints: Understood, times: Array, rows: np.ndarray, moments: Array) 
             values = np.degrees(unit.si * np.array([numeral(str(cell)) for cell in cells]))
             largest = np.fmax(largest, np.abs(np.interp(moments, times[order], values[order]) - values[rows]))
     return largest
+
+
+def _clock_tolerance(joints: Understood, values: Understood) -> float:
+    """Return a small part of the time between rows [s] where every measured row has a partner within it, else 0."""
+    if any(time_column(side.raw) is None or len(side.labels) < 2 for side in (joints, values)):
+        return 0.0
+    there, then = (_times(side, "")[1] for side in (joints, values))
+    within = SIMULTANEOUS * float(min(np.diff(np.sort(there)).min(), np.diff(np.sort(then)).min()))
+    return within if len(partners(there, then, within)[1]) == len(then) else 0.0
 
 
 def _times(table: Understood, key: str) -> tuple[str, Array]:

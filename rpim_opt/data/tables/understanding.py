@@ -57,16 +57,17 @@ class Meant(NamedTuple):
 class Understood:
     """A raw table with canonical names.
 
-    ``columns`` are cells by our names, ``raw`` those of the file by its names in lower case, of the same rows. With
-    ``doubt`` only a check against the robot shows the order of a quaternion's components. Of several files as one,
-    ``file`` is the first, and ``keys`` are the columns that joined them, in lower case.
+    ``columns`` are cells by our names, ``raw`` those of the file by its names in lower case, of the same rows. What
+    ``doubt`` is names the option that says how orientations are to be read where only a check against the robot shows
+    it: ``quaternion``, ``rotation``. Of several files as one, ``file`` is the first, and ``keys`` are the columns that
+    joined them, in lower case.
     """
 
     columns: Columns
     raw: Columns
     meant: tuple[Meant, ...]
     notes: tuple[str, ...]
-    doubt: bool = False
+    doubt: str = ""
     file: str = "the table"
     keys: Sequence[str] = ()
 
@@ -118,8 +119,7 @@ def understand(
     if "rx" in known and rotation not in ("", "extrinsic xyz"):
         columns, meant = _as_quaternions(columns, meant, rotation)
     of_file = {name.lower(): cells for name, cells in raw.columns.items()}
-    doubt = not options.quaternion and bool(quaternion_columns(read, robot.dof))
-    table = Understood(columns, of_file, tuple(meant), raw.notes, doubt)
+    table = Understood(columns, of_file, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
     if not targets:
         table = _rows_with_values(table, robot, kind)
     notes = list(table.notes)
@@ -144,6 +144,15 @@ def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> 
     new = {"meaning": meaning_of_turn, "name": "qw, qx, qy, qz", "unit": ""}
     meant = [each._replace(**new) if each.name in turned else each for each in meant]
     return others | known_names.quaternions(np.column_stack(angles), rotation), meant
+
+
+def _doubt(read: Readings, robot: Robot, options: TableOptions, rotation: str) -> str:
+    """Return the option that only a check against the robot decides, or nothing."""
+    if not options.quaternion and quaternion_columns(read, robot.dof):
+        return "quaternion"
+    turns = [name for name, each in read.items() if each.stem in TURNED and recognize(split(name)[0]).stem in TURNED]
+    named = any(re.search("roll|pitch|yaw", name, re.IGNORECASE) for name in turns)
+    return "rotation" if len(turns) == 3 and not named and not rotation else ""
 
 
 # --- what every column holds ---------------------------------------------------------------------------------------
