@@ -689,6 +689,7 @@ BAD = {
     "another kind": (["validate", *RESULT, "later.csv", "--measurement", "pose"], ["'pose'", "position"]),
     "nothing to export": (["export", *RESULT], ["nothing to write", "--urdf", "--robodk"]),
     "nowhere to export": (["export", *RESULT, "--urdf", "arm.urdf"], ["--out", "arm.urdf"]),
+    "nothing for that file": (["export", *RESULT, "--mdh", "made.csv", "--out", "w.csv"], ["--out", "w.csv", "--urdf"]),
     "over the original": (["export", *RESULT, "--urdf", "arm.urdf", "--out", "arm.urdf"], ["is not overwritten"]),
     "another arm": (["export", *RESULT, "--urdf", "other.urdf", "--out", "made"], ["other.urdf", "differs from"]),
     "ending of a table": (["export", *RESULT, "--mdh", "made.txt"], ["made.txt", "ending in .toml"]),

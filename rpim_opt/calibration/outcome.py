@@ -384,11 +384,11 @@ class Outcome:
         return max(self.spread.noise_variance, 1.0)
 
     def noise_test(self) -> NoiseTest:
-        """Test the residuals against the stated measurement noise.
+        """Test the residuals against the measurement noise.
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
-        'Residuals agree with the stated measurement noise (ratio 1.02).'
+        'Residuals agree with the measurement noise (ratio 1.02).'
         """
         linear = self.squares
         repeatability = self.problem.repeatability

@@ -150,6 +150,10 @@ def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: Pa
     """Return the writers of corrected files: to ``out``, or of several into that folder."""
     if sources and out is None:
         raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
+    if out is not None and not sources:
+        raise InputError(
+            "--out", f"{out} without a file to correct", "--urdf, --ur-calibration, ...; --mdh names its own"
+        )
     place = Path(out or "")
     writers: list[Writer] = []
     for source, write in sources:
