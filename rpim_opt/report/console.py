@@ -65,18 +65,22 @@ def _close(stream: TextIO) -> None:
 def progress() -> Iterator[Callable[[str], None]]:
     """Show the current step after one second, on an interactive terminal only."""
     from rich.console import Console
+    from rich.live import Live
+    from rich.spinner import Spinner
 
     console = Console(stderr=True)
-    status = console.status("starting")
-    timer = Timer(1.0, status.start)
+    step = Spinner("dots", "starting", style="status.spinner")
+    # what is printed meanwhile into a file or a pipe is not for the terminal
+    live = Live(step, console=console, transient=True, refresh_per_second=12.5, redirect_stdout=sys.stdout.isatty())
+    timer = Timer(1.0, live.start)
     timer.daemon = True
     if console.is_terminal:
         timer.start()
     try:
-        yield lambda text: status.update(text)
+        yield lambda text: step.update(text=text)
     finally:
         timer.cancel()
-        status.stop()
+        live.stop()
 
 
 def written_to(path: Path | None, text: str) -> list[Path]:

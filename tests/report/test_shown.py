@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from xml.etree import ElementTree
 
 import cvxpy as cp
@@ -10,6 +11,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.report import console
 
 INSTANCE = ro.load("position")
 RESULT = ro.calibrate(INSTANCE.problem, ro.tikhonov, weight=ro.reml)
@@ -124,3 +126,21 @@ def test_a_plot_of_a_result_marks_its_weight() -> None:
     loss, penalty = RESULT.program.value(RESULT.z)
     assert marked.get_xdata()[0] == pytest.approx(np.sqrt(loss), rel=1e-6)
     assert marked.get_ydata()[0] == pytest.approx(np.sqrt(penalty), rel=1e-6)
+
+
+def test_what_is_piped_while_a_command_works_stays_out_of_its_progress(monkeypatch, capsys) -> None:
+    class AtOnce:
+        def __init__(self, _: float, start: Callable[[], None]):
+            self.start = start
+
+        def cancel(self) -> None:
+            pass
+
+    monkeypatch.setattr(console, "Timer", AtOnce)
+    monkeypatch.setenv("FORCE_COLOR", "1")  # a terminal on stderr, and none on stdout
+    with console.progress() as say:
+        say("working")
+        console.show("the text")
+    said = capsys.readouterr()
+    assert said.out == "the text\n"
+    assert "working" in said.err
