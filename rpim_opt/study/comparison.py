@@ -425,12 +425,8 @@ def figures(rows: Rows, metric: str) -> dict[str, dict[Pair, float]]:
     for row in rows:
         own = of.setdefault(row["method"], {})
         if row.get(metric) is not None:
-            own[_pair(row)] = row[metric]
+            own[tuple(row[name] for name in SAME_DATA)] = row[metric]
     return of
-
-
-def _pair(row: Mapping[str, Any]) -> Pair:
-    return tuple(row[name] for name in SAME_DATA)
 
 
 def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[float | None, float | None, float | None]:

@@ -43,8 +43,6 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 """Methods without convex programming; ``nominal`` fits base and tools alone."""
 OK = "ok"
 UNCONVERGED = "not converged"
-IMPOSSIBLE = "impossible"
-FAILED = "failed"
 WITH_FIGURES = (OK, UNCONVERGED)  # statuses of replicates that have figures
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]
@@ -384,7 +382,7 @@ def replicate(
                 row |= {"status": UNCONVERGED, "reason": result.message}
         return row | values
     except InputError as error:
-        row |= {"status": IMPOSSIBLE, "reason": str(error)}
+        row |= {"status": "impossible", "reason": str(error)}
     except Exception as error:  # somebody's function, a solver: the other replicates go on
-        row |= {"status": FAILED, "reason": f"{type(error).__name__}: {error}"}
+        row |= {"status": "failed", "reason": f"{type(error).__name__}: {error}"}
     return {**row, **dict.fromkeys(metrics)}

@@ -111,7 +111,7 @@ class Compensation:
                 rows.append(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded}{self._at_limit(i)})")
             if rows:
                 lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
-        uncertain = int(self.uncertain.sum())
+        uncertain = np.count_nonzero((np.array(self.status) == ABOVE) & (self.position_error <= self.limit))
         for count, what in (
             (len(self.missed) - uncertain, "miss their target"),
             (uncertain, "reach their target by the model, with an uncertainty that is above the limit"),
@@ -137,11 +137,6 @@ class Compensation:
         if not np.isfinite(self.limit):
             far |= self.position_error > EXPANDED * self.std
         return [self.label[i] for i in np.flatnonzero(far)]
-
-    @property
-    def uncertain(self) -> np.ndarray:
-        """Which rows (N,) are above the limit by their uncertainty alone."""
-        return (np.array(self.status) == ABOVE) & (self.position_error <= self.limit)
 
     def _at_limit(self, row: int) -> str:
         """Return which joints of a row that misses its target are at a limit, as part of a sentence."""

@@ -82,8 +82,8 @@ def read_targets(
             raise InputError("column approach1", "directions of approach", accepted)
     torque = None if block.torque is None else block.torque[:, 0]
     targets = Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
-    every = [each for table in understanding.tables for each in table.meant]
-    turned = [each for each in every if each.name.startswith(("rx", "ry", "rz", "qw,"))]
+    angles = ("rx", "ry", "rz", "qw,")
+    turned = [each for table in understanding.tables for each in table.meant if each.name.startswith(angles)]
     if turned:
         meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
         understanding = replace(understanding, notes=(*understanding.notes, f"Orientation of targets: {meant}."))
