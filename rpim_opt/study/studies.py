@@ -325,9 +325,9 @@ def _resumed(path: Path, code: Mapping[str, str], resume: bool | None) -> dict[s
     content = read_bytes(path, LARGEST_DATA)
     try:  # of the lines that were finished
         stored = dict(json.loads(line) for line in content[: content.rfind(b"\n") + 1 or None].splitlines())
+        known = dict(stored.pop("code", {}))
     except (TypeError, ValueError):
         raise InputError("the file", "no journal of replicates", "--no-resume to start again", path) from None
-    known = stored.pop("code", {})
     if not stored:
         return {}
     if resume is None:
