@@ -236,10 +236,9 @@ def compensate(
     the flange frame [m] where they were identified without, by default as the problem states them.
 
     ``largest`` is the largest correction of a joint [rad or m], ``limit`` [m] what the position error left by the model
-    and its expanded uncertainty (k = 2) may be together; a command above it counts as one that misses its target. A
-    calibration that is not delivered, or that its acceptance test rejects, raises NotDelivered unless
-    ``despite_verdict``; InputError for shapes that do not
-    fit, numbers that are not finite, a reflector that is not known.
+    and its expanded uncertainty (k = 2) may be together. A calibration that is not delivered, or that its acceptance
+    test rejects, raises NotDelivered unless ``despite_verdict``; InputError for shapes that do not fit, numbers that
+    are not finite, a reflector that is not known.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")

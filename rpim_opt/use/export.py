@@ -279,10 +279,8 @@ def export_urdf(
 
     An identified base that lies near the file's root is the same frame, known better, and is written; elsewhere it is
     the instrument's own. The tip link stays where the file has it behind the last joint, unless ``tip_measured``: the
-    reflector (``marker`` of several) is the tip link's origin, which goes to its identified place. A reflector on the
-    flange is near the tip, and is not the tip. Returned is a sentence for each of the two frames that was identified,
-    the place in the frames of the file's links: of the root in the instrument's frame, of the reflector in the tip
-    link's.
+    reflector (``marker`` of several) is the tip link's origin, which goes to its identified place. Returned are
+    sentences on the places of root and reflector in the frames of the instrument and of the tip link.
 
     ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`, by
     default those that the robot was read between; ``despite_verdict`` as for `export_files`. InputError for several

@@ -47,8 +47,7 @@ def read_targets(
     Columns are joint values (``q1_deg``, ...), positions in the robot's base (``x_mm, y_mm, z_mm``), with
     ``qw, qx, qy, qz``, ``rx_deg, ry_deg, rz_deg`` or ``r11`` to ``r33`` poses, or both: joint values are then where to
     look for those of the pose. Optional: ``label``, torques ``tau1_Nm``, ..., ``payload_kg``. ``source`` and
-    ``options`` are as for `read_measurements`. InputError names the file, the row or column, what was found and what is
-    accepted.
+    ``options`` are as for `read_measurements`.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)

@@ -73,8 +73,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, theta and a follow; here beta2 and
     beta3 take the tilt and every number is near nominal.
 
-    ``nominal`` is the model, a ready robot such as ``read_robot(find_robot("ur5e"))``. An error names the file and the
-    key, what was found and what is accepted.
+    ``nominal`` is the model, a ready robot such as ``read_robot(find_robot("ur5e"))``.
 
     >>> import rpim_opt as ro
     >>> from rpim_opt.robot.library import find_robot
@@ -159,8 +158,6 @@ def read_ur_kinematics(path: str | Path) -> Described:
     ur_description). ur_description puts the angles into a URDF, so that they mean R = Rz Ry Rx, as here.
     ur_calibration computes them for R = Rx Ry Rz: a file from a controller therefore describes the robot only to
     the product of its small yaw angles (about 1e-4 rad) and the reach; `read_ur_calibration` has no such loss.
-
-    The file has plain keys, two spaces or more a level, one a line; joint limits are not in it.
 
     >>> import rpim_opt as ro
     >>> arm = ro.robot.read_ur_kinematics("kinematics.yaml")

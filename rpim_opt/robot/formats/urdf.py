@@ -59,16 +59,14 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
 
     ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
     `chain.describe` states the conventions. The chain goes up from the base to the links' common ancestor, through
-    reversed joints (a joint about axis w that is passed upwards turns about -w), and down to the tip: a camera in a
-    head sees a hand. Fixed joints are part of base, links and tool; limits are carried over (continuous joints, and
-    limits that are left out or equal, have none). Angles are roll, pitch, yaw, R = Rz Ry Rx, and an axis that is left
-    out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z of the chain's highest link, wherever the first
-    axis points, and pulls at the masses that the file states; where joints move the base itself, no masses are read.
+    reversed joints, and down to the tip: a camera in a head sees a hand. Fixed joints are part of base, links and tool;
+    limits are carried over (continuous joints, and limits that are left out or equal, have none). Angles are roll,
+    pitch, yaw, R = Rz Ry Rx, and an axis that is left out is x (wiki.ros.org/urdf/XML/joint). Gravity points along -z
+    of the chain's highest link and pulls at the masses that the file states; none where joints move the base itself.
 
-    ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the base. An error names the
-    file, the element, what was found and what is accepted: document types and entities, links or joints that are
-    missing, twice or in a cycle, values that are no finite numbers, floating and planar joints between base and tip, no
-    or several candidates for base or tip.
+    ``base`` and ``tip`` name any two links, by default the root, and the only leaf below the base. InputError for
+    document types and entities, links or joints that are missing, twice or in a cycle, values that are no finite
+    numbers, floating and planar joints between base and tip, no or several candidates for base or tip.
 
     With ``origins`` the parameters to identify are not those of the table but the origins of the file's joints, six
     numbers each, ``origin_{joint}_x`` to ``_rz``, of fixed joints at the chain's ends ``mount_{joint}_x``: the same in
