@@ -90,14 +90,8 @@ def find_study(name: str | Path) -> Path:
     own = studies_folder()
     known = {path.stem: path for path in sorted(own.glob("*.py"))} if own else {}
     text = str(name)
-    places = [
-        Path(text),
-        Path(text, FILE),
-        Path(f"{text}.py"),
-        Path("studies", f"{text}.py"),
-        Path("studies", text, FILE),
-    ]
-    for place in [known[text]] if text in known else places:
+    places = [text, f"{text}/{FILE}", f"{text}.py", f"studies/{text}.py", f"studies/{text}/{FILE}"]
+    for place in [known[text]] if text in known else map(Path, places):
         if place.is_file():
             return place.resolve()
     accepted = f"a Python file, or a folder with {FILE}"
