@@ -120,7 +120,10 @@ def nearest(
 
 
 def _boxed(H: Array, g: Array, low: Array, high: Array) -> Array:
-    """Return steps d (N, n) that minimize d'Hd/2 - g'd within low <= 0 <= high, nearly: the next ones mend bounds."""
+    """Return steps d (N, n) that minimize d'Hd/2 - g'd within low <= 0 <= high, nearly.
+
+    Entries that leave the box are set on its border and the others solved for again, until none leaves.
+    """
     n = g.shape[1]
     free = ~(((low >= 0) & (g < 0)) | ((high <= 0) & (g > 0)))
     step = np.zeros_like(g)
