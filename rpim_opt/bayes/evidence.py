@@ -122,15 +122,12 @@ class Hierarchy:
 
     def of(self, keep: np.ndarray) -> Hierarchy:
         """Return the prior of a subset of the deviations (p,) that contains all of a spectrum or none."""
-        group = self.group[keep]
-        used = np.unique(group[group >= 0])
-        number = np.full(len(self.names) + 1, -1)
-        number[used] = np.arange(len(used))
+        used, number = np.unique(np.append(-1, self.group[keep]), return_inverse=True)
         return replace(
             self,
-            group=number[group],
+            group=number[1:] - 1,
             heavy=self.heavy[keep],
-            names=tuple(self.names[i] for i in used),
+            names=tuple(self.names[i] for i in used[1:]),
             replaced=self.replaced[keep],
             rows=self.rows[:, keep],
         )
@@ -437,32 +434,21 @@ def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -
     of C X'R^-1 R_a R^-1 X C.
     """
     q, p = len(parts[0].noise), len(C)
-    gradient, f, among, of_C = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), np.zeros((p, q))
+    gradient, f, among, S = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), np.zeros((q, p, p))
     if not q:
-        return gradient, f, among, of_C
-    rows = [part.X.reshape(-1, p) for part in parts]
-    by_equations = sum(map(len, rows)) < 2 * p  # which then is less work than by deviations
-    S = np.zeros((q, p, p))  # X'R^-1 R_a R^-1 X
-    products = []
-    for part, X, residual in zip(parts, rows, residuals, strict=True):
+        return gradient, f, among, np.zeros((p, 0))
+    for part, residual in zip(parts, residuals, strict=True):
+        X = part.X.reshape(-1, p)
         moved = (part.noise @ residual[:, :, None]).reshape(q, -1)
         f += moved @ X
         XC = (X @ C).reshape(part.X.shape)  # one product: those of configurations take three times as long
         weighed = part.noise - 2 * XC @ part.X.transpose(0, 2, 1) @ part.noise
         gradient += np.einsum("ankk->a", part.noise + weighed) / 2 - moved @ residual.ravel()
         among += 2 * moved @ moved.T - part.noise.reshape(q, -1) @ weighed.reshape(q, -1).T
-        if by_equations:
-            of_C += np.einsum("nki,anki->ia", XC, part.noise @ XC)
-            spread = XC.reshape(len(X), p) @ np.concatenate(rows).T
-            products.append((part.noise @ spread.reshape(*part.X.shape[:2], -1)).reshape(q, len(X), -1))
-        else:
-            S += X.T @ (part.noise @ part.X).reshape(q, -1, p)
-    if by_equations:
-        M = np.concatenate(products, axis=1)
-    else:
-        M = C @ S
-        of_C = np.einsum("aij,ji->ia", M, C)
-    return gradient, f, among - M.reshape(q, -1) @ M.transpose(0, 2, 1).reshape(q, -1).T, of_C
+        S += X.T @ (part.noise @ part.X).reshape(q, -1, p)  # X'R^-1 R_a R^-1 X
+    M = C @ S
+    among -= M.reshape(q, -1) @ M.transpose(0, 2, 1).reshape(q, -1).T
+    return gradient, f, among, np.einsum("aij,ji->ia", M, C)
 
 
 # --- linear algebra ---------------------------------------------------------------------------------------------

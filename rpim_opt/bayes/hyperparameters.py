@@ -194,8 +194,7 @@ class Estimator:
         residual, jacobian = problem.slopes(x)
         J = problem.contrasts(jacobian)
         y = problem.contrasts(residual[:, None])[:, 0] + J @ x
-        if not (np.isfinite(J).all() and np.isfinite(y).all()):
-            raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
+        require_finite(J, y)
         unit = free.scale * stated.scale
         stacks = problem.stacks(joints="joint" in self.noise, at=problem.parameters.values_at(x))
         data = Linearized(J * unit, y - J @ (free.scale * stated.centre), stacks)
@@ -277,6 +276,12 @@ def sampled(problem: Source, most: int = MOST) -> CalibrationProblem:
     count = sum(1 for _ in problem.rows())
     parts = [drawn(part, max(most // count, 1)).data for part in problem.rows()]
     return problem.on(Dataset.together(parts, [str(i) for i in range(len(parts))])).frozen()
+
+
+def require_finite(*arrays: Array) -> None:
+    """Refuse non-finite residuals or derivatives."""
+    if not all(np.isfinite(values).all() for values in arrays):
+        raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")
 
 
 def _distance(x: Array, before: Array, laid: CalibrationProblem) -> float:

@@ -12,15 +12,15 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import pick
 from rpim_opt.basics.text import counted, joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
-from rpim_opt.bayes.hyperparameters import Estimator, Learned
+from rpim_opt.bayes.hyperparameters import Estimator, Learned, require_finite
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Statement
 from rpim_opt.calibration.certificate import DECREASE
-from rpim_opt.calibration.loop import ROUNDS, Ended, Iteration, Options, minimize, nearby, require_finite, require_start
+from rpim_opt.calibration.loop import ROUNDS, Ended, Iteration, Options, minimize, nearby, require_start
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.rules.selection import Selector
@@ -40,7 +40,8 @@ NOISE = {
     "declared": (),
 }
 """Parts of the noise that are estimated, by the option's name."""
-MODELS = ("geometry", "auto")
+MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["free"]}
+"""Parts of the noise that a model tells apart: without its extensions joints would take gravity for noise."""
 LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
 FAR = 1000.0  # deviations in prior standard deviations beyond which a fit without a penalty is called divergent
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
@@ -134,12 +135,8 @@ def calibrate(
     formulation = formulation_of(formulation)
     weight = weight_of(weight)
     options = Options(max_iterations, tolerance, _logged(progress), solver, settings, verbose)
-    for option, word, known in (("model", model, MODELS), ("noise", noise, NOISE)):
-        if word not in known:
-            raise InputError(option, f"'{word}'", choices(word, known))
-    kinds = NOISE[noise]
-    if model == "geometry":  # without the extensions joints would take gravity for noise
-        kinds = tuple(kind for kind in kinds if kind != "joint")
+    told_apart = pick(MODELS, model, "model")
+    kinds = tuple(kind for kind in pick(NOISE, noise, "noise") if kind in told_apart)
     require_affordable(problem)
     require_finite(*(block.y for block in problem.sample().data.blocks))
     mapping: JointMapping | None = None
@@ -290,14 +287,12 @@ def mapped_as(
     mapping: JointMapping | None, again: Callable[[Source], Calibration], notes: Sequence[str] = ()
 ) -> Callable[[Source], Calibration]:
     """Return a calibration of problems with estimated joint mappings or registered frames, with notes on them."""
-    return partial(_mapped, mapping, notes, again) if mapping or notes else again
 
+    def mapped(problem: Source) -> Calibration:
+        result = again(problem)
+        return replace(result, mapping=mapping, message=" ".join([result.message, *notes]))
 
-def _mapped(
-    mapping: JointMapping | None, notes: Sequence[str], again: Callable[[Source], Calibration], problem: Source
-) -> Calibration:
-    result = again(problem)
-    return replace(result, mapping=mapping, message=" ".join([result.message, *notes]))
+    return mapped if mapping or notes else again
 
 
 def _logged(progress: Callable[[Iteration], None] | None) -> Callable[[Iteration], None]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.bayes.hyperparameters import require_finite
 from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
@@ -214,8 +215,6 @@ class State:
 
     def weighted(self, choice: WeightChoice) -> State:
         """Return the state with another weight and its objective."""
-        if choice.weight == self.choice.weight:
-            return replace(self, choice=choice)
         return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight))
 
     def stalled(self, accuracy: float, rounded: bool) -> bool:
@@ -278,8 +277,7 @@ class Loop:
     def initial(self, choice: WeightChoice, start: Array | None) -> State:
         """Return the initial state, at a feasible point."""
         free = self.source.parameters.free
-        x = np.zeros(len(free)) if start is None else require_start(start, len(free))
-        z = free.wrapped(x) / free.scale
+        z = np.zeros(len(free)) if start is None else free.wrapped(start) / free.scale
         model = self.linearized(z)
         require_finite(model.A, model.b)
         unpenalized = self.formulation.penalty is None or (choice.settled and choice.weight == 0)
@@ -531,9 +529,3 @@ def require_start(start: Array, count: int) -> Array:
     if not np.isfinite(x).all():
         raise InputError("start", "a value that is not finite", accepted)
     return x
-
-
-def require_finite(*arrays: Array) -> None:
-    """Refuse non-finite residuals or derivatives."""
-    if not all(np.isfinite(values).all() for values in arrays):
-        raise InputError("data", "non-finite residuals or derivatives", "finite measurements and a finite model")

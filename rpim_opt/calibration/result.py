@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import pick
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
 from rpim_opt.calibration import words
@@ -95,9 +95,7 @@ class Calibration(Outcome):
         >>> list(result.to_frame().columns)
         ['parameter', 'unit', 'nominal', 'identified', 'deviation', 'std']
         """
-        if what not in words.FRAMES:
-            raise InputError("to_frame", f"'{what}'", choices(what, words.FRAMES))
-        return frame_of(words.FRAMES[what](self))
+        return frame_of(pick(words.FRAMES, what, "to_frame")(self))
 
     def __str__(self) -> str:
         return "\n".join([words.parameter_table(self), "", *words.sentences(self, self.verdict)])
