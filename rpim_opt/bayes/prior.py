@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import fits
+from rpim_opt.basics.units import UNITS, fits
 from rpim_opt.bayes import prior_terms as terms
 from rpim_opt.bayes.prior_terms import FIXED, FRAMES, JOINT_OFFSET, Result, ScaledPrior, Statement, default_widths
 from rpim_opt.convex.arguments import places
@@ -92,7 +92,15 @@ class Prior:
         estimated, the default, its standard deviation is absolute; with one weight, given or of a rule, the weight and
         the estimated noise multiply the statement as they do all of the prior. InputError for any other text.
         """
-        return cls(statements=(terms.known(text),))
+        from rpim_opt.convex.constraint_parser import combination  # texts are read where there are any
+
+        stated = combination(text)
+        (combined,) = stated.sums
+        row = tuple(factor / stated.limit for factor in combined.factors)
+        dimensions = (UNITS[stated.unit].dimension,) * len(row)
+        values = (-combined.constant / stated.limit,)
+        reference = None if combined.nominal else (0.0,) * len(row)
+        return cls(statements=(Statement(combined.names, dimensions, (row,), values, reference, text=text.strip()),))
 
     @classmethod
     def from_result(

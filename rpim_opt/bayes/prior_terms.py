@@ -11,7 +11,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
-from rpim_opt.basics.units import UNITS, display
+from rpim_opt.basics.units import display
 from rpim_opt.convex.constraints import Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
@@ -257,19 +257,6 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
     left = rows[:, kept] - seen @ (seen.T @ rows[:, kept])
     right = values - seen @ (seen.T @ values)
     return left, right
-
-
-def known(text: str) -> Statement:
-    """Return the statement that a combination of parameters has a known value, as of `Prior.known`."""
-    from rpim_opt.convex.constraint_parser import combination  # texts are read where there are any
-
-    stated = combination(text)
-    (combined,) = stated.sums
-    row = tuple(factor / stated.limit for factor in combined.factors)
-    reference = None if combined.nominal else (0.0,) * len(row)
-    dimensions = (UNITS[stated.unit].dimension,) * len(row)
-    value = -combined.constant / stated.limit
-    return Statement(combined.names, dimensions, (row,), (value,), reference, text=text.strip())
 
 
 def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:

@@ -11,7 +11,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.bayes.hyperparameters import require_finite
-from rpim_opt.calibration.certificate import DECREASE, Certificate, certified
+from rpim_opt.calibration.certificate import Certificate, certified
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Damping, Program, pose
 from rpim_opt.convex.robust_loss import QuadraticModel, inliers_of
@@ -33,8 +33,6 @@ EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
 """Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
 VANISHING = 1e-12  # share of the first objective below which one has vanished: noise-free data end at rounding
 ROUNDING = 1e-9  # relative rise of an objective at a step that is rounding
-MANY_REFUSED = 6  # refused steps in a row after which a small promise is the solver's noise; the certificate judges
-STALLED = 10  # iterations after which an objective that did not fall is the least; the certificate judges that
 FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
 NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
 NOTHING_PROMISED = 3  # iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest
@@ -196,8 +194,8 @@ class State:
     """State of the loop: the program linearized at z (n,) [scales], the weight, and the nonlinear objective.
 
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2; ``idle``
-    and ``refused`` count iterations in a row that promised, and steps that lowered, nothing. ``outcome`` says why the
-    loop ended (``"rest"``, ``"stuck"``), and ``floor`` is what vanishing objectives are compared with.
+    counts iterations in a row that promised nothing. ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``), and
+    ``floor`` is what vanishing objectives are compared with.
     """
 
     z: Array
@@ -210,18 +208,11 @@ class State:
     history: tuple[Iteration, ...] = ()
     evaluations: int = 1
     idle: int = 0
-    refused: int = 0
     outcome: str = ""
 
     def weighted(self, choice: WeightChoice) -> State:
         """Return the state with another weight and its objective."""
         return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight))
-
-    def stalled(self, accuracy: float, rounded: bool) -> bool:
-        """Whether many iterations together have changed the objective by no more than its accuracy."""
-        if len(self.history) <= STALLED or self.history[-STALLED].weight != self.choice.weight:
-            return False
-        return self.history[-STALLED].objective - self.merit <= (accuracy if rounded else STALLED * accuracy)
 
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""
@@ -345,8 +336,7 @@ class Loop:
         if state.damping > 0 and (short or nothing):
             return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
         state = replace(state, idle=state.idle + 1 if nothing else 0)
-        at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.stalled(accuracy, np.isfinite(best))
-        if choice.settled and at_rest:
+        if choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED):
             return replace(state, outcome="rest")
         waiting = choice.settled and not choice.final and not choice.weights
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
@@ -367,9 +357,8 @@ class Loop:
         state = replace(state, evaluations=state.evaluations + 1)
         if after <= state.merit + rounding:
             return replace(self._accepted(state, candidate, z, after, short), damping=damping)
-        state = replace(state, refused=state.refused + 1, damping=damping)
-        hopeless = state.refused > MANY_REFUSED and promised <= DECREASE * max(abs(state.merit), 1.0)
-        if short or nothing or hopeless:  # the loop is at rest
+        state = replace(state, damping=damping)
+        if short or nothing:  # the loop is at rest
             if state.choice.settled:
                 return replace(state, outcome="rest")
             return replace(state, choice=state.choice.after(0.0))
@@ -420,7 +409,6 @@ class Loop:
             z=z,
             program=candidate,
             merit=after,
-            refused=0,
             history=(*state.history, passed),
             size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
             outcome="rest" if state.choice.settled and short else "",

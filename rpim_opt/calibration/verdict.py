@@ -351,7 +351,11 @@ def likely_causes(result: Outcome) -> list[str]:
     signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = _in_table_order(result, problem)
-    shared = _of_any_fit(result, problem)
+    shared = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
+    if result.learned is not None:
+        shared += diagnosis.left_out_together(problem.labels, {row.label for row in result.learned.left_out})
+    if result.mapping is not None:
+        shared += result.mapping.ambiguities
     if signs or not result.converged:
         causes = _held_base(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
@@ -371,16 +375,6 @@ def likely_causes(result: Outcome) -> list[str]:
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []
-
-
-def _of_any_fit(result: Outcome, problem: CalibrationProblem) -> list[str]:
-    """Return what is said however good a fit is: of rows that are there twice, left out together, or told apart."""
-    said = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
-    if result.learned is not None:
-        said += diagnosis.left_out_together(problem.labels, {row.label for row in result.learned.left_out})
-    if result.mapping is not None:
-        said += result.mapping.ambiguities
-    return said
 
 
 def _large_residuals(result: Outcome, residuals: Mapping[str, tuple[float, float]]) -> Iterator[str]:
