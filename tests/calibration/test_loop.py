@@ -50,9 +50,9 @@ def test_the_objective_follows_the_weight() -> None:
     first = loop().chosen(before)
     assert first.choice.weight == 2.0
     assert first.merit == pytest.approx(before.program.objective(before.z, 2.0), rel=1e-12)
-    passed = replace(first, history=(Iteration(1.0, 1.0, 2.0, 0.0),), merit=-1.0)
+    passed = replace(first, history=(Iteration(1.0, 1.0, 2.0, 0.0),))
     same = loop().chosen(passed)
-    assert (same.merit, same.choice.weights) == (-1.0, (2.0, 2.0))
+    assert (same.merit, same.choice.weights) == (first.merit, (2.0, 2.0))
     other = loop().chosen(same)
     assert other.merit == pytest.approx(before.program.objective(before.z, 3.0), rel=1e-12)
     given = state(z=np.ones(N), merit=-1.0, history=passed.history)
