@@ -110,13 +110,13 @@ def certified_hand_eye(
     equations = np.where(turned, 6, 3)
     beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
     expected = np.asarray(expected, dtype=float)[:3]
-    loops = _Loops(*_equations(flange, measured, turned, deviations, expected, spread), beyond)
+    rows, prior = _equations(flange, measured, turned, deviations, expected, spread)
     several = False  # whether other measurements than those of full weight may be as many that agree
     if loss == "squares":
-        solved = loops.repeated(np.ones(N, dtype=bool))
+        solved = _solved(rows, prior, beyond, np.ones(N, dtype=bool))
     else:
         pairs = _compatible(flange, measured, turned, deviations[:, 1], beyond)
-        solved = loops.repeated(_likeliest(pairs))
+        solved = _solved(rows, prior, beyond, _likeliest(pairs))
         count = int(np.sum(solved.agreeing))
         if count < N // 2 + 2:  # no majority: none of the others is in a core of that size but what a good one may be
             strange = ~solved.agreeing & (solved.squares > chdtri(equations, SURPRISE))
@@ -183,7 +183,9 @@ def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, n
 def _equations(
     flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float
 ) -> tuple[Array, Array]:
-    """Return the loops ``measured = base flange tool``, and what is expected of t, as equations of v (`_Loops`).
+    """Return the loops ``measured = base flange tool``, and what is expected of t, as J_i v (N, 12, n) and (3, n).
+
+    v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first; residuals are in units of their standard deviations.
 
     ::
 
@@ -217,7 +219,7 @@ def _equations(
 class _Solved(NamedTuple):
     """Where a loss of closed loops is least."""
 
-    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
+    v: Array  # (n,) translations, 1 and rotations, as `_equations` has them
     smallest: Smallest  # of the measurements that agree
     squares: Array  # (N,) squared residuals
     agreeing: np.ndarray  # (N,) which of them count
@@ -225,43 +227,32 @@ class _Solved(NamedTuple):
     cost: float  # the loss, summed, and what is expected of translations
 
 
-class _Loops(NamedTuple):
-    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first."""
+def _solved(rows: Array, prior: Array, beyond: Array, some: np.ndarray) -> _Solved:
+    """Return the fixed point of the solution and the measurements that agree with it, beginning with some (N,).
 
-    rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
-    prior: Array  # (3, n) residuals of what is expected of t
-    beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
+    ``rows`` (N, 12, n) and ``prior`` (3, n) are as `_equations` returns them, ``beyond`` (N,) is c^2 of the loss
+    min(r^2, c^2), infinite for the sum of squares. With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its
+    last rows are the least over translations (a Schur complement), its first ones say which these are.
 
-    def of(self, some: np.ndarray) -> _Solved:
-        """Return the solution of the sum of squares of some measurements (N,).
-
-        With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its last rows are the least over translations (a
-        Schur complement), its first ones say which these are.
-        """
-        n = self.rows.shape[2]
-        T = np.asarray(np.linalg.qr(np.vstack([*self.rows[some], self.prior, np.zeros((n, n))]), mode="r"))
+    Of those that do not agree at most the worst quarter is left out at once: the first solution may fit none.
+    """
+    n = rows.shape[2]
+    rounds = 0
+    while True:
+        T = np.asarray(np.linalg.qr(np.vstack([*rows[some], prior, np.zeros((n, n))]), mode="r"))
         best = smallest(T[LINEAR:, LINEAR:])
         x = lifted(best.rotations)
         v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
-        squares = np.sum((self.rows @ v) ** 2, axis=1)
-        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
-        agreeing = squares <= self.beyond
-        return _Solved(v, best, squares, agreeing, np.array_equal(agreeing, some), cost)
-
-    def repeated(self, some: np.ndarray) -> _Solved:
-        """Return the fixed point of solution and measurements that agree with it, beginning with some (N,).
-
-        Of those that do not agree at most the worst quarter is left out at once: the first solution may fit none.
-        """
-        solved = self.of(some)
-        for _ in range(MOST_ROUNDS):
-            off = solved.squares / self.beyond
-            limit = np.sort(off[some])[: max(FEWEST, 3 * some.sum() // 4)][-1]
-            before, some = some, solved.agreeing | (some & (off <= limit))
-            if np.array_equal(some, before):
-                break
-            solved = self.of(some)
-        return solved
+        squares = np.sum((rows @ v) ** 2, axis=1)
+        agreeing = squares <= beyond
+        off = squares / beyond
+        limit = np.sort(off[some])[: max(FEWEST, 3 * some.sum() // 4)][-1]
+        solved, some = some, agreeing | (some & (off <= limit))
+        rounds += 1
+        if np.array_equal(some, solved) or rounds == MOST_ROUNDS:
+            break
+    cost = float(np.sum(np.minimum(squares, beyond)) + np.sum((prior @ v) ** 2))
+    return _Solved(v, best, squares, agreeing, np.array_equal(agreeing, solved), cost)
 
 
 def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:
