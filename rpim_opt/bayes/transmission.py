@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.evidence import CURVES, Evidence, Linearized, Point, whitened
 from rpim_opt.bayes.hyperparameters import Estimator, Fit, Trial, spectrum_of
 from rpim_opt.bayes.model_selection import GAIN as EXTENSION_GAIN
-from rpim_opt.bayes.model_selection import MOMENTS, SECOND, Candidate, Models, complexity, extended, named
+from rpim_opt.bayes.model_selection import MOMENTS, ROUNDS, SECOND, Candidate, Models, complexity, extended, named
 from rpim_opt.bayes.prior_terms import FIXED
 from rpim_opt.problem.noise import Repeatability, Stack
 from rpim_opt.robot.terms import Curve
@@ -32,7 +32,6 @@ SHORTEST = 0.05  # travel of a joint [rad] from which its curve is looked for
 BEYOND = 0.3  # how far curves go on beyond the measured angles [rad], where they are unknown
 STARTS = (0.3, 0.03)  # length scales [rad] from which the optimum is looked for
 ACCURACY = 0.3  # slope of -2 ln L by the logarithms of hyperparameters at which curves are admitted
-ROUNDS = 3  # linearizations at which curves are estimated
 LEAST = 2e-6  # noise [m or rad] from which its optimum is looked for at least
 
 
