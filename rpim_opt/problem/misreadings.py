@@ -57,6 +57,7 @@ ANGLES = {
     1e-3: ("as thousandths of a degree", "divide the joint values by 1000"),
 }
 """The same of joint angles."""
+LENGTHS_OF_ALL = "all measured lengths"
 MOST_TIMES, FACTORS, FINER = 3e3, 49, 3
 """Largest factor of a column that is sought, how many are tried, and how many of them are refined."""
 SLIPPED = ((1, "low", "up"), (-1, "high", "down"))
@@ -334,7 +335,7 @@ def _factors(points: Points) -> Iterator[Misreading]:
     eye = np.eye(robot.dof)
     scaled = {f"column q{i + 1}": ("q", eye[i]) for i in range(robot.dof)}
     turning = np.array(robot.joint_dimensions) == "angle"
-    scaled |= {"all joint values": ("q", turning), "all measured lengths": ("y", np.ones(points.y.shape[1]))}
+    scaled |= {"all joint values": ("q", turning), LENGTHS_OF_ALL: ("y", np.ones(points.y.shape[1]))}
     if not points.lengths:
         scaled |= {f"column {axis}": ("y", of) for axis, of in zip("xyz", np.eye(3), strict=True)}
 
@@ -354,6 +355,8 @@ def _factors(points: Points) -> Iterator[Misreading]:
             factor = near[int(np.argmin(misfits([times(what, each, few) for each in near])))]
             ratio **= 0.25
         remedy = f"multiply {what} by {factor:.5g}, or name the unit"
+        if what == LENGTHS_OF_ALL:
+            remedy += ", or state the right robot: another one's size explains the same"
         yield Misreading(f"{what} in another unit or scale", remedy, partial(times, what, factor))
 
 
