@@ -124,6 +124,8 @@ def _headline(content: Content) -> Iterator[Block]:
         yield "verdict", {"kind": "inconclusive", "word": word, "text": text}
     elif result.verdict.delivered:
         text = "the fit gives no reason against using this robot; no acceptance limit is stated."
+        if result.caution:
+            text = "for joint values as the table counts them, and for no others: check the pendant, see below."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
     yield "notes", [*filter(None, [result.caution]), *reasons, *result.verdict.beside(result.causes)]

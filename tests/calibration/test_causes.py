@@ -233,7 +233,9 @@ def test_a_joint_that_the_table_counts_the_other_way_is_said_below_the_headline(
     assert lines[headline + 1].startswith(said)
     assert run(monkeypatch, "report", out) == 0
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert said in page.partition("<section")[0]
+    top = page.partition("<section")[0]
+    assert said in top
+    assert "for joint values as the table counts them, and for no others" in top
     assert run(monkeypatch, "accept", out, "--limit", "5") == 4  # without held-out rows
     assert capsys.readouterr().out.count(said) == 1
     assert run(monkeypatch, "calibrate", cell, "--limit", "5") == 4
