@@ -19,7 +19,7 @@ from rpim_opt.data.measurements.position import from_elevation, from_zenith
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
-from rpim_opt.problem.registration.global_start import WRITE, JointMapping, explained, search
+from rpim_opt.problem.registration.global_start import QUARTER, WRITE, JointMapping, explained, search
 from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import forward_kinematics
@@ -221,6 +221,17 @@ def _of_positions() -> Iterator[Misreading]:
         if zenith or unit:
             remedy = f"convert the angles to azimuth and elevation in degrees, and {remedy}"
         yield Misreading(what, remedy, partial(from_angles, degrees, zenith))
+
+    def from_other_vertical(side: float, points: Points) -> Points:
+        level = np.linalg.norm(points.y[:, :2], axis=1, keepdims=True)
+        ahead = points.y[:, :2] / np.maximum(level, 1e-12)
+        turned = side * np.sign(ahead @ np.linalg.svd(ahead)[2][:1].T)  # beyond 90 degrees the azimuth turns round
+        return replace(points, y=turned * np.hstack([ahead * points.y[:, 2:], level]))
+
+    for side in (1.0, -1.0):
+        remedy = "name the column zenith_deg in place of elevation_deg, or vice versa"
+        what = "elevations and zenith angles exchanged"
+        yield Misreading(what, remedy, partial(from_other_vertical, side))
     yield MIRRORED
 
 
@@ -378,17 +389,20 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
     """Yield other readings of the Denavit-Hartenberg table, and the ready robots with such joints."""
     robot = points.robot
     mdh = robot.mdh
-    links, still = mdh[:, :2], np.zeros((1, 2))
-    standard = np.hstack([np.vstack([still, links[:-1]]), mdh[:, 2:]])
-    modified = np.hstack([np.vstack([links[1:], still]), mdh[:, 2:]])
+    links = mdh[:, :2]
+    standard = np.hstack([np.vstack([[0.0, 0.0], links[:-1]]), mdh[:, 2:]])
     convention = "a table in the {} Denavit-Hartenberg convention"
     distal, proximal = map(convention.format, ("standard (distal)", "modified (proximal)"))
     tables = [
-        (distal, "move alpha and a of every row to the next row (the first row's are 0)", standard),
-        (proximal, "move alpha and a of every row to the row before", modified),
+        (distal, "read it with --dh standard: alpha and a of every row belong to the next row", standard),
         ("columns a and d of the DH table exchanged", "exchange them", mdh[:, [0, 3, 2, 1, 4]]),
         ("alpha of the other sign in the DH table", "change the signs of alpha", mdh * [-1, 1, 1, 1, 1]),
     ]
+    for last in (0.0, QUARTER, -QUARTER):  # which the other convention gives to the tool
+        modified = np.hstack([np.vstack([links[1:], [last, 0.0]]), mdh[:, 2:]])
+        tables.append(
+            (proximal, "read it with --dh modified: alpha and a of every row belong to the row before", modified)
+        )
     for (k, column), (by, low, back) in product(((0, "alpha"), (1, "a"), (3, "d")), SLIPPED):
         slipped = mdh.copy()
         slipped[:, k] = np.roll(mdh[:, k], -by)

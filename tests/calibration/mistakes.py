@@ -354,6 +354,15 @@ def of_worn_circles(y: np.ndarray) -> np.ndarray:
     return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.sin(elevation)])
 
 
+def of_zenith_angles(y: np.ndarray) -> np.ndarray:
+    """Return positions from zenith angles that were taken for elevations, of an instrument at half the arm's height."""
+    low = y - [0.0, 0.0, np.median(y[:, 2])]
+    radius, azimuth = np.linalg.norm(low, axis=1), np.arctan2(low[:, 1], low[:, 0])
+    elevation = np.arccos(low[:, 2] / radius)
+    flat = radius * np.cos(elevation)
+    return np.column_stack([flat * np.cos(azimuth), flat * np.sin(azimuth), radius * np.sin(elevation)])
+
+
 def to_zenith(y: np.ndarray) -> np.ndarray:
     """Return azimuth and zenith angle [gon], read as millimetres, and distance."""
     radius, azimuth = np.linalg.norm(y, axis=1), np.arctan2(y[:, 1], y[:, 0])
@@ -406,6 +415,7 @@ IN_TABLES |= {
         both(values(lambda y: y / 25.4), shifted(1, 90), flipped(2)),
         "measured lengths in inches, not mm and ",
     ),
+    "zenith angles under the name of elevations": (values(of_zenith_angles), "elevations and zenith angles exchanged"),
     "zenith angles in gon": (values(to_zenith), "azimuth, zenith angle and distance in gon"),
     "the last joint half a turn off in rows": (
         of_joint_rows(

@@ -84,6 +84,7 @@ QUICK = {
         "tracker moved by 300 mm",
         "worn circles of the instrument",
         "zenith angles in gon",
+        "zenith angles under the name of elevations",
     ],
 }
 
@@ -550,17 +551,20 @@ def test_an_outlier_among_few_rows_is_excluded_and_named() -> None:
     assert result.errors(problem.data).max() < 2e-4
 
 
-def test_a_table_in_the_standard_convention_is_named() -> None:
-    """The sheet of a robot with alpha and a in the row of the joint before them."""
+@pytest.mark.parametrize(("by", "convention"), [(-1, "standard (distal)"), (1, "modified (proximal)")])
+def test_a_table_in_another_convention_is_named(by: int, convention: str) -> None:
+    """The sheet of a robot with alpha and a in the row of the joint before them, or behind: there the last are lost."""
     problem = simulated_arm("ur5e")
     mdh = problem.robot.mdh.copy()
-    mdh[:, :2] = np.roll(mdh[:, :2], -1, axis=0)
+    mdh[:, :2] = np.roll(mdh[:, :2], by, axis=0)
+    mdh[: max(by, 0), :2] = 0.0
     nominal = problem.parameters.nominal.copy()
     nominal[: mdh.size] = mdh.ravel()
     sheet = replace(problem.robot, mdh=mdh)
     wrong = replace(problem, robots=sheet, parameters=replace(problem.parameters, nominal=nominal))
     causes = likely_causes(calibrated(wrong))
-    assert "standard (distal) Denavit-Hartenberg" in causes[1], causes
+    assert f"a table in the {convention} Denavit-Hartenberg convention" in causes[1], causes
+    assert f"read it with --dh {convention.partition(' ')[0]}: " in causes[1]
 
 
 def cable(outliers: bool = False, **changes: np.ndarray) -> ro.Calibration:
