@@ -32,7 +32,7 @@ def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = No
     """
     N = len(data)
     sigmas, allowed = np.full((2, N), np.nan)
-    errors = result.nominal_errors(data), result.errors(data)
+    errors = result.nominal_errors(data), result.errors(data), result.errors(data, "angle")
     held = HeldOut(data.label, len(result.problem.labels), *errors, sigmas, allowed)
     C = result.known_covariance
     if C is None:

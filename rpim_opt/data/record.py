@@ -72,11 +72,12 @@ class HeldOut:
     delivered come from all rows.
 
     ``used`` is how many rows the parameters came from; ``nominal`` and ``error`` (N,) are errors before and after [m],
-    NaN for rows that measure no length. ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the
-    covariance of a reading (the instrument's as the row states it, and the repeatability) and C the calibration's;
-    ``allowed`` (N,) their limit by Fisher's F, which one of all N exceeds with probability 0.01. Both are NaN where the
-    calibration has no covariance, or none in a direction that the row depends on. ``coverage`` is the share of lengths
-    in the 95 % interval of a reading, without rows that a final fit excludes; None without covariance.
+    NaN for rows that measure no length, ``angle`` (N,) those of orientations after [rad], NaN for rows that are no
+    poses. ``sigmas`` (N,) are |S^-1/2 r| of a row's residual r, with S = J C J' + the covariance of a reading (the
+    instrument's as the row states it, and the repeatability) and C the calibration's; ``allowed`` (N,) their limit by
+    Fisher's F, which one of all N exceeds with probability 0.01. Both are NaN where the calibration has no covariance,
+    or none in a direction that the row depends on. ``coverage`` is the share of lengths in the 95 % interval of a
+    reading, without rows that a final fit excludes; None without covariance.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibration.refit_all(ro.load("position").calibrate())
@@ -88,6 +89,7 @@ class HeldOut:
     used: int
     nominal: Array
     error: Array
+    angle: Array
     sigmas: Array
     allowed: Array
     coverage: float | None = None

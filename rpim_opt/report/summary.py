@@ -62,6 +62,9 @@ def orientation_rows(result: Calibration) -> list[dict[str, Any]]:
     for name, data in sets(result).items():
         rows += _both_models(result, name, data, "angle", unit="mrad")
         rows += _both_models(result, f"{name}, known angle", data, "stated angle", unit="mrad")
+    held = result.record.held_out
+    if held is not None:
+        rows.append(_figures(f"held out, from {held.used} rows, identified", held.angle, "mrad"))
     return [row for row in rows if row["count"]]
 
 

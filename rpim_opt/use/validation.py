@@ -26,15 +26,14 @@ class Validation(HeldOut):
     """Errors of a calibration on N new measurements, as `HeldOut` has them, and what else they show.
 
     ``data`` are the measurements, ``vectors`` (N, 3) measured minus predicted position [m], NaN where no position was
-    measured, and ``angle`` (N,) the orientation errors [rad], NaN for rows that are no poses. ``outside`` are rows
-    beyond the joint ranges that the calibration measured, ``touched`` says how far touches are from their points and
-    planes, the worst first [mm], ``remarks`` what a reader of the errors has to know, ``mistake`` names another reading
-    of the measurements that fits far better, if there is one, and ``no_intervals`` says why there are none.
+    measured. ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` says how far
+    touches are from their points and planes, the worst first [mm], ``remarks`` what a reader of the errors has to know,
+    ``mistake`` names another reading of the measurements that fits far better, if there is one, and ``no_intervals``
+    says why there are none.
     """
 
     data: Dataset
     vectors: Array
-    angle: Array
     outside: Outside = field(default_factory=Outside)
     touched: tuple[Mapping[str, Any], ...] = ()
     remarks: tuple[str, ...] = ()
@@ -164,7 +163,6 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         **vars(held),
         data=data,
         vectors=result.error_vectors(data),
-        angle=result.errors(data, "angle"),
         outside=result.outside(data),
         touched=touched,
         remarks=tuple(remarks),

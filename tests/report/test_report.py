@@ -315,6 +315,15 @@ def test_both_figures_are_said_where_all_rows_were_used() -> None:
     assert "held out, from 40 rows, identified" in words
 
 
+@pytest.mark.usefixtures("undrawn")
+def test_orientation_errors_of_held_out_poses_are_shown() -> None:
+    result = ro.calibration.refit_all(result_of("pose"))
+    words = re.sub("<[^>]+>", " ", page(result)).partition("Orientation error [mrad]")[2].split()
+    figures = words[words.index("identified", words.index("held")) :][1:6]  # rows, mean, RMS, 95th percentile, max
+    assert figures[0] == "40"
+    assert float(figures[-1]) == pytest.approx(1e3 * result.record.held_out.angle.max(), abs=1e-4)
+
+
 @pytest.mark.slow
 def test_only_tolerances_that_were_kept_are_shown() -> None:
     instance = ro.load("constrained", "wrong_tolerance")
