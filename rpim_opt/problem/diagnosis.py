@@ -1086,9 +1086,9 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         return Addition(column[:, None], lambda c: (what.format(f"{100 * c[0]:+.2g} %"), remedy), SMALL)
 
     yield scale(along[:, 0], "measured lengths are {} too long", "check the scale of the instrument")
-    remedy = "check the instrument's zero and the reflector's radius"
+    of_zero = "check the instrument's zero and the reflector's radius"
     offset = "measured distances are {} mm too long"
-    yield Addition(along[:, [1]], lambda c: (offset.format(three_digits(1e3 * c[0])), remedy), SMALL)
+    yield Addition(along[:, [1]], lambda c: (offset.format(three_digits(1e3 * c[0])), of_zero), SMALL)
     if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
         flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
         radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
@@ -1100,8 +1100,8 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         said = (
             "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of its circles)"
         )
-        remedy = "measure in both faces, and have it checked"
-        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), remedy), SMALL)
+        of_circles = "measure in both faces, and have it checked"
+        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), of_circles), SMALL)
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is {{}} too long", "check its scale")
         if i != j:

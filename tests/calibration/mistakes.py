@@ -254,7 +254,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
         values(lambda y: np.column_stack([np.sort(y[:, 0]), y[:, 1:]])),
         "the values of coordinate x explain nothing",
     ),
-    "distances too long": (values(too_long), "too long"),
+    "distances too long": (values(too_long), "check the instrument's zero and the reflector's radius"),
     "joint 2 slipped halfway": (
         of_joint(1, lambda q: q + 0.014 * (np.arange(COUNT) < 20)),
         "consistent with a changed zero of joint 2",
