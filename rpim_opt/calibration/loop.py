@@ -33,6 +33,7 @@ EXACT, INTERIOR, BEST = 1e-12, 1e-8, 1e-11
 """Relative accuracy of an objective: of formulas and active sets, of interior points, and of these at their best."""
 VANISHING = 1e-12  # share of the first objective below which one has vanished: noise-free data end at rounding
 ROUNDING = 1e-9  # relative rise of an objective at a step that is rounding
+FIRST_ACCURACY = 0.01  # relative accuracy of the first solve: its linearization is no better
 FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
 NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
 NOTHING_PROMISED = 3  # iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest
@@ -328,8 +329,7 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
-        solution = self._solved(state.program, state)
-        promised = state.merit - state.program.objective(solution, state.choice.weight)
+        solution, promised = self._predicted(state)
         choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, promised <= accuracy
@@ -342,6 +342,18 @@ class Loop:
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
             return self.answered(replace(state, idle=0))
         return self._stepped(state, solution, promised, short, nothing)
+
+    def _predicted(self, state: State) -> tuple[Array, float]:
+        """Return the minimum (n,) of the convex program, and by how much the objective falls there if that holds."""
+        # the first linearization is good for a rough minimum, unless that promises too little to judge by
+        first = state.program.separable and not (state.history or state.damping or self.options.solver)
+        rough = FIRST_ACCURACY if first else 0.0
+        solution = self._solved(state.program, state, rough)
+        promised = state.merit - state.program.objective(solution, state.choice.weight)
+        if rough and promised <= 10 * rough * abs(state.merit):
+            solution = self._solved(state.program, state)
+            promised = state.merit - state.program.objective(solution, state.choice.weight)
+        return solution, promised
 
     def _stepped(self, state: State, solution: Array, promised: float, short: bool, nothing: bool) -> State:
         """Step to a minimum if the nonlinear objective falls, else damp; ``nothing``: no fall is promised."""
@@ -366,11 +378,11 @@ class Loop:
             return replace(state, outcome="stuck")
         return state
 
-    def _solved(self, program: Program, state: State) -> Array:
+    def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
         o = self.options
         damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
         how = {"solver": o.solver, "settings": o.settings, "verbose": o.verbose}
-        return program.solve(state.choice.weight, damping=damping, **how).z
+        return program.solve(state.choice.weight, damping=damping, accuracy=accuracy, **how).z
 
     def _accelerated(self, state: State, solution: Array) -> Array:
         """Let a step follow the curve of the residual: the program again, with b moved by half the curvature along it.

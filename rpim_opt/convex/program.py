@@ -344,6 +344,7 @@ class Program(Brief):
         solver: str | None = None,
         settings: Mapping[str, Any] | None = None,
         verbose: bool = False,
+        accuracy: float = 0.0,
     ) -> Estimate:
         """Return the solution at a weight.
 
@@ -351,7 +352,8 @@ class Program(Brief):
         than a squared one they may go anywhere: give it a penalty with a weight, or constraints.
 
         ``damping`` is a term that keeps the solution near a point. With a ``solver`` of CVXPY, its ``settings`` or
-        ``verbose``, `problem` is solved by it, whatever the structure.
+        ``verbose``, `problem` is solved by it, whatever the structure. ``accuracy`` is the part of a loss that is a sum
+        over rows by which a first guess may lie above the minimum.
 
         InputError for a weight that is negative or not finite, and a solver that is not installed. NoSolutionFound
         when the solver does not end with "optimal", or its point misses the constraints; its ``conflict`` names what
@@ -370,7 +372,7 @@ class Program(Brief):
                 z = z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
             estimate = self._at(z, weight)
         else:
-            estimate = self._by_structure(weight, damping)
+            estimate = self._by_structure(weight, damping, accuracy)
         return replace(estimate, seconds=time.perf_counter() - begin)
 
     @one_blas_thread
@@ -437,10 +439,10 @@ class Program(Brief):
             z = self.inside(z, weight)
         return Estimate(z, weight, *self.value(z, weight), multipliers, iterations=iterations)
 
-    def _by_structure(self, weight: float, damping: Damping | None) -> Estimate:
+    def _by_structure(self, weight: float, damping: Damping | None, accuracy: float) -> Estimate:
         """Return the minimum by the structure of the loss; where that fails, CVXPY's."""
         try:
-            optimum = minimum(self._rows, self._warm, weight, damping)
+            optimum = minimum(self._rows, self._warm, weight, damping, accuracy)
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)

@@ -68,7 +68,7 @@ class WarmStart:
         return self
 
 
-def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None) -> Point:
+def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
     """Return the minimum of a convex program; the structure of the loss selects the solver.
 
     ============================ ===================================================
@@ -80,8 +80,8 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
     any other                    all rows
     ============================ ===================================================
 
-    Unsolved where no minimum is found, also by a small program of proximal Newton: then CVXPY solves all rows
-    (`Program.solve`).
+    ``accuracy`` is the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is
+    found, also by a small program of proximal Newton: then CVXPY solves all rows (`Program.solve`).
     """
     with warm.lock:
         loss = warm.structure.loss
@@ -91,14 +91,16 @@ def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None 
             point = _coupled(loss, rows, warm, weight, damping)
         else:
             try:
-                point = _by_newton(loss, rows, warm, weight, damping)
+                point = _by_newton(loss, rows, warm, weight, damping, accuracy)
             except (OutsideDomain, np.linalg.LinAlgError):
                 point = _all_rows(loss, rows, warm, weight, damping)
         warm.z, warm.x = point.x[warm.canonical.at], point.x
         return point
 
 
-def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None) -> Point:
+def _by_newton(
+    loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None, accuracy: float
+) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
     # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too, or
     # begin with an unknown active set
@@ -115,7 +117,7 @@ def _by_newton(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: 
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.canonical.at]
-    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink)
+    search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink, accuracy)
     if warm.kink:
         z, warm.width = search.non_smooth(z, x, warm.width, known)
     else:
