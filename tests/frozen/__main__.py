@@ -32,6 +32,7 @@ INTENDED = {
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
     # x counts from where registration puts the base, which is exact to the root of rounding
     "seven_axis": ("x",),
+    "mixed": ("x",),
     "tracker": ("x",),
     "scara": ("x",),  # 1.2e-9: derivatives by the noise are summed in another order
     "markers": ("x", "objective", "std", "hyperparameters"),  # one of three reflectors places the base, not all of them

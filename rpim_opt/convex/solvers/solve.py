@@ -102,9 +102,10 @@ def _by_newton(
     loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Damping | None, accuracy: float
 ) -> Point:
     few = loss.variable.size <= FEW_ENTRIES
-    # piecewise linear or quadratic: one program of all rows, where Newton's small programs would need cones, too, or
-    # begin with an unknown active set
-    quick = warm.canonical.polyhedral and (warm.z is not None or warm.canonical.size == len(warm.canonical.at))
+    # piecewise linear: one program of all rows; piecewise quadratic: the same where Newton's first small programs would
+    # need cones, too, or begin with an unknown active set
+    begun = warm.z is not None
+    quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
     if few and (loss.expression.is_pwl() or (loss.quadratic and not quick)):
         return _all_rows(loss, rows, warm, weight, damping)
     if warm.kink < 0:
@@ -113,13 +114,12 @@ def _by_newton(
         return _all_rows(loss, rows, warm, weight, damping)
     small = warm.program(rows.A.shape[1] + 1)
     z, x = warm.z, warm.x
-    known = z is not None
     if z is None or x is None:
         x = small.solve(rows.squares.damped(damping), weight).x
         z = x[warm.canonical.at]
     search = Newton(loss, rows, warm.canonical, small, weight, damping, warm.kink, accuracy)
     if warm.kink:
-        z, warm.width = search.non_smooth(z, x, warm.width, known)
+        z, warm.width = search.non_smooth(z, x, warm.width, begun)
     else:
         z = search.smooth(z, x)
     if not np.isfinite(z).all():
