@@ -32,7 +32,6 @@ INTENDED = {
     "paper_arm:bounded": ("weight",),  # a corner on a grid that hangs on the smallest singular value, 1e-7
     # x counts from where registration puts the base, which is exact to the root of rounding
     "seven_axis": ("x",),
-    "mixed": ("x",),
     "tracker": ("x",),
     "scara": ("x",),  # 1.2e-9: derivatives by the noise are summed in another order
     "markers": ("x", "objective", "std", "hyperparameters"),  # one of three reflectors places the base, not all of them
@@ -47,8 +46,8 @@ INTENDED = {
     "paper_arm:tikhonov": ("x", "weight", "objective", "std"),
     "plane": ("x", "objective", "std", "expanded"),
     "position": ("x",),  # 2e-9 on some processors
-    "mixed": ("x",),  # 6e-9, and 4e-9 of the sphere: local variances settle to 1e-8
-    "sphere": ("x",),
+    "mixed": ("x",),  # 6e-9 on some processors
+    "sphere": ("x",),  # 4e-9: local variances settle to 1e-8
     "paper_arm:misprints": ("x", "weight", "objective", "std"),  # what a rule sees of a robust loss is decided anew
 }
 """What may differ by more, and why."""
