@@ -13,9 +13,10 @@ from scipy.special import fdtrc, fdtri, ndtr, ndtri
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.tables import csv_text, records
-from rpim_opt.basics.text import listed
+from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
+from rpim_opt.calibration.held_out import compared, displaced
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import misread
 from rpim_opt.convex.quadratic import Quadratic, identity
@@ -39,6 +40,7 @@ class Drift(NamedTuple):
     first: int  # check after it
     steady: bool  # from the first check to the last
     moved: recalibration.Moved | None  # by how much a single parameter moved in all; None for a frame
+    others: tuple[str, ...] = ()  # that explain the checks as well
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""
@@ -104,7 +106,9 @@ class Monitoring:
 
     def __str__(self) -> str:
         count = f"{len(self.label)} checks"
-        lines = [f"The robot deviates from its calibration in {count}." if self.drifts else f"No drift in {count}."]
+        lines = [f"No drift in {count}."]
+        if self.drifts:
+            lines = [f"The robot deviates from its calibration in {count}.", *filter(None, [self.mistake])]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
@@ -120,10 +124,10 @@ class Monitoring:
                 f"Best explained by {cause.kind} {self.drift.moved or cause.name}, {course}: chi-squared falls by "
                 f"{cause.gain:.1f}, p-value {cause.p_value:.2g}."
             )
+            if self.drift.others:
+                lines.append(f"A change of {joined(self.drift.others)} explains the checks as well: measure more.")
         elif self.drifts:
             lines.append("No single parameter or frame explains it.")
-        if self.drifts and self.mistake:
-            lines.append(self.mistake)
         worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
             f"Largest innovation: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
@@ -189,7 +193,8 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
-        limit=cusum_limit(count, level), drift=_drift(result, problem, level), mistake=misread(result, data),
+        limit=cusum_limit(count, level), drift=_drift(result, problem, level),
+        mistake=misread(result, data) or displaced(result, data, compared(result, data))[0],
     )  # fmt: skip
 
 
@@ -274,7 +279,8 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     if count > 2:
         courses.append((0, True, when / (count - 1)))
     free = problem.parameters.free
-    tried = []
+    width = recalibration.prior_widths(result, problem) / free.scale
+    tried: list[tuple[float, Drift]] = []
     for cause in recalibration.candidates(free):
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])
@@ -285,6 +291,10 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
             if len(g) == 1 and G[0, 0] > 0:
                 change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
                 moved = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
-            tried.append(Drift(misfit.evidence(cause, g, G), start, steady, moved))
-    best = min(tried, key=lambda drift: (drift.cause.p_value, -drift.cause.gain))
+            drift = Drift(misfit.evidence(cause, g, G), start, steady, moved)
+            tried.append((recalibration.log_bayes_factor(g, G, width[index]), drift))
+    best = max(tried, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
+    least = best.cause.gain - recalibration.AS_GOOD
+    others = dict.fromkeys(drift.cause.name for _, drift in tried if drift.cause.gain > least)
+    best = best._replace(others=tuple(name for name in others if name != best.cause.name))
     return best if best.cause.p_value * len(tried) < level else None

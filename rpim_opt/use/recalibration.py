@@ -43,7 +43,7 @@ UNOBSERVABLE = 1e-9  # part of the largest eigenvalue below which readings do no
 MOST = 4  # changes of robot and frames that are looked for one after the other: of more it is another robot
 SPARED = 0.25  # part of the readings that may be wrong
 STRANGE = 5.0  # times the error before any calibration by which readings that no change explains are another robot's
-RIVAL = 0.05  # probability from which on another cause is named beside the most probable one
+RIVAL, AS_GOOD = 0.05, 4.0  # probability, or what chi-squared falls less by, up to which another cause is named, too
 SHOWN = 5  # causes that are shown
 BASE = "base_"
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
@@ -157,7 +157,9 @@ class Update:
         moved = [str(each) for each in self.moved if not (self.registered and each.name.startswith(BASE))]
         if moved:
             lines.append(f"Changed since then: {joined(moved)}.")
-        rivals = [c.name for c in self.causes[1:] if self.changes and c.probability > RIVAL]
+        # a frame that moved explains as much as the link before or behind it (base_z as d1), with more parameters
+        least = self.changes[0].gain - AS_GOOD if self.changed else np.inf
+        rivals = [c.name for c in self.causes[1:] if self.changes and (c.probability > RIVAL or c.gain > least)]
         if rivals:
             lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
         if self.changes:
@@ -319,7 +321,7 @@ def posterior_as_prior(
     """Return the result's loss and constraints with its posterior as penalty, wide for the released parameters."""
     free = problem.parameters.free
     x = previous_deviations(result, problem)
-    widths = _widths(result, problem)
+    widths = prior_widths(result, problem)
     centre, scale = {}, {}
     for i in [free.names.index(name) for name in released]:
         unit, si = display(free.dimensions[i])
@@ -335,7 +337,7 @@ def posterior_as_prior(
     return prior.stated(problem.parameters, widened=False).penalized(plain)
 
 
-def _widths(result: Calibration, problem: Source) -> Array:
+def prior_widths(result: Calibration, problem: Source) -> Array:
     """Return the prior standard deviations (n,) [SI] before any calibration."""
     p = result.problem.parameters
     scale = p.scale.copy()
@@ -435,14 +437,14 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
     free = updated.problem.parameters.free
     prior = updated.program.penalty_form or identity(len(updated.x))
     misfit = Misfit(result, model, prior, [free.names.index(name) for name in released])
-    width = _widths(result, updated.problem) / free.scale
+    width = prior_widths(result, updated.problem) / free.scale
     causes: list[Cause] = []
     logs: list[float] = []
     for cause in candidates(free, released):
         index = [free.names.index(name) for name in cause.members]
         change = misfit.projected(slice(misfit.m, None), misfit.L[:, index])
         causes.append(misfit.evidence(cause, *change))
-        logs.append(_log_bayes_factor(*change, width[index]))
+        logs.append(log_bayes_factor(*change, width[index]))
     rows: dict[int, list[str]] = {}  # a configuration may have been measured wrongly
     for part in updated.problem.rows():
         for label, configuration in zip(part.data.label, part.data.configuration, strict=True):
@@ -451,7 +453,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
         equations = np.flatnonzero(model.group == number)
         change = misfit.projected(equations, np.eye(len(equations)))
         causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
-        logs.append(_log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
+        logs.append(log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
     kinds = [cause.kind for cause in causes]  # each as likely before the readings, and so are the causes of a kind
     share = (1 - UNCHANGED) / len(set(kinds))
     posterior = np.array(logs) + np.log([share / kinds.count(kind) for kind in kinds])
@@ -461,7 +463,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
     return tuple(weighed), misfit.fit
 
 
-def _log_bayes_factor(g: Array, G: Array, width: Array) -> float:
+def log_bayes_factor(g: Array, G: Array, width: Array) -> float:
     """Return ln of the Bayes factor for a change against none, of widths (p,) times each of `MULTIPLES`.
 
     ::

@@ -72,6 +72,17 @@ def test_a_slow_drift_is_no_step() -> None:
     assert "steadily" in str(found)
 
 
+@pytest.mark.parametrize(("moved", "names"), [((1e-3, 1e-3, 1e-3), ["base"]), ((0.0, 0.0, 2e-3), ["d1", "base"])])
+def test_a_base_that_moved_is_no_link_that_grew(moved: tuple[float, ...], names: list[str]) -> None:
+    """What a frame of six numbers and one of the arm explain alike is said of both."""
+    result, data = checked(3, np.zeros(CHECKS))
+    (block,) = data.blocks
+    found = ro.use.monitor(result, replace(data, blocks=(replace(block, y=block.y + np.array(moved)),)))
+    assert found.drift is not None
+    assert sorted([found.drift.cause.name, *found.drift.others]) == sorted(names)
+    assert "the instrument or the base moved" in str(found)
+
+
 def test_one_wrong_check_is_named() -> None:
     result, data = checked(0, np.zeros(CHECKS))
     block = data.blocks[0]
