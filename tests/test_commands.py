@@ -340,6 +340,14 @@ def test_an_instrument_elsewhere_is_found(monkeypatch, cell, tmp_path) -> None:
     assert rms_mm(rows[:, :3] - urdf_points(target, rows[:, 3:])) > 1000
 
 
+def test_more_names_that_people_use() -> None:
+    joints = {f"J{i} [deg]": f"q{i}_deg" for i in range(1, 7)}
+    more = {"Wire length [mm]": "distance_mm", "SMR ID": "marker", "Anchor": "fixture", "U (k=2) [mm]": "u95_mm"}
+    table = RawTable({name: ["1"] for name in joints | more})
+    found = understand(table, ARM, ro.data.measurements.registry.MEASUREMENTS["cable"], TableOptions())
+    assert {each.column: each.name for each in found.meant} == joints | more
+
+
 def test_names_that_people_use() -> None:
     names = {
         "J1 [deg]": "q1_deg", "axis_2(rad)": "q2_rad", "joint03": "q3_rad", "Theta_4": "q4_rad", "q5": "q5_rad",

@@ -54,15 +54,16 @@ NAMES: tuple[tuple[str, ...], ...] = (
     (r"pitch", "ry"),
     (r"yaw", "rz"),
     (r"u_?95_?([xyz])|([xyz])_u_?95", r"u95_\1\2", "expanded uncertainty, coverage factor 2"),
-    (r"(?:unsicherheit_|uncertainty_)?u_?95(?:_total|_mag|_magnitude)?", "u95",
+    (r"(?:unsicherheit_|uncertainty_)?u_?(?:95(?:_total|_mag|_magnitude)?|k_?=?_?2)", "u95",
          "expanded uncertainty, coverage factor 2"),
     (rf"{_SPREAD}_?([xyz])|([xyz])_{_SPREAD}", r"sigma_\1\2", "standard deviation"),
-    (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|cable|cable_length", "distance"),
+    (r"(?:slope_?|slant_?)?(?:distance|dist|range)|sd|(?:cable|wire|rope)(?:_length)?", "distance"),
     (r"label|name|id|no|nr|number|index|row|point(?:_(?:id|name|no|nr))?|target(?:_(?:id|name))?|messpunkt|feature"
          r"|punkt(?:_?(?:name|nr))?|pos(?:e|ition)?_?name|nom_du_point|punto|pt|点名|点号|測定点|測点"
          r"|(?:collection_)?group", "label"),
     (r"configuration|config|pose|pose_id", "configuration"),
-    (r"marker|reflector|smr", "marker"),
+    (r"marker|(?:reflector|reflektor|smr|prism)(?:_(?:id|name|no|nr))?", "marker"),
+    (r"anchor(?:_(?:id|name|no|nr))?", "fixture"),
     (r"temp(?:erature|eratur)?", "temperature"),
     (r"session(?:_?(?:id|name|no|nr))?|measurement_session|campaign|messreihe|sitzung", "session"),
 )  # fmt: skip
