@@ -478,7 +478,7 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
 
 def _single_rows(result: Outcome, ordered: CalibrationProblem) -> list[str]:
     """Return what is wrong with single rows, by themselves or by the calibrated robot."""
-    causes = [*diagnosis.rows_without_values(ordered), *diagnosis.filled_rows(ordered.data)]
+    causes = [*diagnosis.rows_without_values(ordered.data, ordered.arms), *diagnosis.filled_rows(ordered.data)]
     causes += diagnosis.exchanged_rows(ordered)
     if not causes and result.excluded is not None and len(ordered.arms) == 1:
         causes += diagnosis.turned_joint(replace(ordered, robots=result.robot))
@@ -488,7 +488,7 @@ def _single_rows(result: Outcome, ordered: CalibrationProblem) -> list[str]:
 def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
     """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
-        return list(diagnosis.rows_without_values(problem))
+        return list(diagnosis.rows_without_values(problem.data, problem.arms))
     better = better_reading(ordered)
     read = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
     causes = [*_single_rows(result, ordered), *read]
@@ -562,7 +562,9 @@ def refuse_misread(result: Outcome, data: Dataset) -> None:
 
 
 def misread(result: Outcome, data: Dataset) -> str:
-    """Return the result of `better_fitting` as a sentence, empty for None."""
+    """Return the result of `better_fitting` as a sentence, or rows without values; empty where there is nothing."""
+    for lost in diagnosis.rows_without_values(data, result.problem.arms):
+        return f"Likely: {lost}"
     better = better_fitting(result, data)
     return "" if better is None else f"Likely: {better.sentence}"
 

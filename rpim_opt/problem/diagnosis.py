@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations, combinations_with_replacement, product
@@ -244,8 +244,8 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         proposals = (f"the axes {pairs} are nearly parallel: add {', '.join(needed)} to `identify`.",)
     # all are identified again, with frames where they were fitted
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
-    warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation), *rows_without_values(problem)]
-    warnings += filled_rows(data)
+    warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation)]
+    warnings += [*rows_without_values(data, problem.arms), *filled_rows(data)]
     better = better_reading(problem)
     if better is not None:
         warnings.append(better.sentence)
@@ -319,9 +319,8 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
                 yield f"{both} have the same measured values in different configurations: copied?"
 
 
-def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
+def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[str]:
     """Report rows with zeros or one number for all measured coordinates, which instruments write for missing values."""
-    data = problem.data
     for block in data.blocks:
         if len(block.measurement.columns) < 3:
             continue
@@ -333,7 +332,7 @@ def rows_without_values(problem: CalibrationProblem) -> Iterator[str]:
             number = f"{value / si:g} {unit}" if value else "0"
             what = f"{_rows(labels, 'has', 'have')} {number} for every measured coordinate"
             yield f"{what}: missing measurements? Exclude such rows ([exclude])."
-        arm = problem.arms[block.robot]
+        arm = arms[block.robot]
         sliding = np.array(arm.joint_dimensions) == "length"
         reach = float(np.abs(arm.mdh[:, [1, 3]]).sum() + np.ptp(block.q[..., sliding], axis=(0, 1)).sum())
         away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
@@ -662,20 +661,22 @@ def moved_far(problem: CalibrationProblem) -> Iterator[str]:
     if left[place] >= BETTER * whole:
         return
     first, second = (fit_points(part) for part in parted[place])
+    remedy = "calibrate one part, and add the other to its result with `update --reset 'base_*'`"
     if points.lengths:
         far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
-        other, what, column = "anchor", "the anchor or the robot's base moved", "session"
+        other, what = "anchor", "the anchor or the robot's base moved"
+        remedy = "calibrate the two parts separately"
     else:  # the second part's points by the other base
         there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
         far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
-        other, what, column = "base", "the instrument or the robot's base moved", "session"
+        other, what = "base", "the instrument or the robot's base moved"
     reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
     if reflectors > far:
-        other, what, far, column = "reflector", "the reflector was exchanged", reflectors, "marker"
+        other, what, far = "reflector", "the reflector was exchanged", reflectors
+        remedy = "name the reflector of every row in a column `marker` of the raw table (rpim-opt new)"
     yield (
-        f"from row {problem.data.label[points.row[place]]} on the points fit another {other}, "
-        f"{three_digits(1e3 * far)} mm away: {what}; calibrate the two parts separately, or name them "
-        f"in a column `{column}` of the raw table (rpim-opt new)."
+        f"from about row {problem.data.label[points.row[place]]} on the points fit another {other}, "
+        f"{three_digits(1e3 * far)} mm away: {what}; {remedy}."
     )
 
 

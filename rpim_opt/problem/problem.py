@@ -192,7 +192,8 @@ class CalibrationProblem(RobotModel):
             for marker in block.markers:
                 if tool_prefix(marker) + "x" not in names:
                     known = sorted({n.split("_")[1] for n in names if n.startswith("tool_") and n.count("_") == 2})
-                    raise InputError("column marker", f"'{marker}'", "a reflector of " + choices(marker, known))
+                    found = f"'{marker}'" if marker else "no name of a reflector"
+                    raise InputError("column marker", found, "a reflector of " + choices(marker, known))
             for name in block.measurement.parameters:
                 if of_fixture(name, block.fixture) not in names:
                     where = f"measurement {block.measurement.name}"

@@ -23,6 +23,7 @@ from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, Board, grid_b
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
 from rpim_opt.data.tables.names import recognize
 from rpim_opt.data.tables.reading import read_data
+from rpim_opt.problem.diagnosis import rows_without_values
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
@@ -155,7 +156,14 @@ def new_problem(
         _write_whole(folder, contents, arm, source, bool(chain))
     added = f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}."
     of_chain = [SHARED if before else added] if chain else []
-    notes = (*_remarks(arm, source, understanding, assumed), f"Measurement {kind.name}: {how}.", guessed, *of_chain)
+    lost = [f"{text[0].upper()}{text[1:]}" for text in rows_without_values(rows, {"": arm.robot})]
+    notes = (
+        *_remarks(arm, source, understanding, assumed),
+        *lost,
+        f"Measurement {kind.name}: {how}.",
+        guessed,
+        *of_chain,
+    )
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
     return Started(folder, counts, notes, replace(understanding, kind=kind), not dry_run)
 
@@ -386,9 +394,9 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
     down = -numeric_frame(located)[2, :3]
     if down @ arm.robot.gravity.direction < UPRIGHT and not kind.by_camera:
-        close = [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]
-        stated = toml(close[0] if close else down.round(3).tolist())
-        how += f" If the instrument's z points up, the robot is mounted otherwise than assumed: mounting = {stated}."
+        for word in [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]:
+            otherwise = f"the robot is mounted otherwise than assumed: mounting = {toml(word)}."
+            how += f" If the instrument's z points up, {otherwise}"
     blocks = [block for block in rows.blocks if block.measurement.registers]
     seen = np.vstack([block.y[:, :3] for block in blocks])
     flange = np.vstack([forward_kinematics(arm.robot, block.q[:, 0])[:, :3, 3] for block in blocks])

@@ -103,15 +103,18 @@ def rows_of(
         return read_data(columns, arm.robot, usual_noise(kind) if noise is None else noise, kind)
     except InputError as error:
         row, mark, ours = error.where.partition(", column ")
+        row += " of those joined" * (bool(mark) and len(found.tables) > 1)
         own = {each.name: each.column for table in found.tables for each in table.meant if each.name}
-        where = f"{row}{mark}'{own[ours]}'" if own.get(ours, ours) != ours else error.where
+        column = own.get(ours, ours)
+        where = f"{row}{mark}'{column}'" if column != ours else error.where
+        of_column = [table.file for table in found.tables if column in {each.column for each in table.meant}]
         accepted = error.accepted
         units = {name: split(name)[1] for name in found.left_out}
         lengths = [name for name, unit in units.items() if unit and dimension_of(unit) == "length"]
         lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
         if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
             accepted += f", or rename '{lengths[0]}'"
-        raise InputError(where, error.found, accepted, error.file or found.file) from None
+        raise InputError(where, error.found, accepted, error.file or next(iter(of_column), found.file)) from None
 
 
 def understand_of(

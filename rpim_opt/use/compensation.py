@@ -379,7 +379,7 @@ def _tooled(
     if tool is not None:
         marker = known[0]
     elif marker not in known:
-        raise InputError("marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+        raise InputError("--marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
     at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
     identified = p.identified.copy()
     nominal = p.nominal.copy()

@@ -47,7 +47,11 @@ def test_noise_and_prior_add_up_and_monte_carlo_agrees() -> None:
 
 
 def test_the_noise_is_compared_with_the_declared() -> None:
-    for factor, word in ((1.0, "agree with the stated"), (5.0, "rows are wrong"), (0.2, "too large")):
+    for factor, word in (
+        (1.0, "agree with the measurement"),
+        (5.0, "rows are wrong"),
+        (0.2, "smaller than the problem says"),
+    ):
         problem, _ = simulated(noise=factor * 5e-5, seed=1)
         test = ro.calibrate(problem, ro.tikhonov, ro.reml).noise_test()
         assert test.ratio == pytest.approx(factor, rel=0.25)

@@ -69,7 +69,7 @@ def test_nominal_may_lie_outside_the_domain_of_a_penalty(problem: Any, name: str
     assert result.converged, result.message
     assert np.isfinite(result.history[-1].objective)
     assert result.certificate.decrease < 1e-6
-    assert not abs(gap(result)) >= 1e-6  # plain CVXPY's point may lie outside the domain by rounding: not a number
+    assert not gap(result) >= 1e-6  # plain CVXPY's point may be higher, or outside the domain by rounding: not a number
 
 
 def test_outside_the_domain_an_objective_is_infinite(model: Any) -> None:
