@@ -202,3 +202,19 @@ def test_later_commands_read_the_very_table_that_new_read(monkeypatch, capsys, e
     if kind == "pose":
         (empty / "points.csv").write_text(text([HEAD], ROWS))
         assert run(monkeypatch, "validate", "out", "points.csv", "--json") == 0, capsys.readouterr().err
+
+
+def test_a_value_of_a_joined_file_is_refused_with_the_name_of_that_file(monkeypatch, capsys, empty) -> None:
+    points = [[*row, "0" if i == 4 else "0.02"] for i, row in enumerate(beside(NAMED, POINTS))]
+    (empty / "joints.csv").write_text(text([HEAD[:7]], beside(NAMED, JOINTS)))
+    (empty / "points.csv").write_text(text([["Point", *HEAD[7:], "U95 [mm]"]], points))
+    assert new(monkeypatch, "joints.csv", "points.csv") == 2
+    said = capsys.readouterr().err
+    assert said.startswith("points.csv, row P5 of those joined, column 'U95 [mm]': found 0"), said
+
+
+def test_lost_readings_are_named_before_anything_is_calibrated(monkeypatch, capsys, empty) -> None:
+    rows = [[*row[:7], *(["-999"] * 3 if i == 6 else row[7:])] for i, row in enumerate(ROWS)]
+    (empty / "raw.csv").write_text(text([HEAD], rows))
+    assert new(monkeypatch, "raw.csv") == 0
+    assert "Row P7 has -999 mm for every measured coordinate" in " ".join(capsys.readouterr().out.split())

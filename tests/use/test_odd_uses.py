@@ -314,3 +314,14 @@ def test_a_table_without_any_known_column_is_named_so(tmp_path: Path) -> None:
     path.write_text("a,b\n1,2\n")
     with pytest.raises(ro.InputError, match=r"header: found no known column \(a, b\)"):
         ro.use.read_measurements(calibrated(), path)
+
+
+def test_a_lost_reading_among_checks_is_named() -> None:
+    data = checks()
+    (block,) = data.blocks
+    y = block.y.copy()
+    y[3] = -9.99
+    lost = replace(data, blocks=(replace(block, y=y),))
+    for found in (ro.use.validate(calibrated(), lost), ro.use.monitor(calibrated(), lost)):
+        assert "has -9990 mm for every measured coordinate: missing measurements?" in found.mistake
+    assert ro.use.validate(calibrated(), lost).failure
