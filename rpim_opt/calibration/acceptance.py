@@ -332,6 +332,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
         word: Verdict = "rejected" if against else "inconclusive"
         return Acceptance(requirement, word, reasons, held_out=held_out, caution=result.caution)
+    kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
@@ -354,6 +355,12 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         lacking.append(
             f"Missing: one registration for all sessions. The bound is {1e3 * mapped.largest:.3f} mm, session offsets "
             "included: more configurations do not reduce them."
+        )
+    elif mapped.largest > limit and not any(kind.registers for kind in kinds.values()):
+        lacking.append(
+            f"Missing: where the base stands, which {joined(list(kinds))} readings do not determine: more of them "
+            f"hardly reduce the bound of {1e3 * mapped.largest:.3f} mm. Survey the base or what the readings start "
+            'from, and state it in [prior] (known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     elif mapped.largest > limit:
         lacking.append(

@@ -118,6 +118,12 @@ class Compensation:
         ):
             if count:
                 lines.append(f"{count} of {len(self.q)} commands {what}; do not execute these rows.")
+        vague = EXPANDED * self.std > self.position_before
+        if vague.mean() > 0.5 and np.isfinite(self.std).all():
+            lines.append(
+                f"In {vague.sum()} of {len(self.q)} rows the expanded uncertainty (k = 2) is larger than the error "
+                "that is corrected: the commands may be no better than the nominal ones."
+            )
         far = [i for i in np.argsort(-np.nan_to_num(self.beside)) if self.beside[i] > BESIDE]
         if far:
             lines.append(

@@ -372,3 +372,12 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
     for wrong in (["--limit", "0"], ["--box", "1,2"]):
         assert run(monkeypatch, "accept", out, *wrong) == 2
     assert run(monkeypatch, "calibrate", "position", "--box", "0,800,-900,900,0,900") == 2
+
+
+def test_more_lengths_do_not_tell_where_the_base_stands() -> None:
+    result = ro.load("cable").calibrate()
+    (reason,) = [text for text in ro.calibration.accept(result, ro.data.Requirement(1e-4)).reasons if "bound" in text]
+    assert reason.startswith("Missing: where the base stands, which cable readings do not determine")
+    assert "design PROBLEM --augment" not in reason
+    said = str(ro.use.compensate(result, result.problem.data.blocks[0].q[:6, 0]))
+    assert "In 6 of 6 rows the expanded uncertainty (k = 2) is larger than the error that is corrected" in said
