@@ -19,7 +19,6 @@ from rpim_opt.calibration.covariance import noise_covariances
 from rpim_opt.calibration.held_out import compared, displaced
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import misread
-from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.use import recalibration
@@ -267,8 +266,7 @@ def cusum_limit(count: int, level: float) -> float:
 def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Drift | None:
     """Return the change that explains checks best; None where chance does, over all changes that were tried."""
     model = problem.linearize(recalibration.previous_deviations(result, problem))
-    penalty = recalibration.posterior_as_prior(result, problem).penalty
-    form: Quadratic = getattr(penalty, "quadratic", None) or identity(model.A.shape[1])
+    form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), model.A.shape[1])
     # rows of one configuration were read together: the first of them says when
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]

@@ -252,13 +252,17 @@ def update(
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     was, now = _values(result), _values(updated)
     moved = []
-    for name in [name for name in released if name in result.problem.parameters.free.names]:
+    changed = [name for cause in changes if cause.kind != "reading" for name in cause.members]
+    for name in [name for name in released if name in result.problem.parameters.free.names and name not in changed]:
         i = free.names.index(name)
         std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
         change = now[name] - was[name]
         if free.dimensions[i] == "angle":
             change = np.angle(np.exp(1j * change))
         moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
+    if changed:
+        reset = [name for name in released if name not in changed]
+        moved += _changes(result, problem.linearize(updated.x), problem, changed, reset)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = result.record
     last = Earlier(
@@ -291,6 +295,28 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
         f"The instrument or the base moved: the base is at {placed(now)} in the instrument's frame, and was at "
         f"{placed(was)}. It was registered again, as with --reset 'base_*'."
     )
+
+
+def _changes(
+    result: Calibration, model: LinearModel, problem: CalibrationProblem, names: Sequence[str], reset: Sequence[str]
+) -> list[Moved]:
+    """Return by how much parameters changed: what was not known of them before is in both values, and no change."""
+    free = problem.parameters.free
+    index = [free.names.index(name) for name in names]
+    misfit = Misfit(result, model, penalty_of(posterior_as_prior(result, problem, reset), len(free)))
+    g, G = misfit.projected(slice(misfit.m), misfit.A[:, index])
+    covariance = np.linalg.pinv(G, hermitian=True)
+    change, std = covariance @ g, np.sqrt(np.diag(covariance))
+    return [
+        Moved(name, free.dimensions[i], float(free.scale[i] * d), float(free.scale[i] * s))
+        for name, i, d, s in zip(names, index, change, std, strict=True)
+    ]
+
+
+def penalty_of(formulation: Formulation, n: int) -> Quadratic:
+    """Return the quadratic form of n deviations that a formulation penalizes."""
+    form: Quadratic | None = getattr(formulation.penalty, "quadratic", None)
+    return form or identity(n)
 
 
 def _values(result: Calibration) -> dict[str, float]:

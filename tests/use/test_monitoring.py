@@ -83,6 +83,18 @@ def test_a_base_that_moved_is_no_link_that_grew(moved: tuple[float, ...], names:
     assert "the instrument or the base moved" in str(found)
 
 
+def test_update_and_monitor_say_one_size_of_a_change() -> None:
+    """What the first calibration did not know of a joint offset is no part of its change."""
+    result, data = checked(4, np.full(CHECKS, 5e-4))
+    drift, (moved,) = ro.use.monitor(result, data).drift, ro.use.update(result, data).moved
+    assert drift is not None
+    assert drift.moved is not None
+    assert moved.name == drift.cause.name == "theta3"
+    assert moved.change == pytest.approx(drift.moved.change, abs=0.1 * moved.std)
+    assert moved.std == pytest.approx(drift.moved.std, rel=0.01)
+    assert abs(moved.change - 5e-4) < 4 * moved.std
+
+
 def test_one_wrong_check_is_named() -> None:
     result, data = checked(0, np.zeros(CHECKS))
     block = data.blocks[0]
