@@ -32,6 +32,7 @@ from rpim_opt.calibration.verdict import refuse_misread, rms
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Requirement
+from rpim_opt.problem.diagnosis import LEAST_TRAVEL
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
@@ -326,12 +327,13 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     held_out, missed, unheld = _held_out(result, region, requirement, data)
     lacking = [*_unmodelled(result, region), *unheld]
     against = list(result.verdict.reasons)
+    caution = " ".join(filter(None, [result.caution, _standing(result)]))
     try:
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
         reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
         word: Verdict = "rejected" if against else "inconclusive"
-        return Acceptance(requirement, word, reasons, held_out=held_out, caution=result.caution)
+        return Acceptance(requirement, word, reasons, held_out=held_out, caution=caution)
     kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
@@ -372,7 +374,19 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     if against or lacking:
         verdict = "rejected" if against else "inconclusive"
     reasons = tuple(against or lacking)
-    return Acceptance(requirement, verdict, reasons, mapped, repeatability, held_out, result.caution)
+    return Acceptance(requirement, verdict, reasons, mapped, repeatability, held_out, caution)
+
+
+def _standing(result: Calibration) -> str:
+    """Say which joints of the robot were hardly moved; empty if all were."""
+    if len(result.ranges) > 1:
+        return ""
+    (measured,), (robot,) = result.ranges.values(), result.problem.arms.values()
+    least = np.array([LEAST_TRAVEL[robot.joint_types[i]] for i in robot.leading])
+    still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]
+    if not still:
+        return ""
+    return f"The region holds where joint{'s' * (len(still) > 1)} {joined(still)} stood: nothing else was measured."
 
 
 def _held_out(

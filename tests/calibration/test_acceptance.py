@@ -381,3 +381,19 @@ def test_more_lengths_do_not_tell_where_the_base_stands() -> None:
     assert "design PROBLEM --augment" not in reason
     said = str(ro.use.compensate(result, result.problem.data.blocks[0].q[:6, 0]))
     assert "In 6 of 6 rows the expanded uncertainty (k = 2) is larger than the error that is corrected" in said
+
+
+def test_joints_that_stood_are_named() -> None:
+    instance = ro.load("position")
+    data = instance.problem.data
+    block = data.blocks[0]
+    q = block.q * np.array([0.01, 1, 1, 1, 1, 1])
+    problem = instance.problem.on(replace(data, blocks=(replace(block, q=q),)))
+    y = problem.modelled(np.zeros(len(problem.parameters.free)))[0][:, :3]
+    noise = 5e-5 * np.random.default_rng(0).normal(size=y.shape)
+    still = ro.calibrate(problem.on(ro.Dataset.of(q[:, 0], y + noise, 5e-5)), "tikhonov", 1.0)
+    said = "The region holds where joint 1 stood"
+    assert said in str(ro.calibration.accept(still, ro.data.Requirement(1e-3)))
+    assert said not in str(
+        ro.calibration.accept(ro.calibrate(instance.problem, "tikhonov", 1.0), ro.data.Requirement(1e-3))
+    )
