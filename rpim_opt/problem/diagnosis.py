@@ -914,6 +914,10 @@ def _changes(
 
     shares = {"more and more from row to row": owners / (len(data) - 1)}
     for start, end in [*((k, len(data)) for k in _places(len(data))), *combinations(_places(len(data), SPANS), 2)]:
+        # rows of one configuration share what the model lacks of the arm, and are one piece of evidence
+        outside = np.delete(data.configuration, np.s_[start:end])
+        if min(len(np.unique(data.configuration[start:end])), len(np.unique(outside))) < FEWEST:
+            continue
         until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
         shares[f"from row {data.label[start]} {until}"] = ((owners >= start) & (owners < end)).astype(float)
     for when, share in shares.items():
