@@ -250,19 +250,6 @@ def update(
             same = f"those of the same robot ({robots}) in the same units and instrument's frame"
             found = f"readings {1e3 * missed:.3g} mm off, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
-    was, now = _values(result), _values(updated)
-    moved = []
-    changed = [name for cause in changes if cause.kind != "reading" for name in cause.members]
-    for name in [name for name in released if name in result.problem.parameters.free.names and name not in changed]:
-        i = free.names.index(name)
-        std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
-        change = now[name] - was[name]
-        if free.dimensions[i] == "angle":
-            change = np.angle(np.exp(1j * change))
-        moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
-    if changed:
-        reset = [name for name in released if name not in changed]
-        moved += _changes(result, problem.linearize(updated.x), problem, changed, reset)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = result.record
     last = Earlier(
@@ -277,7 +264,14 @@ def update(
         requirement=record.requirement, earlier=(*record.earlier, last), reading=record.reading, terms=record.terms,
     )  # fmt: skip
     return Update(
-        replace(updated, record=record), before, after, tuple(changes), first, tuple(moved), len(data), elsewhere
+        replace(updated, record=record),
+        before,
+        after,
+        tuple(changes),
+        first,
+        _moved(result, updated, released, changes),
+        len(data),
+        elsewhere,
     )
 
 
@@ -297,20 +291,36 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     )
 
 
-def _changes(
-    result: Calibration, model: LinearModel, problem: CalibrationProblem, names: Sequence[str], reset: Sequence[str]
-) -> list[Moved]:
-    """Return by how much parameters changed: what was not known of them before is in both values, and no change."""
-    free = problem.parameters.free
-    index = [free.names.index(name) for name in names]
-    misfit = Misfit(result, model, penalty_of(posterior_as_prior(result, problem, reset), len(free)))
+def _moved(
+    result: Calibration, updated: Calibration, released: Sequence[str], changes: Sequence[Cause]
+) -> tuple[Moved, ...]:
+    """Return by how much released parameters moved; of those that were reset, it is the difference of the results.
+
+    Of those that changed, what neither result knows of them is in both, and no change.
+    """
+    free = updated.problem.parameters.free
+    changed = [name for cause in changes if cause.kind != "reading" for name in cause.members]
+    reset = [name for name in released if name not in changed]
+    was, now = _values(result), _values(updated)
+    moved = []
+    for name in [name for name in reset if name in result.problem.parameters.free.names]:
+        i = free.names.index(name)
+        std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
+        change = now[name] - was[name]
+        if free.dimensions[i] == "angle":
+            change = np.angle(np.exp(1j * change))
+        moved.append(Moved(name, free.dimensions[i], float(change), float(std)))
+    if not changed:
+        return tuple(moved)
+    problem = with_data(result, updated.problem.data)
+    index = [free.names.index(name) for name in changed]
+    penalty = penalty_of(posterior_as_prior(result, problem, reset), len(free))
+    misfit = Misfit(result, problem.linearize(updated.x), penalty)
     g, G = misfit.projected(slice(misfit.m), misfit.A[:, index])
-    covariance = np.linalg.pinv(G, hermitian=True)
-    change, std = covariance @ g, np.sqrt(np.diag(covariance))
-    return [
-        Moved(name, free.dimensions[i], float(free.scale[i] * d), float(free.scale[i] * s))
-        for name, i, d, s in zip(names, index, change, std, strict=True)
-    ]
+    covariance = free.scale[index, None] * np.linalg.pinv(G, hermitian=True) * free.scale[index]
+    change, std = covariance @ (g / free.scale[index]), np.sqrt(np.diag(covariance))
+    rows = zip(changed, index, change.tolist(), std.tolist(), strict=True)
+    return (*moved, *(Moved(name, free.dimensions[i], d, s) for name, i, d, s in rows))
 
 
 def penalty_of(formulation: Formulation, n: int) -> Quadratic:
