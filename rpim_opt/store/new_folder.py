@@ -394,9 +394,9 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     how = f"Guessed: the base was registered at {placed(located)}, {kind.words.frame} ({verdict})."
     down = -numeric_frame(located)[2, :3]
     if down @ arm.robot.gravity.direction < UPRIGHT and not kind.by_camera:
-        for word in [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]:
-            otherwise = f"the robot is mounted otherwise than assumed: mounting = {toml(word)}."
-            how += f" If the instrument's z points up, {otherwise}"
+        close = [word for word, direction in MOUNTINGS.items() if down @ direction > UPRIGHT]
+        stated = toml(close[0] if close else down.round(3).tolist())
+        how += f" If the instrument's z points up, the robot is mounted otherwise than assumed: mounting = {stated}."
     blocks = [block for block in rows.blocks if block.measurement.registers]
     seen = np.vstack([block.y[:, :3] for block in blocks])
     flange = np.vstack([forward_kinematics(arm.robot, block.q[:, 0])[:, :3, 3] for block in blocks])

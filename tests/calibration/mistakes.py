@@ -232,7 +232,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "a row of zeros": (rows_set([7], 0.0), "row P8 has 0 for every"),
     "three rows of zeros": (rows_set([7, 8, 20], 0.0), "rows P8, P9, P21 have 0 for every"),
     "two rows exchanged": (rows_exchanged(4, 21), "P5 and P22"),
-    "tracker moved by 300 mm": (moved_by(0.3, 0.2), "from row P2"),
+    "tracker moved by 300 mm": (moved_by(0.3, 0.2), "from about row P2"),
     "tracker moved by 1 mm": (moved_by(1e-3), "from row P2"),
     "joint 5 in radians": (of_joint(4, np.radians), "joint 5 read as radians, not degrees"),
     "joints in turns": (joints(lambda q: q / 360), "as turns, not degrees"),

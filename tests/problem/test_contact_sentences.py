@@ -113,7 +113,8 @@ def test_a_lost_decimal_point_is_named() -> None:
     problem, _ = simulated(("theta2",), 30)
     block = problem.data.blocks[0]
     far = np.where(np.arange(30)[:, None] == 4, 1e3 * block.y, block.y)
-    (text,) = rows_without_values(problem.on(replace(problem.data, blocks=(replace(block, y=far),))))
+    data = replace(problem.data, blocks=(replace(block, y=far),))
+    (text,) = rows_without_values(data, problem.arms)
     assert text.startswith(f"row {problem.labels[4]} is farther from the others than the arm is long")
 
 
@@ -122,7 +123,7 @@ def test_travel_of_a_rail_is_reach() -> None:
     q = np.append(np.linspace(0, 0.5, 20), 8.0)[:, None]
     y = [0.1, 0.2, 0.3] + q * [0.0, 0.0, 1.0] + 1e-3 * np.arange(21)[:, None] * [1.0, 2.0, 0.0]
     problem = ro.problem_from(robot, ro.Dataset.of(q, y, 5e-5), ("base_*",), base=np.zeros(6))
-    assert list(rows_without_values(problem)) == []
+    assert list(rows_without_values(problem.data, problem.arms)) == []
 
 
 def test_round_lengths_of_a_drawing_are_no_rounded_measurements() -> None:

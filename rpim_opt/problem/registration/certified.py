@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib import import_module
 from typing import NamedTuple
@@ -28,6 +28,7 @@ LOSSES = ("squares", "truncated")
 QUANTILE = 0.99  # which part of good measurements the truncated loss leaves as they are: their squares are chi-squared
 FEWEST, MOST_ROUNDS = 3, 100  # measurements that have to agree, and how often these are chosen anew
 MOST_PAIRED = 2000  # measurements up to which all pairs are compared
+TRIED, FEW = 40, 10  # measurements, evenly spread, whose compatible sets are tried, and the most sets that are
 SURPRISE = 1e-4  # probability that a good measurement is off by more than counts as good
 LINEAR = 6  # unknowns that are eliminated exactly: the translations t of the tool and u of the base
 
@@ -110,13 +111,13 @@ def certified_hand_eye(
     equations = np.where(turned, 6, 3)
     beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
     expected = np.asarray(expected, dtype=float)[:3]
-    rows, prior = _equations(flange, measured, turned, deviations, expected, spread)
+    loops = _Loops(*_equations(flange, measured, turned, deviations, expected, spread), beyond)
     several = False  # whether other measurements than those of full weight may be as many that agree
     if loss == "squares":
-        solved = _solved(rows, prior, beyond, np.ones(N, dtype=bool))
+        solved = loops.repeated(np.ones(N, dtype=bool))
     else:
         pairs = _compatible(flange, measured, turned, deviations[:, 1], beyond)
-        solved = _solved(rows, prior, beyond, _likeliest(pairs))
+        solved = _truncated(loops, pairs)
         count = int(np.sum(solved.agreeing))
         if count < N // 2 + 2:  # no majority: none of the others is in a core of that size but what a good one may be
             strange = ~solved.agreeing & (solved.squares > chdtri(equations, SURPRISE))
@@ -183,9 +184,7 @@ def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, n
 def _equations(
     flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float
 ) -> tuple[Array, Array]:
-    """Return the loops ``measured = base flange tool``, and what is expected of t, as J_i v (N, 12, n) and (3, n).
-
-    v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first; residuals are in units of their standard deviations.
+    """Return the loops ``measured = base flange tool``, and what is expected of t, as equations of v (`_Loops`).
 
     ::
 
@@ -219,7 +218,7 @@ def _equations(
 class _Solved(NamedTuple):
     """Where a loss of closed loops is least."""
 
-    v: Array  # (n,) translations, 1 and rotations, as `_equations` has them
+    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
     smallest: Smallest  # of the measurements that agree
     squares: Array  # (N,) squared residuals
     agreeing: np.ndarray  # (N,) which of them count
@@ -227,32 +226,66 @@ class _Solved(NamedTuple):
     cost: float  # the loss, summed, and what is expected of translations
 
 
-def _solved(rows: Array, prior: Array, beyond: Array, some: np.ndarray) -> _Solved:
-    """Return the fixed point of the solution and the measurements that agree with it, beginning with some (N,).
+class _Loops(NamedTuple):
+    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first."""
 
-    ``rows`` (N, 12, n) and ``prior`` (3, n) are as `_equations` returns them, ``beyond`` (N,) is c^2 of the loss
-    min(r^2, c^2), infinite for the sum of squares. With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its
-    last rows are the least over translations (a Schur complement), its first ones say which these are.
+    rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
+    prior: Array  # (3, n) residuals of what is expected of t
+    beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
 
-    Of those that do not agree at most the worst quarter is left out at once: the first solution may fit none.
-    """
-    n = rows.shape[2]
-    rounds = 0
-    while True:
-        T = np.asarray(np.linalg.qr(np.vstack([*rows[some], prior, np.zeros((n, n))]), mode="r"))
-        best = smallest(T[LINEAR:, LINEAR:])
+    def of(self, some: np.ndarray, start: Array | None = None) -> _Solved:
+        """Return the solution of the sum of squares of some measurements (N,), as `smallest` does.
+
+        With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its last rows are the least over translations (a
+        Schur complement), its first ones say which these are.
+        """
+        n = self.rows.shape[2]
+        T = np.asarray(np.linalg.qr(np.vstack([*self.rows[some], self.prior, np.zeros((n, n))]), mode="r"))
+        best = smallest(T[LINEAR:, LINEAR:], start)
         x = lifted(best.rotations)
         v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
-        squares = np.sum((rows @ v) ** 2, axis=1)
-        agreeing = squares <= beyond
-        off = squares / beyond
-        limit = np.sort(off[some])[: max(FEWEST, 3 * some.sum() // 4)][-1]
-        solved, some = some, agreeing | (some & (off <= limit))
-        rounds += 1
-        if np.array_equal(some, solved) or rounds == MOST_ROUNDS:
-            break
-    cost = float(np.sum(np.minimum(squares, beyond)) + np.sum((prior @ v) ** 2))
-    return _Solved(v, best, squares, agreeing, np.array_equal(agreeing, solved), cost)
+        squares = np.sum((self.rows @ v) ** 2, axis=1)
+        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
+        agreeing = squares <= self.beyond
+        return _Solved(v, best, squares, agreeing, np.array_equal(agreeing, some), cost)
+
+    def repeated(self, some: np.ndarray) -> _Solved:
+        """Return the fixed point of solution and measurements that agree with it, beginning with some (N,).
+
+        Of those that do not agree at most the worst quarter is left out at once: the first solution may fit none.
+        """
+        solved = self.of(some)
+        for _ in range(MOST_ROUNDS):
+            off = solved.squares / self.beyond
+            limit = np.sort(off[some])[: max(FEWEST, 3 * some.sum() // 4)][-1]
+            before, some = some, solved.agreeing | (some & (off <= limit))
+            if np.array_equal(some, before):
+                break
+            solved = self.of(some, solved.smallest.rotations)
+        return solved if np.isfinite(solved.smallest.bound) else self.of(some)
+
+
+def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
+    """Return the least of the truncated loss min(r^2, c^2) of r = |J_i v|, c^2 being a quantile of chi-squared.
+
+    It begins with the largest core of measurements that turn alike, of which ``pairs`` (N, N) can agree, and if not all
+    of that agree, with all of them and with parts of it.
+    """
+    first = _likeliest(pairs)
+    solutions = [loops.repeated(first)]
+    if not np.array_equal(solutions[0].agreeing, first):
+        solutions.append(loops.repeated(np.ones(len(pairs), dtype=bool)))
+    most = max(each.agreeing.sum() for each in solutions)
+    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
+        members = np.flatnonzero(first)
+        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
+        parts = [_likeliest(some) for some in around]
+        if len(members) <= FEW:  # turning alike, one may be wrong all the same
+            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
+        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
+        solutions += [loops.repeated(part) for part in distinct if part.sum() >= FEWEST]
+    least = min(each.cost for each in solutions)
+    return next(each for each in solutions if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
 
 
 def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:
@@ -305,7 +338,7 @@ TOLERANCE, FINE = 1e-8, 1e-12
 """Of gap and feasibility, the form being of size one: what follows refines rotations and multipliers; the finer one
 where moments are those of several rotations."""
 SPREAD = 1e-3
-"""Second over first eigenvalue from which moments are those of several rotations."""
+"""Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
 CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))  # the matrices of the cross products e_a x
 
 
@@ -386,10 +419,10 @@ class Smallest:
 
     rotations: Array
     value: float
-    bound: float  # no rotations have less, up to rounding
-    rank_ratio: float  # of the moment matrix
-    information: Array  # (3k, 3k) half the Hessian by turns [1/rad^2]
-    steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
+    bound: float = -np.inf  # no rotations have less, up to rounding
+    rank_ratio: float = np.inf  # of the moment matrix
+    information: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (3k, 3k) half the Hessian by turns [1/rad^2]
+    steepness: float = 0.0  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
 
     def radius(self, excess: float) -> float:
         """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
@@ -409,8 +442,8 @@ class Smallest:
         return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
 
 
-def smallest(L: Array) -> Smallest:
-    """Return the best rotations that the relaxation leads to, with its bound.
+def smallest(L: Array, start: Array | None = None) -> Smallest:
+    """Return the best rotations that the relaxation leads to, with its bound; or those near a start, of no bound.
 
     ::
 
@@ -420,14 +453,21 @@ def smallest(L: Array) -> Smallest:
     The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
+    if start is not None:
+        near = _refined(L, start)
+        return Smallest(near, _value(L, near))
     Q = L.T @ L
     moments = relax(Q)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
         moments = relax(Q, FINE)
     lifts = [moments.matrix[:, 0]]  # the mean of the rotations that the moments stand for
-    if moments.rank_ratio > SPREAD:
-        lifts += [np.copysign(1.0, v[0]) * v for v in np.linalg.eigh(moments.matrix)[1].T[:-5:-1]]
-    best = min((_refined(L, proper(v[1:].reshape(-1, 3, 3))) for v in lifts), key=lambda R: _value(L, R))
+    if moments.rank_ratio > SPREAD:  # and some that are drawn from them
+        eigenvalues, vectors = np.linalg.eigh(moments.matrix)
+        normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
+        drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
+        lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
+    rounded = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
+    best = min(rounded, key=lambda R: _value(L, R))
     value = _value(L, best)
     x = lifted(best)
     C = rotation_constraints(len(best))
