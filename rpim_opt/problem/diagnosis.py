@@ -10,7 +10,7 @@ from itertools import combinations, combinations_with_replacement, product
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.special import fdtrc
+from scipy.special import bdtrc, fdtrc
 
 from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError
@@ -42,6 +42,7 @@ MOVED = 0.5  # an instrument has moved if that leaves less than this part of the
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
 SMALL = 0.2  # ratios and couplings [1, m] from which on a linearization says nothing of them
+UNLIKELY = 1e-3  # probability with which outliers may agree on one joint by chance
 RARE = 1e-6  # probability with which chance may explain what is reported
 FEW = 3  # outliers from which on they may have one cause
 FEWEST = 6  # rows on either side of a change, or of which copies are told
@@ -618,7 +619,10 @@ def turned_joint(problem: CalibrationProblem) -> Iterator[str]:
         q = _values_that_fit(out, int(i), fit)
         modelled = transformed(fit.base @ forward_kinematics(points.robot, q), fit.tools[out.marker])
         explained = np.linalg.norm(out.y - modelled, axis=1) < limit
-        if explained.sum() > best:
+        # a joint reaches a random error of size E to within the limit with probability 1 - sqrt(1 - (limit / E)^2)
+        reached = 1 - np.sqrt(1 - (limit / fit.error[fit.error > limit]) ** 2)
+        chance = bdtrc(explained.sum() - 1, len(explained), float(reached.mean())) * points.robot.dof
+        if explained.sum() > best and chance < UNLIKELY:
             best = explained.sum()
             named = _rows([problem.data.label[row] for row in out.row[explained]], "has", "have")
             off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))

@@ -29,13 +29,16 @@ from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import OF_JOINTS, Described, placed, same_place
-from rpim_opt.robot.formats.tables import CONVENTIONS, write_robodk, write_robot
+from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numeric_link
+from rpim_opt.robot.library import READY, robots
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty
 
+ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's
 CURVES = "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
 CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
@@ -381,9 +384,9 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
     """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
     robot = identified(result).robot
-    nominal = result.problem.robot
-    if np.abs(nominal.mdh[0, :2]).max() > 0:
+    if np.abs(result.problem.robot.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
+    nominal = _catalogued(result.problem.robot)
     mdh = robot.mdh.copy()
     mdh[0, :2] = 0.0
     write_ur_calibration(source, replace(robot, mdh=mdh), nominal, target)
@@ -396,6 +399,19 @@ def export_ur_calibration(result: Calibration, source: str | Path, target: str |
     if not np.array_equal(mdh, robot.mdh):
         notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
     return notes
+
+
+def _catalogued(robot: Robot) -> Robot:
+    """Return the ready robot that a controller's deltas count from, whatever the calibration began with."""
+
+    def lengths(mdh: Array) -> Array:  # a is negative in Base only; of parallel axes 2 to 4 the sum of offsets counts
+        return np.array([*np.abs(mdh[:, 1]), *mdh[[0, 4, 5], 3], mdh[1:4, 3].sum()])
+
+    ready = [read_robot(READY / f"{name}.toml") for name in robots() if name.startswith("ur")]
+    apart = [float(np.abs(lengths(each.mdh) - lengths(robot.mdh)).max()) for each in ready]
+    if min(apart) > ANOTHER_MODEL:
+        raise InputError("robot", robot.name, "one of Universal Robots' models")
+    return ready[int(np.argmin(apart))]
 
 
 def export_camera(result: Calibration, source: str | Path, target: str | Path) -> list[str]:

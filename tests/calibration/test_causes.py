@@ -338,6 +338,20 @@ def test_rows_that_were_filled_in_are_named(wrong, rows: list[int], said: str) -
     assert any(said in text for text in found), found
 
 
+def test_outliers_that_a_joint_explains_by_chance_are_outliers() -> None:
+    """Each joint moves a point along a line, and one of seven random errors lies near enough to it."""
+    problem = simulated_arm("irb120", count=60)
+    delivered = []
+    for seed in range(8):
+        rng = np.random.default_rng(seed)
+        off = np.zeros((60, 3))
+        directions = rng.normal(size=(6, 3))
+        off[rng.permutation(60)[:6]] = 3e-3 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+        noisy = off + 2e-4 * rng.normal(size=(60, 3))
+        delivered.append(ro.calibrate(values(lambda y, noisy=noisy: y + noisy)(problem)).verdict.delivered)
+    assert all(delivered)
+
+
 def test_excluded_rows_are_named_by_the_joint_that_explains_them() -> None:
     """Also without a sign in the fit, which has lost these rows, and where they are excluded from a fit to all rows."""
     problem = joints(lambda q: half_a_turn(q, [3, 9, 21]))(simulated_arm("irb120"))

@@ -817,3 +817,19 @@ def test_small_errors_of_axes_that_are_nearly_parallel_are_small_deviations(tmp_
         assert change.max() < 4e-3  # 1 mm of a link of 0.3 m is 3.3 mrad
     data = ro.Dataset.of(np.random.default_rng(0).uniform(-2, 2, (20, 3)), np.zeros((20, 3)), 1e-4)
     assert "beta1" in ro.problem_from(path, data, base=np.zeros(6)).parameters.free.names
+
+
+@pytest.mark.parametrize("start", ["catalogue", "factory"])
+def test_a_controllers_deltas_count_from_its_catalogue_whatever_the_calibration_began_with(
+    tmp_path: Path, start: str
+) -> None:
+    """Of a calibration that began with the factory's robot the deltas were those from there: 0.4 m off at the tool."""
+    path, target = tmp_path / "calibration.conf", tmp_path / "new.conf"
+    path.write_text(CONF)
+    robot = {"catalogue": UR10, "factory": ro.robot.read_ur_calibration(path, UR10).robot}[start]
+    problem, truth = simulated(("d4", "a[34]", "theta[2-6]", "base_*"), robot=robot, configurations=40, noise=1e-5)
+    result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
+    ro.use.export_files(result, target, ur_calibration=path, despite_verdict=True)
+    q = configurations(6)
+    written = ro.robot.read_ur_calibration(target, UR10)
+    assert np.abs(reach(written, q) - ro.robot.forward_kinematics(result.robot, q)).max() < 1e-9

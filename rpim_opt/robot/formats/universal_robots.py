@@ -116,6 +116,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
         found = f"a2 = {1e3 * nominal.mdh[2, 1]:.1f} mm and a3 = {1e3 * nominal.mdh[3, 1]:.1f} mm"
         raise InputError("robot", found, "a Universal Robot: a2 and a3 of its controller are negative")
     change = without_beta(robot).mdh - nominal.mdh
+    change[:, 2] = np.angle(np.exp(1j * change[:, 2]))
     behind = np.vstack([change[1:], np.zeros(5)])  # alpha and a stand a row further up
     new = {"theta": change[:, 2], "d": change[:, 3], "a": behind[:, 1], "alpha": behind[:, 0]}
     edits = {
