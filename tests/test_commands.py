@@ -837,3 +837,20 @@ def test_help_states_the_exit_codes(monkeypatch, capsys) -> None:
     assert "0 done; 1 a limit or gate failed" in text
     assert "2 invalid input; 3 no solution found" in text
     assert "--install-completion" in text
+
+
+def test_where_the_base_of_a_urdf_with_a_mount_is_gets_printed(monkeypatch, capsys, cell, tmp_path) -> None:
+    text = (cell / "arm.urdf").read_text()
+    root = re.search(r'<parent link="([^"]+)"', text)[1]
+    mount = (
+        f'<link name="floor"/><joint name="pedestal" type="fixed"><parent link="floor"/><child link="{root}"/>'
+        '<origin xyz="0.5 0.2 0.75" rpy="0 0 0"/></joint></robot>'
+    )
+    (tmp_path / "mounted.urdf").write_text(text.replace("</robot>", mount))
+    arguments = ["new", str(tmp_path / "arm"), "--data", str(cell / "measured.csv"), "--units", "rad,m", "--dry-run"]
+    said = {}
+    for name in (cell / "arm.urdf", tmp_path / "mounted.urdf"):
+        assert run(monkeypatch, *arguments, "--robot", str(name)) == 0
+        said[name.name] = " ".join(capsys.readouterr().out.split())
+    assert "In the base of mounted.urdf it is at x 500.000 y 200.000" in said["mounted.urdf"]
+    assert "x 500.000" not in said["arm.urdf"]

@@ -613,15 +613,17 @@ def turned_joint(problem: CalibrationProblem) -> Iterator[str]:
     fit = fit_points(points)
     limit = FAR * np.median(fit.error)
     out = points.take(np.flatnonzero(fit.error > limit))
+    if len(out.row) < FEW:
+        return
+    # a joint reaches a random error of size E to within the limit with probability 1 - sqrt(1 - (limit / E)^2)
+    reached = float(np.mean(1 - np.sqrt(1 - (limit / fit.error[fit.error > limit]) ** 2)))
     best = max(FEW, len(out.row) / 2) - 1
     said = ""
     for i in np.flatnonzero(np.array(points.robot.joint_types) == "revolute"):
         q = _values_that_fit(out, int(i), fit)
         modelled = transformed(fit.base @ forward_kinematics(points.robot, q), fit.tools[out.marker])
         explained = np.linalg.norm(out.y - modelled, axis=1) < limit
-        # a joint reaches a random error of size E to within the limit with probability 1 - sqrt(1 - (limit / E)^2)
-        reached = 1 - np.sqrt(1 - (limit / fit.error[fit.error > limit]) ** 2)
-        chance = bdtrc(explained.sum() - 1, len(explained), float(reached.mean())) * points.robot.dof
+        chance = bdtrc(explained.sum() - 1, len(explained), reached) * points.robot.dof
         if explained.sum() > best and chance < UNLIKELY:
             best = explained.sum()
             named = _rows([problem.data.label[row] for row in out.row[explained]], "has", "have")

@@ -169,7 +169,7 @@ def new_problem(
 
 
 def _remarks(arm: Described, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
-    """Yield the assumed noise, where the flange frame of a converted table is, and joint values of no joint."""
+    """Yield the assumed noise, where base and flange of a converted table are, and joint values of no joint."""
     if noise:
         assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
         yield (
@@ -182,6 +182,11 @@ def _remarks(arm: Described, source: Path, understanding: Understanding, noise: 
         yield (
             f"[tool], `known` and --tool refer to the flange frame after the last joint. In it {frame} is at "
             f"{placed(arm.tool)}: transform points of {frame} by it."
+        )
+    if placed(arm.base) != placed(np.zeros(6)):
+        yield (
+            "[base], boxes and poses for `compensate` refer to the robot's base, the first frame of its DH table. In "
+            f"the base of {source.name} it is at {placed(arm.base)}."
         )
     further = _ignored_joints(arm, understanding)
     if further:
