@@ -334,7 +334,6 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
         word: Verdict = "rejected" if against else "inconclusive"
         return Acceptance(requirement, word, reasons, held_out=held_out, caution=caution)
-    kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
     if least > limit:
@@ -344,37 +343,41 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
             f"With this model the robot's repeatability alone contributes at least {1e3 * least:.3f} mm; only {model}a "
             "more repeatable robot reduces it."
         )
-    if not np.isfinite(mapped.largest):
-        lacking.append(
-            "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
-        )
-    elif mapped.largest > limit and repeatability > limit:
-        lacking.append(
-            f"Missing: a tighter bound on repeatability: {1e3 * repeatability:.3f} mm may exceed the "
-            "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
-        )
-    elif mapped.largest > limit and any(of_session(name) for name in result.problem.parameters.free.names):
-        lacking.append(
-            f"Missing: one registration for all sessions. The bound is {1e3 * mapped.largest:.3f} mm, session offsets "
-            "included: more configurations do not reduce them."
-        )
-    elif mapped.largest > limit and not any(kind.registers for kind in kinds.values()):
-        lacking.append(
-            f"Missing: where the base stands, which {joined(list(kinds))} readings do not determine: more of them "
-            f"hardly reduce the bound of {1e3 * mapped.largest:.3f} mm. Survey the base or what the readings start "
-            'from, and state it in [prior] (known = ["anchor_x = 900 +- 0.05 mm", ...]).'
-        )
-    elif mapped.largest > limit:
-        lacking.append(
-            f"Missing: measurements. The bound is {1e3 * mapped.largest:.3f} mm; with all parameters known the "
-            f"robot's repeatability would still cause {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
-            "--augment --count 10` names the configurations that help most."
-        )
+    if not mapped.largest <= limit:
+        lacking.append(_missing(result, limit, mapped.largest, repeatability))
     verdict: Verdict = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "inconclusive"
     reasons = tuple(against or lacking)
     return Acceptance(requirement, verdict, reasons, mapped, repeatability, held_out, caution)
+
+
+def _missing(result: Calibration, limit: float, bound: float, repeatability: float) -> str:
+    """Say what is missing for a bound [m] within the limit [m]."""
+    if not np.isfinite(bound):
+        return "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
+    if repeatability > limit:
+        return (
+            f"Missing: a tighter bound on repeatability: {1e3 * repeatability:.3f} mm may exceed the "
+            "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
+        )
+    if any(of_session(name) for name in result.problem.parameters.free.names):
+        return (
+            f"Missing: one registration for all sessions. The bound is {1e3 * bound:.3f} mm, session offsets "
+            "included: more configurations do not reduce them."
+        )
+    kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
+    if not any(kind.registers for kind in kinds.values()):
+        return (
+            f"Missing: where the base stands, which {joined(list(kinds))} readings do not determine: more of them "
+            f"hardly reduce the bound of {1e3 * bound:.3f} mm. Survey the base or what the readings start "
+            'from, and state it in [prior] (known = ["anchor_x = 900 +- 0.05 mm", ...]).'
+        )
+    return (
+        f"Missing: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the "
+        f"robot's repeatability would still cause {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
+        "--augment --count 10` names the configurations that help most."
+    )
 
 
 def _standing(result: Calibration) -> str:

@@ -563,7 +563,8 @@ def refuse_misread(result: Outcome, data: Dataset) -> None:
 
 def misread(result: Outcome, data: Dataset) -> str:
     """Return the result of `better_fitting` as a sentence, or rows without values; empty where there is nothing."""
-    for lost in diagnosis.rows_without_values(data, result.problem.arms):
+    lost = next(diagnosis.rows_without_values(data, result.problem.arms), "")
+    if lost:
         return f"Likely: {lost}"
     better = better_fitting(result, data)
     return "" if better is None else f"Likely: {better.sentence}"

@@ -259,13 +259,13 @@ def test_poses_are_reached_from_a_start_and_without_one() -> None:
 
 def test_poses_without_a_start_are_reached_in_the_arm_configuration_that_was_measured() -> None:
     result, _ = limited()
-    middle = commands(ARM, 1, seed=5)[0]
-    q = middle + np.random.default_rng(1).uniform(-0.4, 0.4, (80, 6))
-    measured = ro.Dataset.of(q, reading(result, result.x, q)[:, :3], 1e-10)
-    result = replace(result, problem=result.problem.on(measured))
-    poses = nominal_poses(result, q[:30])
-    searched = ro.use.compensate(result, poses=poses)
-    assert np.abs(searched.nominal - q[:30]).max() < 1e-6  # of up to eight solutions
+    for seed in range(6):
+        rng = np.random.default_rng(seed)
+        q = rng.uniform(-1.6, 1.6, 6) + rng.uniform(-0.4, 0.4, (80, 6))
+        measured = ro.Dataset.of(q, reading(result, result.x, q)[:, :3], 1e-10)
+        moved = replace(result, problem=result.problem.on(measured))
+        searched = ro.use.compensate(moved, poses=nominal_poses(moved, q[:20]), despite_verdict=True)
+        assert np.abs(searched.nominal - q[:20]).max() < 1e-5  # of up to eight solutions
 
 
 def nominal_poses(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
