@@ -20,14 +20,12 @@ from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
-from rpim_opt.convex.solvers.conic import Damping, Point, Unsolved, nearest
+from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
 from rpim_opt.convex.structure import Structure, structure
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 
-FEASIBLE = 1e-7
-"""By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
 ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 TOUCHING = 1e-9
@@ -448,6 +446,9 @@ class Program(Brief):
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
         penalty, loss = self.structure.canonical, self.structure.loss
         z = optimum.x[penalty.at]
+        # half: the projection by which `violation` judges the point is no more exact
+        if self.structure.constrained and not self.structure.joint and penalty.missed(optimum.x) > 0.5 * FEASIBLE:
+            z = self.nearest(z)
         if self.structure.joint and loss is not None and optimum.rest is not None:  # own variables as they are there
             values = loss.canonical.value(optimum.rest) + self.model.offset, penalty.value(optimum.x)
             self._values[z.tobytes(), weight] = values

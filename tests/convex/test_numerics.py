@@ -157,3 +157,37 @@ def test_row_generation_ends_where_the_other_rows_do_not_matter() -> None:
     assert found.objective == pytest.approx(program.problem(1e-3).solve(solver="CLARABEL"), rel=1e-7)
     largest = np.sort(np.abs(model.A @ found.z - model.b))[-count // 10 :]
     assert found.loss == pytest.approx(largest.mean(), rel=1e-7)
+
+
+def groups_of_three(z):
+    return cp.sum(cp.hstack([cp.norm(z[k : k + 3]) for k in range(0, z.size - 2, 3)]))
+
+
+def symmetric_logistic(r):
+    return cp.sum(cp.logistic(r) + cp.logistic(-r))
+
+
+@pytest.mark.parametrize(
+    ("loss", "penalty", "constraint"),
+    [
+        (cp.norm1, cp.norm1, None),
+        (symmetric_logistic, groups_of_three, lambda z, _: cp.sum(z[:4]) <= -0.2),
+        (cp.sum_squares, groups_of_three, lambda z, _: cp.sum(z[:4]) <= -0.2),
+        (lambda r: cp.sum(cp.maximum(0.9 * r, -0.1 * r)), cp.norm1, ro.in_ball(1.5, "*")),
+    ],
+    ids=["L1", "logistic", "squares", "quantile in a ball"],
+)
+def test_small_weights_on_a_singular_problem_are_solved_to_the_last_digits(loss, penalty, constraint) -> None:
+    """At a weight of 1e-8 some directions are 10^5 scales long, and a penalty's costs below a solver's tolerances."""
+    problem = ro.load("rank_deficient").problem
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    constraints = () if constraint is None else (constraint,)
+    program = ro.convex.pose(ro.Formulation("small weight", loss, penalty, constraints), model)
+    estimate = program.solve(1e-8)
+    z = cp.Variable(model.A.shape[1])
+    limits = [each(z, model.parameters) for each in constraints]
+    plain = cp.Problem(cp.Minimize(loss(model.A @ z - model.b) + 1e-8 * penalty(z)), limits)
+    # a linear program has vertices, which SciPy's simplex method finds
+    plain.solve(solver=cp.SCIPY if constraint is None else cp.CLARABEL)
+    assert estimate.objective <= plain.value * (1 + 1e-7)
+    assert program.violation(estimate.z) <= 1e-7

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from importlib import import_module
@@ -18,6 +19,8 @@ from rpim_opt.convex.expressions import cp, norms, substituted
 from rpim_opt.convex.quadratic import Quadratic
 from rpim_opt.problem.linear import RANK_TOLERANCE
 
+FEASIBLE = 1e-7
+"""By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
 SOUGHT, ACCEPTED = 1e-10, 1e-8
 """Clarabel's tolerances: what it goes on to while it makes progress, and what is good enough."""
 SOLVED = ("Solved", "AlmostSolved")
@@ -37,6 +40,15 @@ EQUILIBRATED: Attempt = (
     ("tol_feas", 0.1 * SOUGHT),  # relative to the largest residual, an outlier's perhaps
 )
 """Settings for the rows of a loss, which come as they are: a quarter fewer iterations."""
+REFINED: Attempt = (
+    ("static_regularization_constant", 1e-12),
+    ("iterative_refinement_max_iter", 20),
+    ("iterative_refinement_reltol", 1e-15),
+    ("iterative_refinement_abstol", 1e-15),
+    *((f"tol_{each}", 1e-12) for each in ("gap_abs", "gap_rel", "feas")),
+    ("reduced_tol_feas", 1e-10),
+)
+"""Settings for changes of unit size about a minimum."""
 LOOSE: Attempt = (
     ("equilibrate_enable", True),
     *((f"reduced_tol_{each}", 5e-8) for each in ("gap_abs", "gap_rel", "feas")),
@@ -48,6 +60,8 @@ DENSE = 4e5
 """Entries of the constraints' matrix up to which active sets are tried."""
 CENTRED = 1e-10
 """Least weight of |z|^2, relative to the squares, of the point about which Clarabel's unknowns are counted."""
+FAR, REFINEMENTS = 1e3, 3
+"""Size of a change from which a minimum is refined, and how often that is tried."""
 LARGE = 1e-2
 """Part of the largest residual from which the objective is scaled down: no scale costs accuracy where it is small, and
 iterations where it is large."""
@@ -97,6 +111,7 @@ class Canonical:
         A = sparse.coo_array(data["A"])
         sizes = [int(k) for k in dims.soc] + [int(k) * (int(k) + 1) // 2 for k in dims.psd]
         rest = len(data["b"]) - self.linear - sum(sizes)
+        self.second_order = len(dims.soc)
         self.cone_sizes = sizes + ([3] * (rest // 3) if rest % 3 == 0 else [rest])  # exponential and power cones
         self.row_scale, self.column_scale = _scales(A, len(data["b"]), self.size, self.at, self.linear, self.cone_sizes)
         free = np.isposinf(data["b"])  # a bound that is none
@@ -128,7 +143,7 @@ class Canonical:
             made.offset = float(penalty.c @ penalty.c) + penalty.constant
             made.root = np.sqrt(2) * L
         made.cones = None
-        made.cone_sizes = []
+        made.cone_sizes, made.second_order = [], 0
         return made
 
     @property
@@ -169,6 +184,16 @@ class Canonical:
     def value(self, x: Array) -> float:
         """Return the objective at x (N,)."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
+
+    def missed(self, x: Array) -> float:
+        """Return by how much x (N,) misses equations, inequalities and second-order cones, as they were stated."""
+        slack = np.divide(self.b - self.A @ x, self.row_scale, out=np.zeros(len(self.b)), where=self.row_scale > 0)
+        worst = [0.0, *np.abs(slack[: self.zero]), *-slack[self.zero : self.linear]]
+        begin = self.linear
+        for count in self.cone_sizes[: self.second_order]:
+            worst.append(float(np.linalg.norm(slack[begin + 1 : begin + count]) - slack[begin]))
+            begin += count
+        return max(worst)
 
     def duals(self, x: Array, z: Array) -> dict[int, Array]:
         """Return the multipliers of the stated constraints by their id, from those of all rows (m,)."""
@@ -405,20 +430,72 @@ class ReducedProgram:
     def _by_cones(
         self, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
     ) -> tuple[Point, Array]:
-        """Return Clarabel's minimum, and the slacks of the penalty's rows."""
-        data, p, k, n = self.data, self.canonical, self.rows, len(self.canonical.at)
-        # tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
-        # of the squares with some weight on |z|^2
-        z0 = self.near[p.at]
-        if k and not z0.any():
+        """Return Clarabel's minimum, and the slacks of the penalty's rows.
+
+        Its tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
+        of the squares with some weight on |z|^2. A minimum that is far from there, or misses constraints, is refined.
+        """
+        p, n = self.canonical, len(self.canonical.at)
+        near = np.zeros(p.size)
+        near[p.at] = self.near[p.at]
+        if self.rows and not near.any():
             rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
-            z0 = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
-        x0 = np.zeros(p.size)
-        x0[p.at] = z0
+            near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
+        point, slack = self._about(near, squares, weight, A, b)
+        missed = p.missed(point.x)
+        if (missed > ACCEPTED or np.abs(point.x - near).max() > FAR) and not len(p.shared):
+            there = point, slack
+            for _ in range(REFINEMENTS):
+                try:
+                    there = self._refined(there[0].x, squares, weight, A, b)
+                except Unsolved:
+                    break
+                if p.missed(there[0].x) <= max(missed, FEASIBLE, SOUGHT * np.abs(there[0].x).max()):
+                    point, slack = there
+                    break
+        self.near = point.x
+        return point, slack
+
+    def _refined(
+        self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
+    ) -> tuple[Point, Array]:
+        """Return the minimum next to one (N,), in changes of unit size: z = z0 + V min(1 / s, |near|) y, others |near|.
+
+        s and V are the singular values and directions of all equations. With small weights some directions of z are
+        10^5 scales long and others 10^-4, and costs are below a solver's tolerances.
+        """
+        from scipy import sparse
+
+        p, far = self.canonical, np.abs(near).max()
+        z0, every = near[p.at], squares.R
+        if A is not None:
+            every = np.vstack([every, A])
+        _, s, V = np.linalg.svd(np.linalg.qr(every, mode="r"))
+        M = V.T / np.maximum(np.pad(s, (0, len(z0) - len(s))), 1 / far)
+        changes: Any = far * sparse.eye_array(p.size, format="lil")
+        changes[np.ix_(p.at, p.at)] = M
+        changes = sparse.csc_array(changes)
+        changed = copy(p)
+        changed.A, changed.b = sparse.csr_array(p.A @ changes / far), (p.b - p.A @ near) / far
+        changed.P, changed.q = sparse.csc_array(changes.T @ p.P @ changes), changes.T @ (p.q + p.P @ near)
+        program = ReducedProgram(changed, self.rows, self.loss, self.counts)
+        program.data.clarabel.attempts = [(*REFINED, *other) for other in ATTEMPTS]
+        squares = ReducedSquares(squares.R @ M, squares.y - squares.R @ z0, M.T @ squares.g)
+        if A is not None and b is not None:
+            A, b = A @ M, b - A @ z0
+        point, slack = program._about(np.zeros(p.size), squares, weight, A, b)
+        return replace(point, x=near + changes @ point.x, dual=point.dual / far), far * slack
+
+    def _about(
+        self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
+    ) -> tuple[Point, Array]:
+        """Return Clarabel's minimum and the slacks of the penalty's rows; the unknowns are changes of ``near`` (N,)."""
+        data, p, k = self.data, self.canonical, self.rows
+        z0 = near[p.at]
         residual = squares.y - squares.R @ z0
-        q = [weight * (p.q + p.P @ x0), np.zeros(k)]
+        q = [weight * (p.q + p.P @ near), np.zeros(k)]
         q[0][p.at] += squares.g
-        bounds, dense = [residual, p.b - p.A @ x0], [squares.R.ravel()]
+        bounds, dense = [residual, p.b - p.A @ near], [squares.R.ravel()]
         if self.loss is not None and A is not None and b is not None:
             q.append(self.loss.q)
             bounds.append(data.linked(A @ z0 - b))
@@ -431,8 +508,7 @@ class ReducedProgram:
         P.data *= scale
         solution = data.clarabel.solve(P, cost * scale, matrix, np.concatenate(bounds))
         x, z, s = np.array(solution.x), np.array(solution.z) / scale, np.array(solution.s)
-        x[: p.size] += x0
-        self.near = x[: p.size]
+        x[: p.size] += near
         own = slice(k, k + len(p.b))
         return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :]), s[own]
 
