@@ -17,7 +17,7 @@ from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.diagnosis import NOTICED, decimals_of, first
+from rpim_opt.problem.diagnosis import NOTICED, SLIGHT, decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS
 from rpim_opt.problem.problem import CalibrationProblem
@@ -27,6 +27,9 @@ from rpim_opt.robot.parameters import frame_of, own_name
 
 BAD = "Larger than expected"
 """Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
+SLIGHTLY = "Slight, but significant"
+"""Beginning of the sentence on an effect in residuals that are no larger than instrument and robot make them."""
+REMARKS = (BAD, SLIGHTLY)  # beginnings of what is said of robots that are delivered, too
 NOISY = 3.0  # residual RMS over the stated noise above which the fit is not that of the stated instrument
 OVERSTATED = 0.05  # residual RMS over the stated noise below which the noise is not that of these data; from 20 um on
 REACH = 0.003  # residual RMS over the length of the arm that a robot's own errors stay below
@@ -83,7 +86,7 @@ class Verdict:
 
     def beside(self, causes: Sequence[str]) -> list[str]:
         """Return the likely causes that the reasons do not already mention."""
-        return [text for text in causes if text not in self.reasons and not (self.reasons and text.startswith(BAD))]
+        return [text for text in causes if text not in self.reasons and not (self.reasons and text.startswith(REMARKS))]
 
     def require(self, forced: bool = False) -> str:
         """Return the note for a robot used despite its verdict, empty if it is delivered.
@@ -365,11 +368,15 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
         if causes:
             causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
-        if not causes and noticed and len(problem.arms) == 1:
-            limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)]
-            limits = [f"{BAD}: residuals; {text}" for text in limits]
-            causes = [] if limits else list(diagnosis.shown_by_residuals(*_without_outliers(result, ordered)))
-            shared += limits
+        if not causes and len(problem.arms) == 1:
+            limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
+            shared += [f"{BAD}: residuals; {text}" for text in limits]
+            alone, x = _without_outliers(result, ordered)
+            causes = list(diagnosis.shown_by_residuals(alone, x)) if noticed and not limits else []
+            if not causes and not limits:
+                error = rms(problem.errors(result.x)[kept])
+                slight = diagnosis.roundings(problem, error, (1 - SLIGHT) ** -0.5)
+                shared += [f"{SLIGHTLY}: {text}" for text in first(slight, diagnosis.slight_effects(alone, x))]
     if noticed:
         causes += _upward(result, problem)
     if causes or shared:
@@ -572,4 +579,4 @@ def misread(result: Outcome, data: Dataset) -> str:
 
 def mistakes(causes: Sequence[str]) -> list[str]:
     """Return the input mistakes among `likely_causes`."""
-    return [text for text in causes if text != NOTHING and not text.startswith(BAD)]
+    return [text for text in causes if text != NOTHING and not text.startswith(REMARKS)]

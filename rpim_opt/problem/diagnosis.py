@@ -39,6 +39,7 @@ NOTICED = 2**0.5
 """Residuals over the noise from which on half of the squares may be explained, and no less than the noise be left."""
 MANY_MINUTES, TAKEN_UP = 30, 0.05  # different decimals below .60 that are no chance, and what a model leaves of them
 MOVED = 0.5  # an instrument has moved if that leaves less than this part of the sum of squares
+SLIGHT = (5 / 6) ** 2  # what an effect that is worth a word leaves of it: errors without it are a sixth smaller
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
 SMALL = 0.2  # ratios and couplings [1, m] from which on a linearization says nothing of them
@@ -425,55 +426,86 @@ def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Itera
             )
 
 
+class Rounding(NamedTuple):
+    """What is rounded, the RMS error which that makes [m], and what helps.
+
+    Residuals are at least a part ``least`` of it; ``step`` is what every joint is rounded to, empty if not all are.
+    """
+
+    what: str
+    made: float
+    remedy: str
+    least: float = ALIKE[0]
+    step: str = ""
+
+
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
-    """Report rounding of joint or measured values that explains the RMS error [m] of a fit."""
-    causes: list[tuple[str, float, str]] = []  # what is rounded to what, what that makes [m], and what helps
-    minutes = "joint values look like degrees and minutes (no decimals from .60 on)"
+    """Report rounding of joint or measured values that explains the RMS error [m] of a fit, or what it excludes."""
+    yield from first(roundings(problem, error, ALIKE[1]), _commanded(problem, error))
+
+
+def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
+    """Report rounding of joint or measured values, if the RMS error [m] of a fit is less than so many times its own."""
+    for each in _roundings(problem):
+        if each.least * each.made < error < most * each.made:
+            yield (
+                f"{each.what}: that alone contributes {three_digits(1e3 * each.made)} mm, the residual RMS is "
+                f"{three_digits(1e3 * error)} mm: {each.remedy}."
+            )
+
+
+def _commanded(problem: CalibrationProblem, error: float) -> Iterator[str]:
+    """Report joint values that are all multiples of a step to which they are not rounded, as errors are smaller."""
+    steps = [each for each in _roundings(problem) if each.step and each.made > ALIKE[1] * error]
+    for each in steps[-1:]:
+        yield (
+            f"joint values are multiples of {each.step}, but rounding is excluded, which would contribute "
+            f"{three_digits(1e3 * each.made)} mm: they are the commanded values, and the arm stops "
+            f"{three_digits(1e3 * error)} mm beside them; log the measured ones."
+        )
+
+
+def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
+    """Yield roundings of joint and measured values that are there, whatever they explain."""
     turning = np.array(problem.robot.joint_dimensions) == "angle"
     angles = _all_q(problem.data)[:, turning]
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
     decimals = (np.abs(np.degrees(angles)) % 1).round(6)
     if (decimals < 0.6).all():
-        causes.append((minutes, np.radians(0.4) / np.sqrt(3) * arm, "convert them"))
+        minutes = "joint values look like degrees and minutes (no decimals from .60 on)"
+        least = TAKEN_UP if len(np.unique(decimals)) > MANY_MINUTES else ALIKE[0]
+        yield Rounding(minutes, np.radians(0.4) / np.sqrt(3) * arm, "convert them", least)
     for block in problem.data.blocks:
-        if len(block.y) < FEWEST:  # lengths of a drawing are round
+        columns = {name: i for i, (name, of) in enumerate(block.measurement.columns.items()) if of == "length"}
+        if len(block.y) < FEWEST or not columns:  # lengths of a drawing are round
             continue
-        lengths = [i for i, dimension in enumerate(block.measurement.columns.values()) if dimension == "length"]
-        values = 1e3 * block.y[:, lengths]
-        exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
-        gaps = np.diff(np.unique(values))  # a grid of any step, or the last of 3 or 4 digits
-        units = (np.full(values.shape, gaps.min(initial=np.inf)), 10.0 ** (exponents - 2), 10.0 ** (exponents - 3))
-        exact = (unit for unit in units if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < ON_GRID)
-        unit = next(exact, np.zeros(values.shape))
-        made = 1e-3 * float(np.sqrt(np.sum(np.mean(unit**2, axis=0)) / 12))
-        remedy = "export more decimals, or state the rounding as their noise"
-        causes.append((f"measured values are rounded to {unit.max(initial=0.0):.4g} mm", made, remedy))
+        units = np.array([_unit(1e3 * block.y[:, i]) for i in columns.values()])
+        each = np.sqrt(np.mean(units**2, axis=1) / 12)
+        made = float(np.linalg.norm(each))
+        coarse = [name for name, part in zip(columns, each, strict=True) if 10 * part > made]
+        of = "" if len(coarse) == len(columns) else f" ({', '.join(coarse)})"
+        what = f"measured values are rounded to {units.max(initial=0.0):.4g} mm{of}"
+        yield Rounding(what, 1e-3 * made, "export more decimals, or state the rounding as their noise")
     levers = np.sqrt(np.sum((slopes @ problem.robot.joint_map) ** 2, axis=0) / len(problem.data))[turning]
-    commanded = ""
     for name, size in (("deg", np.pi / 180), ("rad", 1.0)):
         steps = np.array([_step(column) for column in angles.T / size])
         each = size * steps / np.sqrt(12) * levers
         made = float(np.linalg.norm(each))
         of = ", ".join(f"q{i + 1}" for i, part in zip(np.flatnonzero(turning), each, strict=True) if 10 * part > made)
-        what = f"joint values are rounded to {steps.max(initial=0.0):g} {name} ({of})"
-        causes.append((what, made, "export them with more decimals"))
-        if made > ALIKE[1] * error and steps.all():
-            commanded = (
-                f"joint values are multiples of {steps.max():g} {name}, but rounding is excluded, which would "
-                f"contribute {three_digits(1e3 * made)} mm: they are the commanded values, and the arm stops "
-                f"{three_digits(1e3 * error)} mm beside them; log the measured ones."
-            )
-    for what, made, remedy in causes:
-        certain = what == minutes and len(np.unique(decimals)) > MANY_MINUTES
-        if (TAKEN_UP if certain else ALIKE[0]) * made < error < ALIKE[1] * made:
-            commanded = ""
-            yield (
-                f"{what}: that alone contributes {three_digits(1e3 * made)} mm, the residual RMS is "
-                f"{three_digits(1e3 * error)} mm: {remedy}."
-            )
-    if commanded:
-        yield commanded
+        step = f"{steps.max(initial=0.0):g} {name}"
+        what = f"joint values are rounded to {step} ({of})"
+        yield Rounding(what, made, "export them with more decimals", step=step if steps.all() else "")
+
+
+def _unit(values: Array) -> Array:
+    """Return to what values (N,) [mm] are rounded: a grid of any step, or their last of 3 or 4 digits; zeros if not."""
+    exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
+    gap = np.diff(np.unique(values)).min(initial=np.inf)
+    for unit in (np.full(values.shape, gap), 10.0 ** (exponents - 2), 10.0 ** (exponents - 3)):
+        if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < ON_GRID:
+            return unit
+    return np.zeros(values.shape)
 
 
 def _step(values: Array) -> float:
@@ -760,12 +792,15 @@ class Addition(NamedTuple):
     largest: float = np.inf
 
 
-def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> tuple[float, Addition, Array] | None:
+def _explained(
+    model: LinearModel, x: Array, additions: Iterable[Addition], left_at_most: float = MOVED
+) -> tuple[float, Addition, Array] | None:
     """Return which part of a model's residual at x (n,) is left, by which addition, with which coefficients (c,).
 
-    Beside the parameters with their prior it must explain half of the sum of squares, more than chance does once in a
-    million (F test, all additions counted): None where none does.
+    Beside the parameters with their prior it must leave at most that part of the sum of squares, less than chance does
+    once in a million (F test, all additions counted): None where none does.
     """
+    taken = _freedom(model)
     r = model.b - model.A @ (x / model.parameters.scale)
     whole = float(r @ r)
     without = _without_parameters(model)
@@ -775,17 +810,23 @@ def _explained(model: LinearModel, x: Array, additions: Iterable[Addition]) -> t
         G = without(addition.columns)
         step = np.asarray(np.linalg.lstsq(G, rest, rcond=1e-9)[0], dtype=float)
         gain = float(rest @ rest - np.sum((rest - G @ step) ** 2))
-        spare = max(len(model.A) - len(x) - len(step), 1)
+        spare = max(len(model.A) - taken - len(step), 1)
         tried.append(((float(rest @ rest) - gain) / spare, gain, addition, step))
     if not tried or not whole:
         return None
     _, gain, addition, step = min(tried, key=lambda each: each[0])
-    spare = max(len(model.A) - len(x) - len(step), 1)
+    spare = max(len(model.A) - taken - len(step), 1)
     left = max(whole - gain, 1e-300)
     chance = fdtrc(len(step), spare, gain / len(step) / (left / spare))
-    if gain <= (1 - MOVED) * whole or chance * len(tried) >= RARE:
+    if gain <= (1 - left_at_most) * whole or chance * len(tried) >= RARE:
         return None
     return float(np.sqrt(left / whole)), addition, step
+
+
+def _freedom(model: LinearModel) -> float:
+    """Return how many degrees of freedom the parameters take up beside their prior."""
+    squares = model.svd[1] ** 2
+    return float(np.sum(squares / (1 + squares)))
 
 
 def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
@@ -821,10 +862,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if len(problem.owners) > MOST_EQUATIONS:
         return
     model = problem.linearize(x)
-    tried = [*_moves(problem, x)]
-    if transmission:
-        tried += [*_gears(problem, model), *_scales(problem, x, model)]
-    best = _explained(model, x, tried)
+    best = _explained(model, x, _additions(problem, x, model, transmission))
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
     changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, least=3)
@@ -837,13 +875,38 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if kinds is not None and left <= (MOVED if kinds.consecutive else kinds.left / MOVED):
         kinds = None
     if kinds is None and best is not None and abs(best[2][0]) <= best[1].largest:
-        _, addition, coefficients = best
-        what, remedy = addition.said(coefficients)
-        yield f"{what} (that leaves {100 * left:.0f} % of the residuals): {remedy}."
+        yield _said_of_addition(*best)
     elif kinds is not None or transmission:
         most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
         yield from first(two_positions(problem, x, most), said)
+
+
+def slight_effects(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Report what one addition explains of residuals at x (n,) that are no larger than they may be.
+
+    It is reported if errors would be a sixth smaller without it.
+    """
+    if len(problem.owners) > MOST_EQUATIONS:
+        return
+    model = problem.linearize(x)
+    best = _explained(model, x, _additions(problem, x, model), SLIGHT)
+    if best is not None and abs(best[2][0]) <= best[1].largest:
+        yield _said_of_addition(*best)
+
+
+def _additions(
+    problem: CalibrationProblem, x: Array, model: LinearModel, transmission: bool = True
+) -> Iterator[Addition]:
+    yield from _moves(problem, x)
+    if transmission:
+        yield from _gears(problem, model)
+        yield from _scales(problem, x, model)
+
+
+def _said_of_addition(left: float, addition: Addition, coefficients: Array) -> str:
+    what, remedy = addition.said(coefficients)
+    return f"{what} (that leaves {100 * left:.0f} % of the residuals): {remedy}."
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
@@ -947,8 +1010,7 @@ def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
     """
     model = problem.with_repeatability(None).linearize(x)
     A, b, owners, N = model.A, model.b, problem.owners, len(problem.data)
-    squares = model.svd[1] ** 2
-    rank = float(np.sum(squares / (1 + squares)))
+    rank = _freedom(model)
     spare = len(b) - 2 * rank - N
     if spare < rank:
         return None

@@ -33,10 +33,12 @@ from tests.calibration.mistakes import (
     good,
     joints,
     likely,
+    of_joint,
     reflectors_exchanged,
     rows_set,
     shifted,
     simulated_arm,
+    tenths,
     validated,
     values,
 )
@@ -192,6 +194,29 @@ def test_a_small_motion_of_the_instrument_is_named_before_calibrating_too(robot:
         assert "did the instrument or the robot's base move?" in text
     alone = values(lambda y: y + 3e-3 * (np.arange(COUNT) == 7)[:, None])(simulated_arm(robot))
     assert not [text for text in inspect(alone).warnings if "hardly" not in text]
+
+
+def growing(count: int) -> np.ndarray:
+    return np.linspace(0, 1, count)[:, None]
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (values(lambda y: y + 2e-4 * growing(len(y)) * [0.4, -0.5, 0.77]), "drifted slowly|more and more from row"),
+        (values(lambda y: y * [1, 1, 1.0002]), r"column z is \+0.0\d* % too long"),
+        (values(lambda y: np.hstack([(2e3 * y[:, :1]).round() / 2e3, y[:, 1:]])), r"are rounded to 0.5 mm \(x\)"),
+        (of_joint(4, tenths), r"are rounded to 0.1 deg \(q5\)"),
+    ],
+    ids=["a drift", "a scale", "a rounded column", "a rounded joint"],
+)
+@pytest.mark.usefixtures("undrawn")
+def test_what_hides_in_the_noise_is_named_beside_a_delivered_robot(monkeypatch, capsys, tmp_path, wrong, said) -> None:
+    """Each makes errors of held-out rows at least a quarter larger, and leaves residuals near the assumed noise."""
+    made(monkeypatch, tmp_path, wrong(simulated_arm("ur5e", count=80)))
+    capsys.readouterr()
+    assert run(monkeypatch, "calibrate", str(tmp_path / "cell")) == 0
+    assert re.search(f"\nSlight, but significant: .*{said}", capsys.readouterr().out)
 
 
 def made(monkeypatch, folder, problem, *options: str, robot: str = "ur5e") -> None:
