@@ -1127,9 +1127,9 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
     for i, j in product(of_zero, range(q.shape[1])):
         if q[:, j].any():
             yield Addition((of_zero[i] * q[problem.owners, j])[:, None], partial(gear, i, j), SMALL)
-    if len(of_zero) == robot.dof:
-        way = np.diff(q, axis=0, prepend=q[:1])[problem.owners] @ robot.joint_map.T
-        lag = np.sum([of_zero[i] * way[:, i] for i in range(robot.dof)], axis=0)
+    if len(of_zero) == len(robot.mdh):
+        way = np.diff(q, axis=0, prepend=q[:1])[problem.owners]
+        lag = np.sum([zero * way[:, i] for i, zero in of_zero.items()], axis=0)
         remedy = "read both when the arm stands still"
         yield Addition(lag[:, None], lambda c: (f"joint values lag behind by {100 * c[0]:.2g} % of each move", remedy))
 
