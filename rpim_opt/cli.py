@@ -263,7 +263,7 @@ def new(
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
     chain: Chain = "",
-    dh: Annotated[str, Option(help="Convention of a DH table .csv: modified (Craig) or standard (Paul, Hayati).")] = "",
+    dh: Annotated[str, Option(help="Convention of a DH table: modified (Craig) or standard (Paul, Hayati).")] = "",
     target: Annotated[str, Option(help="Board of a camera: a table with point, x_mm, y_mm, or 7x5,30mm.")] = "",
     as_json: bool = False,
 ) -> Answer:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import math
 import re
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
+from itertools import takewhile, zip_longest
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +37,22 @@ MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!
 """How tables say that there is no value."""
 BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
 """A name with its number and unit, in a header whose names and cells are separated by single blanks."""
+PART_OF_PI = re.compile(r"([+-]?)\s*(?:(\d+(?:\.\d*)?)\s*\*?\s*)?(?:π|pi)\s*(?:/\s*(\d+))?", re.IGNORECASE)
+"""An angle [rad] as a part of pi, ``-pi/2``."""
 GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 """What may be a whole number with its thousands apart, or one with three decimals."""
 BEYOND = {"angle": 20 * math.pi, "length": 50.0}
 """Joint values and coordinates [SI] that no table has: ten turns, and farther than instruments stand."""
-PARTS = re.compile(r"x y z|(j|a|q|joint_?|axis_?)1 (?:\1\d )+\1\d")
-"""What tables with a row a coordinate, or a joint, name in that row, sorted."""
+PARTS = re.compile(r"(?=.)(?:(j|a|q|joint_?|axis_?)1(?: \1\d)+)?(?:(?:^| )x y z)?")
+"""What tables with a row a coordinate, or a joint, or both, name in that row, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
 """What the column is called that holds the coordinates of a table with a row a coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
-UNITS_LINE = re.compile(r"\W*(?:units?|einheit(?:en)?|unités?|unidades|unità)\s*[:=]?\s+(.+)", re.IGNORECASE)
-"""A line above the header that states units."""
+UNITS_WORD = re.compile(r"\b(?:units?|einheit(?:en)?|unités?|unidades|unità)\b", re.IGNORECASE)
+"""What a line above the header says before the units that it states."""
+JOINING = ("in", "and", "und", "et", "y", "e")
+"""Words among units; ``in`` alone is inches."""
 
 
 @dataclass(frozen=True)
@@ -140,8 +145,16 @@ class RawTable:
         return replace(self, columns=columns)
 
 
-def read_table(path: Path, options: TableOptions | None = None, columns: Columns | None = None) -> RawTable:
-    """Return the table of a raw file, or of columns of texts, with a number a cell and a row a point."""
+def read_table(
+    path: Path,
+    options: TableOptions | None = None,
+    columns: Columns | None = None,
+    turned: Callable[[Grid], bool] = lambda grid: False,
+) -> RawTable:
+    """Return the table of a raw file, or of columns of texts, with a number a cell and a row a point.
+
+    A grid that is ``turned`` has in its rows what others have in their columns.
+    """
     options = options or TableOptions()
     readers = {".parquet": read_columns, ".mat": array_columns, ".npz": array_columns}
     reader = readers.get(path.suffix.lower())
@@ -149,7 +162,11 @@ def read_table(path: Path, options: TableOptions | None = None, columns: Columns
         if columns is None and reader is not None:
             columns = reader(path)
         if columns is None:
-            table = _of_grid(read_grid(path, options.sheet, options.encoding, options.separator), options)
+            grid = read_grid(path, options.sheet, options.encoding, options.separator)
+            if turned(grid):
+                rows = [list(cells) for cells in zip_longest(*grid.rows, fillvalue="")]
+                grid = grid._replace(rows=rows, lines=list(range(1, len(rows) + 1)), blanks=False)
+            table = _of_grid(grid, options)
         else:
             table = RawTable(columns)
         return _one_row_each(_one_number_each(table))
@@ -176,17 +193,28 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
     units: dict[str, str] = {}
     lines_of_units = []
     for row in grid.rows[: above[0] if above else 0]:
-        stated = UNITS_LINE.fullmatch(" ".join(filter(None, row)))
-        with suppress(InputError):  # a sentence that happens to begin so
-            if stated:
-                units = parse_units(re.sub(r"[\s;,]+", ",", stated[1]))
-                lines_of_units.append(f"units above the header: {stated[1]}.")
+        stated = _stated_units(row)
+        if stated:
+            units = stated
+            lines_of_units.append(f"units above the header: {' '.join(filter(None, row))}.")
     table = _columns([grid.rows[i] for i in full], heads, replace(options, units={**units, **options.units}))
     full = full[: len(full) - _summaries(table.columns)]
     left = set(range(numeric[0], len(grid.rows))).difference(full)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
     columns = {name: cells[: len(full)] for name, cells in table.columns.items()}
     return RawTable(columns, table.groups, notes, units)
+
+
+def _stated_units(row: Sequence[str]) -> dict[str, str]:
+    """Return the units that a line states, ``Units: mm, deg`` or ``length unit mm, angle unit deg``, by dimension."""
+    names: list[str] = []
+    for text in UNITS_WORD.split(" ".join(filter(None, row)))[1:]:
+        words = re.findall(r"[^\s;,:=()]+", text)
+        taken = list(takewhile(lambda word: word.lower() in JOINING or split(f"x [{word}]")[1], words))
+        names += [word for word in taken if word.lower() not in JOINING] or taken
+    with suppress(InputError):  # units of columns, or a sentence
+        return parse_units(",".join(names))
+    return {}
 
 
 def _summaries(columns: Columns) -> int:
@@ -205,7 +233,13 @@ def _summaries(columns: Columns) -> int:
 
 def _count(row: Sequence[str]) -> int:
     """Return how many cells of a row are numbers or marks of a missing number."""
-    numbers = sum(is_numeral(cell) or len(list_of_numbers(cell)) or _unit_of([cell]) != "" for cell in row)
+    numbers = sum(
+        is_numeral(cell)
+        or len(list_of_numbers(cell))
+        or _unit_of([cell]) != ""
+        or PART_OF_PI.fullmatch(cell) is not None
+        for cell in row
+    )
     return numbers and numbers + sum(cell != "" and is_missing(cell) for cell in row)
 
 
@@ -295,7 +329,7 @@ def _header_rows(grid: Grid, first: int, width: int) -> list[int]:
     for i in reversed(range(max(first - LINES_OF_HEADER, 0), first)):
         row = _uncommented(grid.rows[i], width)
         filled = [place for place, cell in enumerate(row, start=1) if cell]
-        if headers and grid.lines[i + 1] - grid.lines[i] > 1:
+        if (headers and grid.lines[i + 1] - grid.lines[i] > 1) or _stated_units(row):
             break
         if not any(map(str.isalpha, "".join(row))):
             continue  # a line of dashes
@@ -446,6 +480,8 @@ def _one_number_each(table: RawTable) -> RawTable:
             if part in "xyz":
                 new = f"{stem} {_with_unit(part, unit)}"
                 groups[new] = stem
+            if new in columns:
+                raise InputError("the header", f"two lists of {new}, one of them in '{name}'", "one of them")
             columns[new] = [numbers[i] if numbers else "" for numbers in rows]
     return replace(table, columns=columns, groups=groups)
 
@@ -479,10 +515,10 @@ def _one_row_each(table: RawTable) -> RawTable:
     of_points = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
     columns = {name: [min(own) for own in each] for name, each in of_points.items() if max(map(len, each)) == 1}
     value = _value_column({name: cells for name, cells in texts.items() if name not in columns})
-    units = {split(value)[1]} - {""}
-    units = units or {cells[0] for cells in columns.values() if len(set(cells)) == 1 and cells[0].lower() in UNIT_SIGNS}
-    unit = units.pop() if len(units) == 1 else ""
+    units = [cells for cells in texts.values() if {cell.lower() for cell in cells} <= UNIT_SIGNS]
     for part in parts:
+        of_part = {cells[i] for cells in units for i, letter in enumerate(letters) if letter == part}
+        unit = split(value)[1] or (of_part.pop() if len(of_part) == 1 else "")
         columns[_with_unit(part, unit)] = [texts[value][rows[part]] if part in rows else "" for rows in points]
     note = f"one row per coordinate: column '{value}' by '{axis}'."
     return replace(table, columns=columns, notes=(*table.notes, note))

@@ -38,7 +38,7 @@ EXCEL_ROWS = 2**20
 SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": " "}
 """What may stand between cells, by name; a space stands for any number of them."""
 SAMPLE = 2**15  # characters from which the separator is found
-TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts")
+TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md")
 EXCEL = (".xlsx", ".xlsm")
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
 NO_NUMBER = re.compile(

@@ -10,10 +10,10 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
 from rpim_opt.robot.chain import Described
-from rpim_opt.robot.formats.tables import read_robot, read_sheet
+from rpim_opt.robot.formats.tables import SHEETS, read_robot, read_sheet
 
 READY = Path(__file__).resolve().parent / "ready"
-ROBOT_FILES = (".toml", ".urdf", ".csv", ".json", ".yaml", ".yml")
+ROBOT_FILES = (".toml", ".urdf", ".json", ".yaml", ".yml", *SHEETS)
 REFUSED = {
     ".xacro": "a xacro file, which ROS's command expands (xacro arm.urdf.xacro > arm.urdf)",
     ".xml": "an XML file, of MuJoCo or others",
@@ -40,7 +40,7 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
     ready = robots()
     if name in ready:
         return READY / f"{name}.toml"
-    accepted = "a file .toml, .urdf, .csv, .json or .yaml (Universal Robots' kinematics)"
+    accepted = "a file .toml, .urdf, .json, .yaml (Universal Robots' kinematics), or a DH table .csv, .md, .xlsx, ..."
     file = None if folder is None else folder / "problem.toml"
     refused = REFUSED.get(Path(name).suffix.lower())
     if refused:
@@ -60,14 +60,16 @@ def read_arm(
         return read_urdf(file, urdf_base, urdf_tip, origins)
     if origins:
         raise InputError("chain", f"a robot {file.name}", "a robot in a file .urdf")
-    if file.suffix == ".csv":
+    if file.suffix in SHEETS:
         return read_sheet(file, convention)
     if file.suffix in (".yaml", ".yml"):
         from rpim_opt.robot.formats.universal_robots import read_ur_kinematics
 
         return read_ur_kinematics(file)
     if convention:
-        raise InputError("--dh", f"'{convention}' of {file.name}", "a table .csv; other files state their convention")
+        raise InputError(
+            "--dh", f"'{convention}' of {file.name}", "a table of numbers; other files state their convention"
+        )
     return Described(read_robot(file), np.zeros(6), np.zeros(6))
 
 

@@ -10,6 +10,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.robot.formats.tables import read_sheet, write_robodk, write_robot
 from rpim_opt.robot.kinematics import numeric_frame, numeric_link
+from rpim_opt.robot.library import read_arm
 from tests.simulate import ARM
 from tests.store.raw_files import HEAD, ROWS, text
 from tests.test_cli import run
@@ -91,6 +92,32 @@ def test_an_index_of_the_link_before_says_that_it_is_modified(tmp_path: Path, he
     else:
         with pytest.raises(ro.InputError, match="not stated"):
             read_sheet(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        (
+            "dh.csv",
+            "KR 6 R900;;;;;;\nJoint;1;2;3;4;5;6\na [mm];25;455;35;0;0;0\nalpha [deg];-90;0;-90;90;-90;0\n"
+            "d [mm];400;0;0;420;0;80\ntheta;q1;q2;q3 - 90\u00b0;q4;q5;q6\n",
+        ),
+        (
+            "dh.md",
+            "# KR 6 R900\n\n| Kinematics | theta [rad] | a [m] | d [m] | alpha [rad] |\n|---|---|---|---|---|\n"
+            "| Joint 1 | 0 | 0.025 | 0.4 | \u2212\u03c0/2 |\n| Joint 2 | 0 | 0.455 | 0 | 0 |\n"
+            "| Joint 3 | -pi/2 | 0.035 | 0 | -pi/2 |\n| Joint 4 | 0 | 0 | 0.42 | 0.5 * pi |\n"
+            "| Joint 5 | 0 | 0 | 0 | -\u03c0/2 |\n| Joint 6 | 0 | 0 | 0.08 | 0 |\n",
+        ),
+    ],
+    ids=["a joint a column", "Markdown, parts of pi"],
+)
+def test_a_sheet_as_people_write_it_is_the_robot(tmp_path: Path, name: str, content: str) -> None:
+    (tmp_path / name).write_text(content, encoding="utf-8")
+    arm = read_arm(tmp_path / name, convention="standard")
+    expected = np.array([[0, 0, 0, 0.4, 0], [-90, 0.025, 0, 0, 0], [0, 0.455, -90, 0, 0], [-90, 0.035, 0, 0.42, 0],
+                         [90, 0, 0, 0, 0], [-90, 0, 0, 0.08, 0]])  # fmt: skip
+    assert np.abs(arm.robot.mdh - expected * [np.pi / 180, 1, np.pi / 180, 1, 1]).max() < 1e-12
 
 
 def test_a_written_table_has_one_system_of_units_and_reads_back_exactly(tmp_path: Path) -> None:

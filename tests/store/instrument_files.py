@@ -409,6 +409,34 @@ STRANGERS: dict[str, Shape] = {
         {"Joints": [HEAD[:7], *beside(NAMED, JOINTS)], "Points": [[HEAD[0], *HEAD[7:]], *beside(NAMED, POINTS)]},
         sheet="Joints,Points",
     ),
+    "SpatialAnalyzer, units in a comment": many(
+        ("joints.csv", text([HEAD[:7]], beside(NAMED, JOINTS))),
+        (
+            "sa.txt",
+            "// SpatialAnalyzer ASCII Export\n// Coordinate Frame: A::WORLD   Units: Millimeters, Degrees\n"
+            "// Format: Collection, Group, Target, X, Y, Z\n" + text([], [["A", "Robot", *row] for row in beside(NAMED, POINTS)]),
+        ),
+    ),
+    "a unit of lengths and one of angles in a comment": one(
+        "# 6DoF, length unit mm, angle unit deg\n" + text([BARE], ROWS, "\t"), "raw.txt"
+    ),
+    "JSON, units beside the rows": one(
+        json.dumps({
+            "meta": {"units": {"q": "deg", "point": "mm"}},
+            "samples": [{"id": n, "q": [*map(float, q)], "point": dict(zip("xyz", map(float, p), strict=True))} for n, q, p in zip(LABELS, JOINTS, POINTS, strict=True)],
+        }), "raw.json",
+    ),
+    "points with another word before their number": many(
+        ("calib.dat", krl()), ("points.csv", text([["Name", *HEAD[7:]]], [[f"Meas{i + 1:02d}", *row] for i, row in enumerate(POINTS)]))
+    ),
+    "MATLAB text": one(
+        "% joint angles in deg\nq = [\n" + text([], JOINTS, " ") + "];\np = [\n" + "".join(f"  {', '.join(row)};\n" for row in POINTS) + "]; % tracker [mm]\n",
+        "raw.m",
+    ),
+    "a row a value": one(
+        text([["point", "quantity", "value", "unit"]],
+             [[row[0], name, value, "deg" if name[0] == "J" else "mm"] for row in ROWS for name, value in zip([*joint_names("J{}"), *"XYZ"], row[1:], strict=True)])
+    ),
     "VAL3": program(
         "p.dtx", lines('<Value key="{}" j1="{}" j2="{}" j3="{}" j4="{}" j5="{}" j6="{}"/>\n'), key="row"
     ),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -153,12 +153,7 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
 
 def _key(joints: Understood, values: Understood, key: str) -> Key:
     """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
-    pairs = [
-        _keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others)
-        for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
-        if key in ("", "row") or key.lower() in (name.lower(), other.lower())
-    ]
-    pairs = [pair for pair in pairs if _alike({*pair.left}, {*pair.right})]
+    pairs = _pairs(joints, values, key, _keyed)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
     pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
     if key == "row":
@@ -173,8 +168,9 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     name = common[0] if not key and len(common) == 1 and not (telling and pair) else key.lower()
     if name in common:
         return _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
-    if pair:
-        return pair
+    numbered = [] if pairs else _pairs(joints, values, key, _by_numbers)
+    if pair or len(numbered) == 1:
+        return pair or numbered[0]
     found = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
     if key:
         found = f"'{key}', whose values no column of the other file has"
@@ -183,8 +179,32 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     raise InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
 
 
+def _pairs(
+    joints: Understood, values: Understood, key: str, keyed: Callable[[str, tuple[str, ...], list[str], list[str]], Key]
+) -> list[Key]:
+    """Return the keys that two columns make whose values are nearly the same."""
+    pairs = [
+        keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others)
+        for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
+        if key in ("", "row") or key.lower() in (name.lower(), other.lower())
+    ]
+    return [pair for pair in pairs if _alike({*pair.left}, {*pair.right})]
+
+
+def _by_numbers(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
+    """Return a key of names that are one word and a number on both sides, ``XP1`` and ``P1``, or a number alone."""
+    sides = [[re.fullmatch(r"(\D*)(\d+)\W?", name) for name in names] for names in (left, right)]
+    if not all(all(matches) and len({match[1] for match in matches if match}) == 1 for matches in sides):
+        return Key(how, columns, [], [])
+    own, others = ([str(int(match[2])) for match in matches if match] for matches in sides)
+    example = next(iter(right), "")
+    named = dict(zip(own, left, strict=True))
+    named = [named.get(number, name) for number, name in zip(others, right, strict=True)]
+    return Key(f"{how} ('{example}' as '{next(iter(named), '')}')", columns, left, named)
+
+
 def _alike(own: set[str], others: set[str]) -> bool:
-    return len(own & others) >= SAME * min(len(own), len(others))
+    return len(own & others) >= max(SAME * min(len(own), len(others)), 1)
 
 
 def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:

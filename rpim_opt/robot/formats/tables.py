@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, of_file, pick
 from rpim_opt.basics.files import read_json, read_toml, write_json, write_text
-from rpim_opt.basics.layout import read_table
+from rpim_opt.basics.layout import PART_OF_PI, read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import UNITS, accepted_units, display, split
@@ -23,7 +23,9 @@ from rpim_opt.robot.chain import Chain, Described, describe, standard_table, wit
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
-ENDINGS = (".toml", ".json", ".csv")
+SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")
+"""Endings of tables with one row per joint."""
+ENDINGS = (".toml", ".json", *SHEETS)
 LIMITS = ("lower", "upper")
 SI = {"angle": "rad", "length": "m"}
 FAR = 10.0  # a common normal that is further away [m] is that of nearly parallel axes
@@ -42,6 +44,9 @@ SHEET_ORDER = ("theta", "d", "a", "alpha", "beta")  # of a data sheet in the sta
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
+ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
+JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)
+"""The name of a joint in a cell."""
 WITHOUT_COLUMN = {
     "coupling": "a coupling of joints",
     "mounting": "a mounting other than on the floor",
@@ -167,7 +172,7 @@ def read_robot(path: str | Path) -> Robot:
     """
     path = Path(path)
     ending = _ending(path)
-    if ending == ".csv":
+    if ending in SHEETS:
         described = read_sheet(path)
         if described.tool.any() or described.base.any():
             raise InputError("the table", "a link after the last joint", "a script's read_arm, or rpim-opt new")
@@ -188,21 +193,22 @@ def read_sheet(path: Path, convention: str = "") -> Described:
         modified   Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta)
         standard   Rot(z, theta) Trans(z, d) Trans(x, a) Rot(x, alpha) Rot(y, beta)
     """
-    raw = read_table(path)
+    raw = read_table(path, turned=lambda grid: {"alpha", "a", "d"} <= {_stem(row[0])[0] for row in grid.rows})
     lost = next((note for note in raw.notes if "is not a row of the table" in note), "")
     if lost:
         raise InputError("the table", lost.rstrip("."), "one row per joint")
     columns: dict[str, list[str]] = {}
     for name, cells in raw.columns.items():
-        stem, unit = split(name.partition(" #")[0])
-        stem = INDEX_BEFORE.sub("", stem).strip().lower()
-        if stem in JOINT_NAMES:
+        texts = [str(cell) for cell in cells]
+        stem, unit = _stem(name.partition(" #")[0])
+        if stem in JOINT_NAMES or not any(texts) or all(map(JOINT_NAME.fullmatch, texts)):
             continue
-        stem = INDEX.sub("", stem)
-        key = SHEET.get(stem, stem) + (f"_{unit}" if unit else "")
+        if stem in ANGLES and not unit and any("°" in text for text in texts):
+            unit = "deg"
+        key = stem + (f"_{unit}" if unit else "")
         if key in columns:
             raise InputError("the header", ", ".join(raw.columns), "every column once")
-        columns[key] = [str(cell) for cell in cells]
+        columns[key] = texts
     conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
         conventions.add("modified")
@@ -220,6 +226,13 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     if robot.gravity.masses:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
     return _from_standard(robot)
+
+
+def _stem(name: str) -> tuple[str, str]:
+    """Return what a column of a sheet is called in ``robot.toml``, without indices, and its unit."""
+    stem, unit = split(name)
+    stem = INDEX.sub("", INDEX_BEFORE.sub("", stem).strip().lower())
+    return SHEET.get(stem, stem), unit
 
 
 def _from_standard(robot: Robot) -> Described:
@@ -243,6 +256,9 @@ def _joint(cells: dict[str, str]) -> dict[str, Any]:
             joint[name] = text
             if name.startswith("theta"):
                 text = ANGLE_OF.sub(r"\1", text).replace(" ", "") or "0"
+            turns = PART_OF_PI.fullmatch(text)
+            if turns and name.removesuffix("_rad") in ANGLES:
+                text = str(float(f"{turns[1]}{turns[2] or 1}") * np.pi / float(turns[3] or 1))
             for kind in (float, int):
                 with suppress(ValueError):
                     joint[name] = kind(text)

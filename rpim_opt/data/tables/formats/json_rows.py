@@ -42,6 +42,7 @@ def read_yaml(text: str) -> Rows:
 
 
 def _rows(found: Any) -> Rows:
+    units = _units(found)
     if isinstance(found, dict):
         lists = {name: cells for name, cells in found.items() if isinstance(cells, list)}
         inner = [cells for cells in lists.values() if cells and all(isinstance(row, dict) for row in cells)]
@@ -54,7 +55,20 @@ def _rows(found: Any) -> Rows:
             found = inner[0] if len(inner) == 1 else [found]
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
         raise InputError("the text", "an array of other things", "an array of objects, one per row")
-    return [dict(_flat("", row)) for row in found]
+    named = [
+        {f"{name} [{units[name]}]" if name in units else name: cell for name, cell in row.items()} for row in found
+    ]
+    return [dict(_flat("", row)) for row in named]
+
+
+def _units(found: Any) -> dict[str, str]:
+    """Return the units that an object states by the names of the columns, in ``units`` of its own or of its header."""
+    inner = found if isinstance(found, dict) else {}
+    for part in (inner, *(each for each in inner.values() if isinstance(each, dict))):
+        stated = next((each for name, each in part.items() if str(name).lower() == "units"), None)
+        if isinstance(stated, dict):
+            return {name: unit for name, unit in stated.items() if split(f"{name} [{unit}]")[1]}
+    return {}
 
 
 def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
