@@ -366,7 +366,7 @@ def report(
     """Write the calibration report: one self-contained HTML page, ready to be signed.
 
     With --data it has a section of their validation, with the acceptance test by them where the result has a limit
-    (calibrate --limit); verdict and acceptance of the page stay those of the result.
+    (calibrate --limit): it is the page's verdict then, in the place of the test by rows that were held out.
     """
     with _loaded(result) as (loaded, say):
         _require_data(register, data)

@@ -40,6 +40,7 @@ SEPARATORS = {"comma": ",", "semicolon": ";", "tab": "\t", "bar": "|", "space": 
 SAMPLE = 2**15  # characters from which the separator is found
 TEXTS = (".csv", ".txt", ".tsv", ".dat", ".asc", ".xyz", ".pts", ".md")
 EXCEL = (".xlsx", ".xlsm")
+NUMBERS_OF_ROW = 3  # numbers in a row from which on a sheet is one of measurements
 NUMERAL = re.compile(r"[+-]?(?:\d[\d.,]*|[.,]\d+)(?:[eE][+-]?\d+)?")
 NO_NUMBER = re.compile(
     r"(?<=\d)['\u2019\u00a0\u202f](?=\d{3}(?!\d))|±(?=\s*\d)|(?<=\d)[ \t]+#[^\n,;|\t]*$", re.MULTILINE
@@ -358,10 +359,10 @@ def _words(line: str) -> list[str]:
 
 
 def _excel(path: Path, sheet: str) -> Grid:
-    """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has cells."""
+    """Return the rows of a sheet of an Excel workbook: the stated one, or the first that has numbers."""
     openpyxl = library("openpyxl", "Excel files")
     rows: list[tuple[int, list[str]]] = []
-    chosen = ""
+    chosen = named = ""
     try:
         with path.open("rb") as stream:
             with ZipFile(stream) as archive:  # what it says of itself is what is read of it
@@ -377,15 +378,18 @@ def _excel(path: Path, sheet: str) -> Grid:
                 if not 0 < number <= len(names):
                     raise InputError("--sheet", f"'{sheet}'", choices(sheet, names))
                 wanted = [names[number - 1]]
-            for chosen in wanted:
-                rows = list(_filled(book[chosen]))
-                if rows:
+            for named in wanted:
+                filled = list(_filled(book[named]))
+                numeric = any(sum(map(is_numeral, row)) >= NUMBERS_OF_ROW for _, row in filled)
+                if filled and (numeric or not rows):
+                    rows, chosen = filled, named
+                if numeric:
                     break
     except InputError:
         raise
     except Exception as error:  # a broken file fails in zipfile, XML and openpyxl in many ways
         raise InputError("the file", _first_line(error), "a readable Excel workbook (.xlsx)") from None
-    how = "as requested" if sheet else "the first with cells; another one, or several, by --sheet"
+    how = "as requested" if sheet else "the first with numbers; another one, or several, by --sheet"
     notes = (f"sheet '{chosen}' of {', '.join(names)}: {how}.",) if len(names) > 1 else ()
     return Grid([row for _, row in rows], [number for number, _ in rows], notes)
 

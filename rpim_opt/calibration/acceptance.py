@@ -264,7 +264,8 @@ class Acceptance:
         ]
         workspace = self.workspace
         if workspace is not None and np.isfinite(workspace.largest):
-            another = "It is the uncertainty of the reflector; `compensate --tool` states that of another point."
+            reflector = f"reflector '{requirement.marker}'" if requirement.marker else "the reflector"
+            another = f"It is the uncertainty of {reflector}; `compensate --tool` states that of another point."
             lines += [f"{workspace.summary}.", another]
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
@@ -323,9 +324,12 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         refuse_misread(result, data)
     limit = requirement.limit
     region = region_of(result, requirement)
+    requirement = replace(requirement, marker=region.marker)  # the first, if none of several is stated
     drawn = region.drawn()
     held_out, missed, unheld = _held_out(result, region, requirement, data)
     lacking = [*_unmodelled(result, region), *unheld]
+    if result.contradiction:
+        lacking.append("Missing: constraints that the data do not contradict, on which the bound rests.")
     against = list(result.verdict.reasons)
     caution = " ".join(filter(None, [result.caution, _standing(result)]))
     try:

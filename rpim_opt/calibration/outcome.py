@@ -9,9 +9,11 @@ from types import MappingProxyType
 from typing import Any, NamedTuple, Self, get_args
 
 import numpy as np
+from scipy.special import chdtrc
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
 from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
@@ -49,6 +51,7 @@ from rpim_opt.problem.row_functions import transform
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.parameters import own_name
 
+CONTRADICTED = 1e-6  # probability of what constraints cost, if they hold for the robot, below which they do not
 ACTIVE = 1e-6  # relative multiplier from which on, and distance up to which, a constraint is active
 COVERAGE_FACTOR = 2.0  # of an expanded uncertainty where no confidence is stated: about 95 % of a normal distribution
 
@@ -112,8 +115,35 @@ class Outcome:
 
     @property
     def caution(self) -> str:
-        """How joint values count where their signs or zeros were estimated (`JointMapping.caution`); else empty."""
-        return "" if self.mapping is None else self.mapping.caution
+        """What uncertainties do not contain: signs and zeros that were estimated, constraints that are contradicted."""
+        mapped = "" if self.mapping is None else self.mapping.caution
+        return " ".join(filter(None, [mapped, self.contradiction]))
+
+    @cached_property
+    def contradiction(self) -> str:
+        """A sentence on constraints that the data contradict; empty where they do not, or the loss is no square.
+
+        Without constraints the sum of squares falls by chi-square of as many degrees of freedom as are active, if they
+        hold for the robot, times the residuals' variance where that is larger than the noise.
+        """
+        program, constraints = self.program, self.formulation.constraints
+        if not (constraints and self.formulation.solvable and program.quadratic):
+            return ""
+        tangent = program.tangent(self.z, self.weight)
+        if tangent is None:
+            return ""
+        free = program.ridge.minima(np.array([self.weight]))[0]
+        held, without = (program.objective(z, self.weight) for z in (self.z, free))
+        active = len(self.z) - tangent.shape[1]
+        variance = max(1.0, without / max(program.model.equations - len(self.z), 1))
+        if chdtrc(active, (held - without) / variance) > CONTRADICTED:
+            return ""
+        names = joined([name_of(constraint, k) for k, constraint in enumerate(constraints)])
+        return (
+            f"The data contradict constraints ({names}): without them the objective is {three_digits(without)} instead "
+            f"of {three_digits(held)}. Standard deviations and intervals are conditional on them and too small; check "
+            "the drawing and the nominal robot, or loosen them."
+        )
 
     # --- the robot that was found ------------------------------------------------------------------------------
 

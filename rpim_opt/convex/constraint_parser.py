@@ -22,9 +22,11 @@ DIMENSIONS = ("length", "angle", "ratio", "compliance")
 """Dimensions that parameters have."""
 Kind = Literal["equal", "most", "within", "norm", "move"]
 _NUMBER = r"(?:\d++\.?+\d*+|\.\d++)(?:[eE][+-]?+\d++)?+"  # possessive: read in linear time
-_PARAMETER = re.compile(r"[\w.]+")
+_PARAMETER = re.compile(r"[\w.-]+")
 _NAME = r"[A-Za-z_](?:[\w.*?]|\[[^\]]*\])*"
-_TOKEN = re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{_NAME})|(?P<sign>\+-|±|<=|>=|≤|≥|==|[-+*=|(),]))")
+_TOOL = r"(?:\w+\.)?tool(?:(?!_r?[xyz]\b)[\w.*?-])*_r?[xyz]\b"  # a reflector's name may have a hyphen: tool_SMR-A_x
+_SIGN = r"\+-|±|<=|>=|≤|≥|==|[-+*=|(),]"
+_TOKEN = re.compile(rf"\s*(?:(?P<number>{_NUMBER})|(?P<name>{_TOOL}|{_NAME})|(?P<sign>{_SIGN}))")
 _MOVE = re.compile(r"\s*move\b(?:\s+at\s+most\b)?([^:]*)(?::(.*))?")
 _SIGNS = {"±": "+-", "≤": "<=", "≥": ">=", "==": "="}
 

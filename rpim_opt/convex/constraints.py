@@ -76,6 +76,8 @@ class Ready:
 
 def name_of(function: Any, k: int) -> str:
     """Return the user's name of a constraint function."""
+    if isinstance(function, Box | Parsed):
+        return function.name
     call = getattr(function, "stated", None)
     if call:
         maker, *arguments = call

@@ -68,6 +68,10 @@ def write_report(
     write_text(Path(path), page(replace(calibration, record=record), new))
 
 
+FAVOURABLE = ("accepted", "inconclusive", "rejected")
+"""Verdicts of acceptance tests, the most favourable first."""
+
+
 class Content(NamedTuple):
     """A result, with evaluations that several sections share."""
 
@@ -76,6 +80,8 @@ class Content(NamedTuple):
     map: Workspace | None
     composition: list[str]
     new: Mapping[str, Validation]
+    tests: Mapping[str, Acceptance]
+    """By new measurements, where the result has a limit."""
 
 
 def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> str:
@@ -93,7 +99,11 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
-    content = Content(result, accepted, workspace, composition, new)
+    tests = {}
+    for name, each in new.items() if accepted is not None else ():
+        with contextlib.suppress(InputError):  # rows that are read in another way: a failure above
+            tests[name] = accept(result, data=each.data)
+    content = Content(result, accepted, workspace, composition, new, tests)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
@@ -107,7 +117,9 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
 
 def _headline(content: Content) -> Iterator[Block]:
     result = content.result
-    accepted = content.accepted
+    # new rows test all that the result's own test does
+    tests = [*content.tests.values()] or [content.accepted]
+    accepted = max(tests, key=lambda test: 0 if test is None else FAVOURABLE.index(test.verdict))
     reasons = result.verdict.reasons
     yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
     if accepted is not None:
@@ -197,8 +209,8 @@ def _new_measurements(content: Content) -> Iterator[Block]:
         yield "text", validation.sentences()
         if np.isfinite(validation.error).any():
             yield "figures", [_error_figure(content.result, "new", validation.data)]
-        if content.accepted is not None and not validation.mistake:
-            found = accept(content.result, data=validation.data)
+        found = content.tests.get(name)
+        if found is not None:
             checked = [] if found.held_out is None else [found.held_out["sentence"]]
             yield "text", [f"Acceptance test by these rows. {found.sentences()[0]}", *checked, *found.reasons]
 

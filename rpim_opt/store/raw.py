@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
-from rpim_opt.basics.tables import Columns, read_columns
+from rpim_opt.basics.tables import EXCEL, Columns, read_columns
 from rpim_opt.basics.units import dimension_of, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
@@ -127,7 +127,13 @@ def understand_of(
     """Interpret raw tables (files or data frames) of measurements, or of targets, as one table."""
     options = options or TableOptions()
     once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}  # once a sheet is once
-    files = [(path, _upright(raw, arm)) for source in once.values() for path, raw in _sheets(source, options)]
+    books = {key for key in once if Path(str(key)).suffix.lower() in EXCEL}
+    of_text = replace(options, sheet="") if books else options  # a sheet is the workbooks'
+    files = [
+        (path, _upright(raw, arm))
+        for key, source in once.items()
+        for path, raw in _sheets(source, options if key in books else of_text)
+    ]
     columns = [raw.columns for _, raw in files]
     if measurement is None:
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)

@@ -123,7 +123,7 @@ def export_files(
     result, notes = geometry_alone(whole)
     others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
     if corrections and any(others) and not transmission_errors(whole):
-        notes.append(f"Not written: {corrections.name}, since the calibration has no transmission errors.")
+        notes.append(f"Not written: {corrections.name}, since the calibration has no curves of transmission errors.")
         corrections = None
     note, remarks, undecided = _judged(whole, result, despite_verdict)
     note = " ".join(filter(None, [note, whole.caution]))

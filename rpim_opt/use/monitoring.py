@@ -107,7 +107,7 @@ class Monitoring:
         count = f"{len(self.label)} checks"
         lines = [f"No drift in {count}."]
         if self.drifts:
-            lines = [f"The robot deviates from its calibration in {count}.", *filter(None, [self.mistake])]
+            lines = [f"The robot deviates from its calibration ({count} read).", *filter(None, [self.mistake])]
         if self.beyond:
             named = [f"{self._named(i)}, {1e3 * self.error[i]:.3f} mm" for i in self.beyond]
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")

@@ -237,6 +237,23 @@ def test_a_penalty_without_covariance_has_no_bound(instance) -> None:
     assert any("No bound" in reason for reason in found.reasons)
 
 
+def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance) -> None:
+    """Intervals are conditional on it: small, whatever it says."""
+    names = instance.problem.parameters.free.names
+    free = ro.calibrate(instance.problem)
+    k = names.index("d4")
+    sd = float(np.sqrt(free.covariance[k, k]))
+    for sigmas, contradicted in ((2.0, False), (12.0, True)):
+        value = 1e3 * (free.problem.parameters.free.nominal[k] + free.x[k] + sigmas * sd)
+        limits = (ro.constraints.parse(f"d4 <= {value - 2e3 * sigmas * sd:.6f} mm"),)
+        stated = ro.Formulation("stated", penalty=ro.tikhonov.penalty, constraints=limits)
+        result = ro.calibrate(instance.problem, stated)
+        assert bool(result.contradiction) == contradicted
+        assert ("The data contradict constraints" in str(result)) == contradicted
+        found = accept(result, Requirement(5e-3), instance.validation)
+        assert (found.verdict == "inconclusive") == contradicted, found
+
+
 # --- all rows ----------------------------------------------------------------------------------------------------
 
 

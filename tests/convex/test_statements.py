@@ -92,3 +92,9 @@ def test_anything_else_is_refused(text: str, found: str) -> None:
         sentence(text)
     assert found in error.value.found
     assert error.value.where == "key stated" or str(text) in error.value.where
+
+
+def test_a_reflectors_name_may_have_a_hyphen() -> None:
+    found = sentence("tool_SMR-A_x - tool_SMR-B_x = 30 +- 0.1 mm")
+    assert found.sums[0].names == ("tool_SMR-A_x", "tool_SMR-B_x")
+    assert sentence("tool_x-tool_y <= 1 mm").sums[0].names == ("tool_x", "tool_y")

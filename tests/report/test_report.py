@@ -293,8 +293,12 @@ def test_new_measurements_verify_a_result_and_are_held_against_its_limit() -> No
     new = {"later.csv": ro.use.validate(result, later)}
     assert "Without validation data" not in page(result, new)
     text = " ".join(Reader(page(required(result, 1e-3), new)).words.split())
-    assert "Inconclusive" in text[: text.index("Validation on new measurements")]  # the result has no held-out rows
+    assert "Accepted" in text[: text.index("Validation on new measurements")]  # though no rows were held out
     assert "Acceptance test by these rows. Accepted: limit 1 mm" in text
+    off = replace(later, blocks=tuple(replace(block, y=block.y + 5e-3) for block in later.blocks))
+    new["off.csv"] = ro.use.validate(result, off)
+    text = " ".join(Reader(page(required(result, 1e-3), new)).words.split())
+    assert "Accepted" not in text[: text.index("Validation on new measurements")]
     assert "Held out: 40 rows" in text
 
 

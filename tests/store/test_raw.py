@@ -29,6 +29,7 @@ from tests.store.raw_files import (
     Q,
     T,
     beside,
+    book,
     cells,
     clocked,
     text,
@@ -365,6 +366,45 @@ def test_a_table_of_a_hundred_thousand_columns_is_refused_in_a_moment(monkeypatc
         assert new(monkeypatch, arm, tmp_path / "cell", path) == 2
         assert process_time() - start < 2.0
         assert "a row of 100000 cells, accepted: at most 1000 columns" in capsys.readouterr().err
+
+
+def test_a_sheet_is_that_of_the_workbook_beside_a_text_file(monkeypatch, capsys, tmp_path, arm) -> None:
+    joints = tmp_path / "joints.csv"
+    joints.write_text(text([["Point", *HEAD[1:7]]], beside(NAMED, JOINTS), ";"))
+    other = [[*row[:3], "0.0"] for row in POINTS]
+    sheets = {
+        "Info": [["Project", "cell 7"], ["Serial number", "4711"]],
+        "Points": [["Point", *HEAD[7:]], *beside(NAMED, POINTS)],
+        "Other": [["Point", *HEAD[7:]], *beside(NAMED, other)],
+    }
+    points = book(tmp_path, sheets)
+    for k, sheet in enumerate(([], ["--sheet", "Points"], ["--sheet", "2"])):  # the first with numbers, or as stated
+        assert new(monkeypatch, arm, tmp_path / f"cell{k}", [joints, points], *sheet) == 0, capsys.readouterr().err
+        assert "sheet 'Points' of Info, Points, Other" in capsys.readouterr().out
+        assert len(ro.load(tmp_path / f"cell{k}").problem.data) == COUNT
+
+
+def test_joined_readings_keep_the_names_of_their_points(monkeypatch, capsys, tmp_path, arm) -> None:
+    joints, points = tmp_path / "joints.csv", tmp_path / "points.csv"
+    joints.write_text(text([["Point", *HEAD[1:7]]], beside(NAMED, JOINTS)))
+    rows = [[*name, marker, *point] for name, point in zip(NAMED, POINTS, strict=True) for marker in ("A", "B")]
+    points.write_text(text([["Point", "Reflector", *HEAD[7:]]], rows))
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 0, capsys.readouterr().err
+    labels = ro.load(tmp_path / "cell").problem.data.label
+    assert set(labels) == {f"{name[0]}/{marker}" for name in NAMED for marker in ("A", "B")}
+
+
+def test_every_reflector_is_joined_by_the_nearest_time(monkeypatch, capsys, tmp_path, arm) -> None:
+    joints, points = clocked(tmp_path, rate=10.0, apart=0.0)
+    rows = []
+    for i, point in enumerate(POINTS):
+        rows += [[f"P{i}{marker}", marker, f"{1e3 * i + later}", *point] for marker, later in (("A", 20), ("B", 60))]
+    points.write_text(text([["Point", "Reflector", "Timestamp [ms]", *HEAD[7:]]], rows))
+    stated = ["--time-tolerance", "0.07"]
+    assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], *stated) == 0, capsys.readouterr().err
+    data = ro.load(tmp_path / "cell").problem.data
+    assert len(data) == 2 * COUNT
+    assert len(np.unique(data.configuration)) == COUNT
 
 
 def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys, tmp_path, arm) -> None:

@@ -92,7 +92,7 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     sums = np.array([0.0, 0.0, 1.0, 2.0, 9e9, 9e9, 9e9, 9e9])
     found = replace(quiet, sums=sums, drift=drift)
     lines = str(found).splitlines()
-    assert lines[0] == "The robot deviates from its calibration in 8 checks."
+    assert lines[0] == "The robot deviates from its calibration (8 checks read)."
     assert lines[1] == "Cumulative sum above its limit: alarm at '5', since '3'."
     assert said in lines[2]
     assert found.content()["since"] == "3"

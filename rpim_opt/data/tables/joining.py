@@ -83,10 +83,13 @@ def together(
     left, right = joints.take(match.left), values.take(match.right)
     columns = {**left.columns, **right.columns}
     columns.pop("label", None)
+    own = right.columns.get("label", ())
     if len(set(match.names)) == len(match.names):
         columns = {"label": match.names, **columns}
     else:  # several measured values of a configuration
         columns.setdefault("configuration", match.names)
+        if len(set(own)) == len(match.names):
+            columns = {"label": own, **columns}
     notes = (*joints.notes, *values.notes, *match.notes)
     return replace(right, columns=columns, raw={**left.raw, **right.raw}, notes=notes, keys=match.columns)
 
@@ -281,7 +284,15 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
         raise InputError("--time-tolerance", f"{within:g}", "a time [s], zero or more")
     clocks, (there, then) = zip(*(_times(side, key) for side in (joints, values)), strict=True)
     rounding = 4 * np.spacing(max(np.abs(there).max(), np.abs(then).max()))  # since 1970, half a microsecond
-    left, right, apart = partners(there, then, within + rounding)
+    markers = np.array(values.columns.get("marker", [""] * len(then)))
+    found = []
+    for marker in sorted(set(markers)):  # a row of joints has one measured row of each reflector
+        own = np.flatnonzero(markers == marker)
+        rows, of_own, apart = partners(there, then[own], within + rounding)
+        found.append((rows, own[of_own], apart))
+    left, right, apart = (np.concatenate(each) for each in zip(*found, strict=True))
+    order = np.lexsort((right, left))
+    left, right, apart = left[order], right[order], apart[order]
     if not len(left):
         nearest = float(np.abs(there - then[0]).min())
         found = f"no two within {within:g} s; the first measured row is {nearest:.6g} s from one with joints"
@@ -302,7 +313,10 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
     if lonely:
         several = f"{len(lonely)} measured rows without a match within {within:g} s, ignored"
         notes.append(f"{several}: {listed(lonely)}.")
-    return Match(left.tolist(), right.tolist(), [labels[i] for i in right], notes, clocks)
+    names = [labels[i] for i in right]
+    if len(set(left.tolist())) < len(left):
+        names = [joints.labels[i] for i in left]
+    return Match(left.tolist(), right.tolist(), names, notes, clocks)
 
 
 def _motion(joints: Understood, times: Array, rows: np.ndarray, moments: Array) -> Array:
