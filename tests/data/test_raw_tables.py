@@ -91,10 +91,10 @@ def test_a_file_of_another_kind_is_named(tmp_path: Path) -> None:
         read(write(tmp_path, HEAD + ROWS, "raw.pdf"))
 
 
-def test_the_first_sheet_with_cells_is_read_and_another_one_by_name_or_number(tmp_path: Path) -> None:
+def test_the_first_sheet_with_numbers_is_read_and_another_one_by_name_or_number(tmp_path: Path) -> None:
     path = book(tmp_path)
     found = read(path)
-    assert "sheet 'points' of notes, points: the first with cells" in found.notes[0]
+    assert "sheet 'points' of notes, points: the first with numbers" in found.notes[0]
     for sheet in ("points", "2"):
         assert dict(read(path, sheet=sheet).columns) == dict(found.columns)
     with pytest.raises(ro.InputError, match=r"found 'poinst', accepted: .*points"):
