@@ -284,14 +284,18 @@ def _worse(result: Outcome) -> Iterator[str]:
 
 
 def elsewhere(result: Outcome, error: Array) -> str:
-    """Say that most rows, of errors (N,) [m], are further off than any robot is by itself; empty if they are not."""
-    if not np.isfinite(error).any() or np.nanmedian(error) <= REACH * arm_length(result.problem):
+    """Say that most rows, of errors (N,) [m], are further off than any robot is by itself; empty if they are not.
+
+    Where the rows of the calibration are as far off, something else is wrong.
+    """
+    most = REACH * arm_length(result.problem)
+    if not np.isfinite(error).any() or np.nanmedian(error) <= most or np.nanmedian(result.errors()) > most:
         return ""
     return (
         f"Median error on {len(error)} held-out rows {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's "
         f"own errors stay below {100 * REACH:g} % of the arm's length. The instrument or the base may have moved "
-        "(`validate` and `accept` register such rows with --register, as a table beside the folder), or these are "
-        "another robot's measurements."
+        "(`validate` and `accept` register such rows with --register, as a table beside the folder), the reflector or "
+        "tool may be another one, or these are another robot's measurements."
     )
 
 
@@ -355,8 +359,8 @@ def likely_causes(result: Outcome) -> list[str]:
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
     ordered = _in_table_order(result, problem)
     shared = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
-    if result.learned is not None:
-        shared += diagnosis.left_out_together(problem.labels, {row.label for row in result.learned.left_out})
+    left_out = () if result.learned is None else result.learned.left_out
+    together = list(diagnosis.left_out_together(problem.labels, {row.label for row in left_out}))
     if result.mapping is not None:
         shared += result.mapping.ambiguities
     if signs or not result.converged:
@@ -366,6 +370,9 @@ def likely_causes(result: Outcome) -> list[str]:
         causes = [other.sentence]
     else:
         causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
+        if not causes and together:
+            causes = list(diagnosis.part_way(ordered))
+            together = [] if causes else together
         if causes:
             causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
         if not causes and len(problem.arms) == 1:
@@ -377,6 +384,7 @@ def likely_causes(result: Outcome) -> list[str]:
                 error = rms(problem.errors(result.x)[kept])
                 slight = diagnosis.roundings(problem, error, (1 - SLIGHT) ** -0.5)
                 shared += [f"{SLIGHTLY}: {text}" for text in first(slight, diagnosis.slight_effects(alone, x))]
+    shared += together
     if noticed:
         causes += _upward(result, problem)
     if causes or shared:

@@ -761,13 +761,15 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    whole = misfit(points)
+    whole = float(np.sqrt(np.mean(fit_points(points).error ** 2))) / points.extent  # of all rows, if few are wrong
     first = {k: points.take(np.arange(k)) for k in _places(len(points.row))}
     fitting = [k for k, part in first.items() if misfit(part) < BETTER * whole]
     if not fitting:
         return
     error = fit_points(first[max(fitting)]).error
     start = int(np.flatnonzero(error <= FAR * np.median(error)).max()) + 1
+    if len(points.row) - start < FEWEST:
+        return
     better = better_reading(problem.on(problem.data.take(points.row[start:])))
     if better is not None:
         yield f"from about row {problem.data.label[points.row[start]]} on {better.sentence}"
@@ -964,11 +966,11 @@ def _changes(
     least: int = 0,
 ) -> Iterator[Addition]:
     """Yield that parameters changed at a row, between two rows or steadily; of ``least`` equations a parameter."""
-    free, data, owners = problem.parameters.free, problem.data, problem.owners
+    free = problem.parameters.free
     some = np.flatnonzero(np.isin(free.names, list(names)))
-    if len(data) < 2 * FEWEST or not len(some):
+    if not len(some):
         return
-    equations = Equations.of(data)
+    equations = Equations.of(problem.data)
 
     def say(when: str, share: Array, coefficients: Array) -> tuple[str, str]:
         rows = equations.length & (share > 0)
@@ -981,6 +983,16 @@ def _changes(
         session = ", or name them in a column `session`" if what == "base" else ""
         return f"{when} {moved}", f"{cause}? Calibrate the two parts separately{session}"
 
+    for when, share in _shares(problem).items():
+        if np.count_nonzero(share) >= least * len(some):
+            yield Addition(A[:, some] * share[:, None], partial(say, when, share))
+
+
+def _shares(problem: CalibrationProblem) -> dict[str, Array]:
+    """Return what part equations (m,) have in a change that came at a row, between two rows or steadily, and when."""
+    data, owners = problem.data, problem.owners
+    if len(data) < 2 * FEWEST:
+        return {}
     shares = {"more and more from row to row": owners / (len(data) - 1)}
     for start, end in [*((k, len(data)) for k in _places(len(data))), *combinations(_places(len(data), SPANS), 2)]:
         # rows of one configuration share what the model lacks of the arm, and are one piece of evidence
@@ -989,9 +1001,7 @@ def _changes(
             continue
         until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
         shares[f"from row {data.label[start]} {until}"] = ((owners >= start) & (owners < end)).astype(float)
-    for when, share in shares.items():
-        if np.count_nonzero(share) >= least * len(some):
-            yield Addition(A[:, some] * share[:, None], partial(say, when, share))
+    return shares
 
 
 class Kinds(NamedTuple):
@@ -1159,9 +1169,14 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         return Addition(column[:, None], lambda c: (what.format(f"{100 * c[0]:+.2g} %"), remedy), SMALL)
 
     yield scale(along[:, 0], "measured lengths are {} too long", "check the scale of the instrument")
-    of_zero = "check the instrument's zero and the reflector's radius"
-    offset = "measured distances are {} mm too long"
-    yield Addition(along[:, [1]], lambda c: (offset.format(three_digits(1e3 * c[0])), of_zero), SMALL)
+
+    def offset(column: Array, when: str, remedy: str) -> Addition:
+        what = f"{when}measured distances are {{}} mm too long"
+        return Addition(column[:, None], lambda c: (what.format(three_digits(1e3 * c[0])), remedy), SMALL)
+
+    yield offset(along[:, 1], "", "check the instrument's zero and the reflector's radius")
+    for when, share in _shares(problem).items():
+        yield offset(along[:, 1] * share, f"{when} ", "check the reflector and its radius in these rows")
     if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
         flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
         radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)

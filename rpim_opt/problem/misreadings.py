@@ -372,17 +372,26 @@ def _factors(points: Points) -> Iterator[Misreading]:
 
 
 def _orders(points: Points) -> Iterator[Misreading]:
-    """Yield all orders of up to six turning joints."""
+    """Yield all orders of up to six turning joints; of more, those with one elsewhere, as ABB's seventh is third."""
     robot = points.robot
-    if robot.dof > 6 or len(set(robot.joint_dimensions)) > 1:
+    joints = tuple(range(robot.dof))
+    if len(set(robot.joint_dimensions)) > 1:
         return
-    for columns in permutations(range(robot.dof)):  # the columns that hold joints 1, 2, ...
+    orders = permutations(joints) if robot.dof <= 6 else map(partial(_elsewhere, joints), permutations(joints, 2))
+    for columns in orders:  # the columns that hold joints 1, 2, ...
         names = ", ".join(f"q{columns.index(i) + 1}" for i in range(robot.dof))
 
         def change(points: Points, columns: tuple[int, ...] = columns) -> Points:
             return replace(points, q=points.q[..., columns])
 
         yield Misreading(f"joints in the order {names}", f"name the columns {names}", change)
+
+
+def _elsewhere(joints: tuple[int, ...], move: tuple[int, int]) -> tuple[int, ...]:
+    """Return the order of joints in which one is moved to another place."""
+    joint, place = move
+    others = [each for each in joints if each != joint]
+    return (*others[:place], joint, *others[place:])
 
 
 def _other_robots(points: Points) -> Iterator[Misreading]:
@@ -433,7 +442,8 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     mapping = None if explained(points) else search(points)
     if mapping is not None:
         return _of_mapping(mapping)
-    present = float(misfits([points])[0])  # with zeros fitted, as of every other reading
+    # with zeros fitted, as of every other reading, unless they only fit what is wrong with some rows
+    present = min(float(misfits([points])[0]), misfit(points))
     if not np.isfinite(present):
         return None
     chain, left = _mistakes(points, present)

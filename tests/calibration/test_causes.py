@@ -196,6 +196,36 @@ def test_a_small_motion_of_the_instrument_is_named_before_calibrating_too(robot:
     assert not [text for text in inspect(alone).warnings if "hardly" not in text]
 
 
+LAST = np.arange(80)[:, None] >= 60
+
+
+@pytest.mark.parametrize(
+    ("robot", "wrong", "said"),
+    [
+        ("ur5e", values(lambda y: y / np.where(LAST, 1e3, 1)), "row P61 on .* thousand times larger"),
+        ("fr3", joints(lambda q: q * np.where(LAST[:, None] & (np.arange(7) == 3), -1, 1)), "P61 on .* joint 4 rev"),
+        ("iiwa7", joints(lambda q: q[..., [0, 1, 6, 2, 3, 4, 5]]), "joints in the order q1, q2, q7, q3, q4, q5, q6"),
+        ("iiwa7", values(lambda y: y * (1 - 0.0127 * (np.arange(80) >= 40) / np.linalg.norm(y, axis=1))[:, None]),
+         "from row P4. on measured distances are -12"),
+    ],
+    ids=["rows in metres", "a sign in some rows", "the seventh joint third", "another radius in some rows"],
+)  # fmt: skip
+def test_what_is_wrong_with_some_rows_or_one_place_is_named(robot: str, wrong, said: str) -> None:
+    causes = likely_causes(ro.calibrate(wrong(simulated_arm(robot, count=80))))
+    assert any(re.search(said, text) for text in causes), causes
+    assert not any("excluded as outliers" in text for text in causes)
+
+
+def test_held_out_rows_are_elsewhere_only_if_the_others_are_not() -> None:
+    """Else the instrument did not move between them, and the cause is the same."""
+    problem = simulated_arm("ur5e")
+    for wrong, said in ((lambda y: y + np.array([0.1, 0, 0]), True), (lambda y: y[::-1], False)):
+        rows = values(wrong)(simulated_arm("ur5e", count=20)).data
+        own = problem if said else values(wrong)(problem)
+        reasons = validated(calibrated(own), rows).verdict.reasons
+        assert any("the reflector or tool may be another one" in text for text in reasons) == said, reasons
+
+
 def growing(count: int) -> np.ndarray:
     return np.linspace(0, 1, count)[:, None]
 
