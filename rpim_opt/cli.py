@@ -190,7 +190,7 @@ class Tables(NamedTuple):
     time_tolerance: Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")] = (
         None
     )
-    quaternion: Annotated[str, Option(help="Order of numbered components, wxyz or xyzw.")] = ""
+    quaternion: Annotated[str, Option(help="Order of a quaternion's numbered components, wxyz or xyzw.")] = ""
     rotation: Annotated[
         str, Option(help="Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector.")
     ] = ""
@@ -474,7 +474,7 @@ def update(
     data: Annotated[list[Path], Argument(help=f"New measurements, in the same instrument's frame; {Several}")],
     tables: Tables = TABLES,
     measurement: Kind = None,
-    prior_inflation: Annotated[float, Option(help="Factor on the earlier standard deviations.")] = 1.0,
+    prior_inflation: Annotated[float, Option(help="Factor on the previous standard deviations.")] = 1.0,
     reset: Annotated[str, Option(help="Parameters without a prior: 'base_*' after the instrument was moved.")] = "",
     source: Source = None,
     out: Folder = None,
@@ -528,7 +528,7 @@ def export(
     ur_kinematics: UrKinematics = None,
     ur_calibration: Annotated[File, Option(help=CONF)] = None,
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
-    mdh: Annotated[File, Option(help="DH table to write: .csv, .json or .toml; convention as --dh says.")] = None,
+    mdh: Annotated[File, Option(help="DH table to write: .csv, .json or .toml, in the convention of --dh.")] = None,
     dh: Convention = "modified",
     robodk: Annotated[File, Option(help="CSV file to write with RoboDK's four numbers a joint (modified DH).")] = None,
     corrections: Annotated[File, Option(help="CSV file for transmission errors, to subtract from commands.")] = None,
@@ -569,7 +569,7 @@ def compensate(
     out: Table = None,
     despite_verdict: Despite = False,
 ) -> Answer:
-    """Correct joint commands so that the real robot goes where the nominal one would.
+    """Correct joint commands so that the calibrated robot reaches the poses of the nominal one.
 
     Exit code 1 if the robot is not delivered, or a command misses its target: unreachable, or error and uncertainty
     above the limit (without a limit: error above twice its standard uncertainty).

@@ -112,7 +112,7 @@ def test_two_logs_are_read_alike_by_every_command_that_takes_measurements(
     ):
         assert run(monkeypatch, command, *options, "--json") == 0, command
         found[command] = json.loads(capsys.readouterr().out)
-        assert found[command]["tables"][-1].endswith("8 rows of 8 with joints and 8 measured.")
+        assert found[command]["tables"][-1].endswith("8 rows match, of 8 with joints and 8 measured.")
     assert found["validate"]["identified"]["count"] == 8
     assert found["validate"]["left_out"] == []
     other = logs("other", slice(25, 33), "Nummer")

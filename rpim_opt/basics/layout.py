@@ -138,7 +138,7 @@ class RawTable:
         for text in constants:
             name, mark, value = (part.strip() for part in text.rpartition("="))
             if not mark or math.isnan(numeral(value)):
-                raise InputError("constants", f"'{text}'", "a column's name with its unit, =, and a number")
+                raise InputError("constants", f"'{text}'", "COLUMN [UNIT]=NUMBER, such as 'torso_lift [m]=0.15'")
             if name in columns:
                 raise InputError("constants", f"'{name}', which the table has", "a column that it lacks")
             columns[name] = [value] * len(next(iter(columns.values()), ()))
@@ -389,7 +389,7 @@ def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
     """Give every row as many cells as the header; blank ones at the end may be missing or too many."""
     what = "the header"
     if options.columns:
-        what = "--columns, which holds for every file (of several, write a header into those without one)"
+        what = "--columns, which applies to all files (or write a header into those without one)"
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()
@@ -510,7 +510,7 @@ def _one_row_each(table: RawTable) -> RawTable:
     texts = {name: _without_letters(cells, letters) for name, cells in texts.items()}
     points = next(filter(None, (_points(cells, letters) for cells in texts.values())), [])
     if not points:
-        accepted = f"a column naming the point; {', '.join(parts)} once each"
+        accepted = f"a column that names the point, with {', '.join(parts)} once for each point"
         raise InputError("the header", f"one row per coordinate ('{axis}')", accepted)
     of_points = {name: [{cells[i] for i in rows.values()} for rows in points] for name, cells in texts.items()}
     columns = {name: [min(own) for own in each] for name, each in of_points.items() if max(map(len, each)) == 1}

@@ -18,6 +18,7 @@ from rpim_opt.calibration.diagnosis import SLACK
 from rpim_opt.calibration.held_out import (
     FEWEST,
     compared,
+    coverage_text,
     displaced,
     excluded_by_fit,
     headline_errors,
@@ -265,7 +266,7 @@ class Acceptance:
         workspace = self.workspace
         if workspace is not None and np.isfinite(workspace.largest):
             reflector = f"reflector '{requirement.marker}'" if requirement.marker else "the reflector"
-            another = f"It is the uncertainty of {reflector}; `compensate --tool` states that of another point."
+            another = f"U is that of {reflector}; `compensate --tool` states that of another point."
             lines += [f"{workspace.summary}.", another]
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
@@ -362,24 +363,24 @@ def _missing(result: Calibration, limit: float, bound: float, repeatability: flo
         return "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
     if repeatability > limit:
         return (
-            f"Missing: a tighter bound on repeatability: {1e3 * repeatability:.3f} mm may exceed the "
-            "limit: approach some poses repeatedly (`rpim-opt iso9283`)."
+            f"Missing: a tighter bound on repeatability, which may contribute {1e3 * repeatability:.3f} mm. Approach "
+            "some poses repeatedly (`rpim-opt iso9283`)."
         )
     if any(of_session(name) for name in result.problem.parameters.free.names):
         return (
-            f"Missing: one registration for all sessions. The bound is {1e3 * bound:.3f} mm, session offsets "
-            "included: more configurations do not reduce them."
+            f"Missing: one registration for all sessions. The bound of {1e3 * bound:.3f} mm includes session offsets, "
+            "which more configurations do not reduce."
         )
     kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     if not any(kind.registers for kind in kinds.values()):
         return (
-            f"Missing: where the base stands, which {joined(list(kinds))} readings do not determine: more of them "
-            f"hardly reduce the bound of {1e3 * bound:.3f} mm. Survey the base or what the readings start "
-            'from, and state it in [prior] (known = ["anchor_x = 900 +- 0.05 mm", ...]).'
+            f"Missing: the base frame, which {joined(list(kinds))} readings do not determine: more of them hardly "
+            f"reduce the bound of {1e3 * bound:.3f} mm. Survey the base or the anchor, and state the result in [prior] "
+            '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     return (
         f"Missing: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the "
-        f"robot's repeatability would still cause {1e3 * repeatability:.3f} mm of it. `rpim-opt design PROBLEM "
+        f"robot's repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design PROBLEM "
         "--augment --count 10` names the configurations that help most."
     )
 
@@ -393,7 +394,7 @@ def _standing(result: Calibration) -> str:
     still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]
     if not still:
         return ""
-    return f"The region holds where joint{'s' * (len(still) > 1)} {joined(still)} stood: nothing else was measured."
+    return f"The verdict holds only at the measured values of joint{'s' * (len(still) > 1)} {joined(still)}: not moved."
 
 
 def _held_out(
@@ -442,12 +443,11 @@ def _held_out(
         )
     noise = 1e3 * instrument[inside].max(initial=0.0)
     sentence = f"Held out: {rows} rows, {count} of them in the region, maximum error there {largest:.3f} mm "
-    sentence += f"(the instrument alone makes up to {noise:.3f} mm)"
+    sentence += f"(up to {noise:.3f} mm from the instrument alone)"
     if held.coverage is not None:
-        least = required_coverage(rows)
-        share = f"{100 * held.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
-        sentence += f"; {share} (at least {100 * least:.0f} % are required for this number of rows)"
-        if held.coverage < least:
+        share = coverage_text(held.coverage, rows)
+        sentence += f"; {share}"
+        if held.coverage < required_coverage(rows):
             why = "" if beyond else moved
             lacking.append(f"Missing: valid prediction intervals. Only {share}. {why}".rstrip())
     if not count:

@@ -180,11 +180,9 @@ def noise_test(squares: float, freedom: float, learned: bool = False, factor: fl
     probability = 2 * min(upper, 1 - upper)
     if probability >= UNLIKELY:
         return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise (ratio {ratio:.2f}).")
-    cause = (
-        "the noise is larger than the problem says, rows are wrong, or the model lacks an effect (backlash, compliance)"
-    )
+    cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"
     if upper >= 0.5:
-        cause = "the noise is smaller than the problem says"
+        cause = "the noise is smaller than stated"
         if learned and factor == 1.0:
             cause += ' (--noise free, or repeatability = "free" in problem.toml, estimates it)'
     elif learned:

@@ -67,6 +67,12 @@ def required_coverage(rows: int) -> float:
     return float(np.sum(bdtr(np.arange(rows + 1), rows, CONFIDENCE) < UNLIKELY)) / rows
 
 
+def coverage_text(coverage: float, rows: int) -> str:
+    """Return the coverage of 95 % prediction intervals, beside the `required_coverage`, as text."""
+    share = f"{100 * coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
+    return f"{share} (at least {100 * required_coverage(rows):.0f} % are required for this number of rows)"
+
+
 def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
     """Say that measurements are displaced together, by the motion that registers them: as mistake or as remark.
 
@@ -93,12 +99,12 @@ def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, s
     )
     if far and after <= before / 2:
         return (
-            f"Likely: the instrument or the base moved. {said} `validate` and `accept` do so with --register: leave "
-            "such rows out of the problem's folder; `update --reset 'base_*'` recalibrates. If neither moved, the "
-            "robot has one common error there."
+            f"Likely: the instrument or the base moved. {said} Use --register in `validate` and `accept`, or "
+            "recalibrate by `update --reset 'base_*'`; do not add such rows to the problem's folder. If neither moved, "
+            "the robot has a common error at these configurations."
         ), ""
     if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:
-        return "", f"{said} If the instrument was set up again since the calibration, use --register."
+        return "", f"{said} If the instrument was moved since the calibration, use --register."
     return "", ""
 
 

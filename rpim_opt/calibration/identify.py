@@ -277,8 +277,7 @@ def _contradicted(prior: Prior, problem: Source, x: Array) -> list[str]:
         apart = np.abs(rows @ (x / problem.parameters.free.scale) - values).max(initial=0.0)
         if not statement.whole and apart > CONTRADICTED:
             lines.append(
-                f"The data contradict {statement.where}: the identified value is {apart:.0f} of its standard "
-                "deviations away."
+                f"The data contradict {statement.where}: the identified value is {apart:.0f} standard deviations away."
             )
     return lines
 

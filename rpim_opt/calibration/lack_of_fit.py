@@ -159,7 +159,7 @@ class LackOfFit:
                 joints = f"Compliances of joints {joined([str(joint) for joint in self.upward])} are"
             lines.append(
                 f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the "
-                "controller compensates sag; do not use such a fit outside the measured joint ranges."
+                "controller compensates sag. Do not use this fit outside the measured joint ranges."
             )
         lines += filter(None, [_limit(self)])
         if self.repeated is not None:
@@ -383,7 +383,7 @@ def _limit(found: LackOfFit) -> str:
             return f"{limit}." if found.excess else f"{limit}, by its repeatability, backlash or drift."
         return (
             f"{limit}; the data do not separate repeatability from an effect that the model lacks. Repeat five "
-            "configurations, approached from both sides, before a better instrument is bought."
+            "configurations, approached from both sides, before you buy a better instrument."
         )
     if found.overstated:
         return "Repeat one reading ten times and state its standard deviation as the measurement noise."

@@ -391,7 +391,7 @@ class Outcome:
         """The reason why there is no covariance; empty where there is one."""
         of = f"of formulation '{self.formulation.name}'"
         if not self.linear_penalty:
-            return f"the penalty {of} is no square; only that of a normal prior has a posterior covariance"
+            return f"the penalty {of} is not quadratic; only a normal prior has a posterior covariance"
         if self.known_covariance is None:
             return f"the loss {of} rests on a few equations and has no quadratic model"
         return ""
@@ -404,7 +404,7 @@ class Outcome:
     @property
     def no_intervals(self) -> str:
         """Return a sentence on why there are no intervals; empty where there are."""
-        return f"No uncertainties and prediction intervals: {self._undefined}." if self._undefined else ""
+        return f"No uncertainties or prediction intervals: {self._undefined}." if self._undefined else ""
 
     @property
     def variance_factor(self) -> float:

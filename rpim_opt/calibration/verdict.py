@@ -272,9 +272,8 @@ def _worse(result: Outcome) -> Iterator[str]:
         checked = result.record.earlier or result.known_covariance is None  # an update is judged against what was known
         if not checked and result.spread.spare < INTERPOLATED:
             yield (
-                f"The fit interpolates the data: of {result.program.model.equations} equations none is left to tell "
-                "errors of the robot from those of the measurements, and no validation data check it. Measure more "
-                "configurations."
+                f"The fit interpolates the data: {result.program.model.equations} equations leave no residual degrees "
+                "of freedom, and no validation data check it. Measure more configurations."
             )
         return
     if worse_than_nominal(nominal, identified):
@@ -293,9 +292,8 @@ def elsewhere(result: Outcome, error: Array) -> str:
         return ""
     return (
         f"Median error on {len(error)} held-out rows {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's "
-        f"own errors stay below {100 * REACH:g} % of the arm's length. The instrument or the base may have moved "
-        "(`validate` and `accept` register such rows with --register, as a table beside the folder), the reflector or "
-        "tool may be another one, or these are another robot's measurements."
+        f"own errors stay below {100 * REACH:g} % of the arm's length. Either the instrument or the base moved (then "
+        "use these rows with --register in `validate` or `accept`), or another reflector, tool or robot was measured."
     )
 
 
@@ -435,7 +433,7 @@ def _held_base(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if then > ELSEWHERE * now:
         return []
     return [
-        "the base is not identified, and not where it is stated: with `base_*` in `identify` residuals are "
+        "the stated base is wrong, and not identified: with `base_*` in `identify` residuals are "
         f"{three_digits(1e3 * then)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
     ]
 
@@ -451,10 +449,10 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     if plain > NOISY or now < NOTICED * plain:
         return []
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
-    remedy = f"loosen its constraints ({joined(names)}) or use" if names else "use"
+    remedy = f"Loosen its constraints ({joined(names)}) or use" if names else "Use"
     return [
         f"the formulation, not the robot, limits the fit: residuals are {three_digits(now)} times the measurement "
-        f"noise, but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint; {remedy} a "
+        f"noise, but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint. {remedy} a "
         "smaller weight."
     ]
 

@@ -89,7 +89,7 @@ def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
 
 def sentences(result: Outcome, verdict: Verdict) -> list[str]:
     """Return the sentences below the table: errors, reasons of the verdict, weight, noise and remarks."""
-    errors = "No errors: the rows have neither lengths nor angles nor pixels."
+    errors = "Errors are undefined: the rows have neither lengths nor angles nor pixels."
     for dimension, (unit, si) in UNITS.items():
         before, after = result.nominal_errors(dimension=dimension), result.errors(dimension=dimension)
         if np.isfinite(after).any():
@@ -125,7 +125,7 @@ def weight_lines(result: Outcome) -> list[str]:
         return [f"Formulation '{name}' has no penalty and needs no weight."]
     if result.selection is None:
         return [f"Weight {result.weight:.4g} ({result.selector}), formulation '{name}'."]
-    note = result.selection.note or ("" if result.selection.interior else "at an edge of the weights that it tried")
+    note = result.selection.note or ("" if result.selection.interior else "at an edge of the tried weights")
     rule = ": ".join(filter(None, [result.selector, note]))
     return [f"Weight {result.weight:.4g} ({rule}), formulation '{name}'."]
 
@@ -171,9 +171,9 @@ def _outlying(result: Outcome, advised: bool) -> list[str]:
     lines = [f"Outliers: {listed(named, MOST_ROWS)}."]
     if together:
         lines.append(
-            f"Of them {listed(together)} have errors like their neighbours in joint space or time, so they are not"
-            " outliers: the model lacks an effect there (model 'auto' tests compliance and gear eccentricity), or"
-            " the set-up moved. --drop-outliers keeps them."
+            f"{listed(together)} have errors like their neighbours in joint space or time: the model lacks an effect"
+            " there (model 'auto' tests compliance and gear eccentricity), or the set-up moved. --drop-outliers keeps"
+            " them."
         )
     if advised and len(together) < len(flagged) and result.squared_loss:
         lines.append("Outliers bias a squared loss: use formulation 'robust', or exclude them.")
@@ -299,7 +299,7 @@ def camera_remarks(result: Outcome) -> list[str]:
     ]
     lens = improvement(result)
     if lens is None:
-        remarks.append("The expected position error of the flange is not determined by this result.")
+        remarks.append("This result does not determine the expected position error of the flange.")
     else:
         remarks.append(
             "Expected position error of the flange over its joint ranges, base and tool fitted: "

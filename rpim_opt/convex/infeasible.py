@@ -107,8 +107,8 @@ def advice(structure: Structure, status: str, found: Conflict | None) -> str:
         return ""
     if status.startswith("unbounded"):
         return (
-            "the objective appears to be unbounded below: bound what falls without end, such as a linear loss or an "
-            "own variable without a price, or use a larger weight"
+            "the objective appears to be unbounded below: bound a linear loss or a variable of your own that no term "
+            "penalizes, or use a larger weight"
         )
     if structure.constrained and status.startswith(("infeasible", "optimal")):
         return (

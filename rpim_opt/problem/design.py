@@ -292,7 +292,7 @@ class Observability(Brief):
     def __str__(self) -> str:
         """Return what configurations can show, in lines."""
         indices = ", ".join(f"{name} {value:.3g}" for name, value in self.indices.items())
-        weak = f"; for {self.weak} of them the prior says more than the data" if self.weak else ""
+        weak = f"; {self.weak} of them the prior determines more precisely than the data" if self.weak else ""
         raw = f", {self.raw_condition:.3g} in mm and rad" if np.isfinite(self.raw_condition) else ""
         lines = [
             f"{self.rank} of {len(self.names)} parameter combinations are identifiable{weak}.",

@@ -1103,11 +1103,11 @@ def two_positions(problem: CalibrationProblem, x: Array, most: float) -> Iterato
             best = left
             units = ["mrad" if free.dimensions[k] == "angle" else "mm" for k in numbers]
             steps = [f"joint {some[k][0]} by {apart[k]:.2g} {unit}" for k, unit in enumerate(units)]
-            said = f"either of two positions in every row, {joined(steps)} apart"
+            said = f"backlash, {joined(steps)}"
     if said:
         yield (
-            f"{said}, explains the residuals (that leaves {100 * best:.0f} %): backlash; approach all rows from one "
-            "side, or state the sides (approach1, ...)."
+            f"{said}: one of two positions in every row explains the residuals (that leaves {100 * best:.0f} %). "
+            "Approach all configurations from one side, or state the directions of approach (columns approach1, ...)."
         )
 
 

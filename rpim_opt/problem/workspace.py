@@ -295,4 +295,6 @@ def visible_configurations(
         if len(visible) >= count:
             return visible[:count]
     found_text = f"{len(visible)} of {count} views in which the board is visible"
-    raise InputError("visible_configurations", found_text, "frames, share and image in which it is visible more often")
+    raise InputError(
+        "visible_configurations", found_text, "frames, a share and an image for which it is visible more often"
+    )

@@ -20,7 +20,7 @@ from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import compared, headline_errors
+from rpim_opt.calibration.held_out import compared, coverage_text, headline_errors
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
@@ -137,7 +137,7 @@ def _headline(content: Content) -> Iterator[Block]:
     elif result.verdict.delivered:
         text = "the fit gives no reason against using this robot; no acceptance limit is stated."
         if result.caution:
-            text = "for joint values as the table counts them, and for no others: check the pendant, see below."
+            text = "only for joint values as the table counts them: check the pendant (see below)."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
     yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
     yield "notes", [*filter(None, [result.caution]), *reasons, *result.verdict.beside(result.causes)]
@@ -181,8 +181,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
         if held is None and record.validation is not None:
             held = compared(result, record.validation)
         if held is not None and held.coverage is not None:
-            share = percent(round(held.coverage, 2))
-            notes.append(f"{share} of the held-out coordinates lie in their 95 % prediction intervals.")
+            notes.append(f"Held-out rows: {coverage_text(held.coverage, len(held.label))}.")
     yield "text", notes
     head = ["data, model", *summary.COLUMNS]
     rows = [row for row in summary.error_rows(result) if row["count"]]
@@ -237,8 +236,8 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     notes = [
         "U is the radius about the predicted position that contains the position reached, from the uncertainty of the "
         "parameters and the robot's repeatability, without the instrument's noise (GUM). Each square shows the maximum "
-        "of the configurations that reach it, at any depth. Axes of the robot's base. Not included is what no reading "
-        "varied: the instrument's scale, temperature and loads other than those measured."
+        "of the configurations that reach it, at any depth. Axes of the robot's base. Not included are effects that no "
+        "reading varied: the instrument's scale, temperature and other loads than the measured ones."
     ]
     required = result.record.requirement is not None
     limit = 1e3 * map_.requirement.limit if required else None

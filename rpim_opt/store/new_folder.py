@@ -40,8 +40,8 @@ from rpim_opt.store.raw import CLEARLY, Understanding, in_time_order, rows_of, u
 TABLES = ("identification.csv", "validation.csv", "target.csv")  # of a new folder
 ROBOT_OF_CHAINS = "robot.urdf"
 SHARED = (
-    "Chains share the joints that they have in common. Other common parameters: `shared` in problem.toml, "
-    '["base_*"] where one instrument measured several chains from one link, by chain { left = ["base_*"], ... }.'
+    'Chains share their common joints. State other shared parameters as `shared` in problem.toml: ["base_*"] where '
+    'one instrument measured several chains from one link; by chain as { left = ["base_*"], ... }.'
 )
 GRID = re.compile(r"(\d{1,6})\s*x\s*(\d{1,6})\s*,\s*(\d+\.?\d*|\.\d+)\s*(mm|m)", re.ASCII)
 TEMPLATE = Path(__file__).with_name("problem.toml.jinja")
@@ -392,7 +392,7 @@ def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measu
     located, _, verdict = locate(arm.robot, rows, tools)
     if same_place(located, arm.base):
         offset = 1e3 * np.linalg.norm(located[:3] - arm.base[:3])
-        how = f"Guessed: the base was registered {offset:.1f} mm from the robot's own: data are in its frame."
+        how = f"Guessed: the data are in the robot's base frame, {offset:.1f} mm from the registered one."
         return arm.base, how
     if np.linalg.norm(located[:3]) > FARTHEST:
         verdict = "implausibly far away: are the units right?"

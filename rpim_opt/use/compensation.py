@@ -108,7 +108,9 @@ class Compensation:
             rows = []
             for i in [i for i, each in enumerate(self.status) if each == status]:
                 expanded = f", U {1e3 * EXPANDED * self.std[i]:.3f} mm" if status == ABOVE else ""
-                rows.append(f"{self.label[i]} ({1e3 * self.position_error[i]:.3f} mm off{expanded}{self._at_limit(i)})")
+                rows.append(
+                    f"{self.label[i]} (error {1e3 * self.position_error[i]:.3f} mm{expanded}{self._at_limit(i)})"
+                )
             if rows:
                 lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
         uncertain = np.count_nonzero((np.array(self.status) == ABOVE) & (self.position_error <= self.limit))
@@ -292,8 +294,8 @@ def compensate(
     point = cell.point
     if targets.q is None:
         point += (
-            " Targets without joint values are looked for in the measured joint ranges first, and may be reached in "
-            "another arm configuration: state q1, ... beside them."
+            " Targets without joint values are sought in the measured joint ranges first, and may be reached in "
+            "another arm configuration: state q1, ... with them."
         )
     found = Compensation(
         result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=point, limit=limit
@@ -316,8 +318,8 @@ def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
     advice = "Measure a reflector as far from the flange as this point."
     if last:
         advice = (
-            f"No reflector, of however many, tells {joined(sorted(last))} from the tool: state what is known of the "
-            "flange (`known` in [prior], or these parameters not identified)."
+            f"No number of reflectors separates {joined(sorted(last))} from the tool: state what is known of the "
+            "flange (`known` in [prior]), or do not identify these parameters."
         )
     of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
     return f" In row {found.label[row[0]]} the U of the tool is {of_tool}, the reflector's {known}. {advice}"

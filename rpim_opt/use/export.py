@@ -183,7 +183,7 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         return note, remarks, undecided
     limit = found.requirement.limit if accepted else np.inf
     less, above = _of_geometry(alone, joined(whole.learned.extensions), found, limit)
-    other = "Another point of the flange and its orientation may be known less: `compensate --tool` states their"
+    other = "Other points and the orientation of the flange may be less certain: `compensate --tool` states their"
     return " ".join(filter(None, [note, less])), [*remarks, f"{other} uncertainty."], undecided or above
 
 
@@ -193,12 +193,12 @@ def _of_geometry(alone: Calibration, extensions: str, found: Workspace, limit: f
     bound, required = float((found.expanded + stays).max()), found.requirement
     text = (
         f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at most "
-        f"{1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It contains the error that geometry "
-        f"without {extensions} makes, at most {1e3 * stays.max():.3f} mm there."
+        f"{1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes the error of geometry without "
+        f"{extensions}, at most {1e3 * stays.max():.3f} mm there."
     )
     above = bound > limit
     if above:
-        text += f" It is above the limit of {1e3 * limit:g} mm, within which only the whole model is."
+        text += f" It is above the limit of {1e3 * limit:g} mm; only that of the whole model is within it."
     return text, above
 
 
@@ -322,8 +322,8 @@ def export_urdf(
     elif of_base:
         at = placed(frame_numbers(numeric_frame(arm.base) @ np.linalg.inv(numeric_frame(own.base))))
         notes.append(
-            f"URDF: {root} is at {at} in the instrument's frame: replace an earlier pose of it by this one, which "
-            "belongs to the corrected origins."
+            f"URDF: {root} is at {at} in the instrument's frame. Use this pose with the corrected origins, not an "
+            "earlier one."
         )
     if tool is not None:
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])

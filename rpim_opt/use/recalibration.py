@@ -148,7 +148,7 @@ class Update:
         elif self.before.likely:
             lines = [f"No change of the robot is detectable from {count}: {self.before}."]
         else:
-            lines = [f"{count} lie outside the prediction intervals of the last calibration: {self.before}."]
+            lines = [f"{count} lie outside the prediction intervals of the previous calibration: {self.before}."]
         lines = [*filter(None, [self.registered]), *lines]
         for cause in self.changes:
             end = ", excluded" if cause.kind == "reading" else ""
@@ -213,7 +213,7 @@ def update(
     free = problem.parameters.free
     matches = matching(free, reset, "update, reset") if reset else np.zeros(len(free), dtype=bool)
     released = tuple(np.array(free.names)[matches].tolist())
-    say("comparing with the last calibration")
+    say("comparing with the previous calibration")
     elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
     if elsewhere:
         released = tuple(name for name in free.names if name.startswith(BASE))
@@ -248,7 +248,7 @@ def update(
         missed = float(np.sqrt(np.nanmean(updated.errors(data) ** 2)))
         if missed > STRANGE * furthest:
             same = f"those of the same robot ({robots}) in the same units and instrument's frame"
-            found = f"readings {1e3 * missed:.3g} mm off, whichever parameters change"
+            found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
             raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     record = result.record
@@ -256,7 +256,7 @@ def update(
         record.title or robots, record.made, record.digest or content(result)["digest"], len(result.problem.labels),
         {robot: ranges.tolist() for robot, ranges in result.ranges.items()}, prior_inflation, released, left_out,
     )  # fmt: skip
-    excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the last calibration")
+    excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the previous calibration")
     first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
     record = Record(
         f"{record.title.removesuffix(UPDATED)}{UPDATED}", f"{source}{BEFORE}{first_source}" if first_source else source,
@@ -286,7 +286,7 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     if same_place(was, now):
         return ""
     return (
-        f"The instrument or the base moved: the base is at {placed(now)} in the instrument's frame, and was at "
+        f"The instrument or the base moved: in the instrument's frame the base is at {placed(now)}, previously at "
         f"{placed(was)}. It was registered again, as with --reset 'base_*'."
     )
 

@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import compared, displaced, registered, required_coverage
+from rpim_opt.calibration.held_out import compared, coverage_text, displaced, registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import elsewhere, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
@@ -104,12 +104,7 @@ class Validation(HeldOut):
         largest = ""
         if np.isfinite(self.error).any():
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
-        covered = ""
-        if self.coverage is not None:
-            covered = f" {100 * self.coverage:.0f} % of the coordinates are within their 95 % prediction intervals"
-            least = required_coverage(len(self.label))
-            missing = f": of this number of rows at least {100 * least:.0f} % are expected"
-            covered += f"{missing if self.coverage < least else ''}."
+        covered = "" if self.coverage is None else f" {coverage_text(self.coverage, len(self.label))}."
         named = [
             f"{self.label[i]} ({self.sigmas[i]:.1f} standard deviations, {1e3 * self.error[i]:.3f} mm)"
             for i in self.beyond
@@ -148,7 +143,7 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
     remarks: list[str] = []
     if register:
         data, motion = registered(result, data)
-        remarks.append(f"Registered again, which takes 6 degrees of freedom: the measurements were {motion}.")
+        remarks.append(f"Registered again: the measurements were {motion}.")
     problem = result.problem.sample()
     held = compared(result, data)
     touched = touch_errors(data, held.nominal, held.error)

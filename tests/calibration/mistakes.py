@@ -319,7 +319,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     ),
     "joint 3 with backlash": (
         of_joint(2, lambda q: q + 3.5e-3 * np.random.default_rng(4).choice([-1, 1], COUNT)),
-        "either of two positions in every row, joint 3 by 7 mrad",
+        "backlash, joint 3 by 7 mrad",
     ),
     "joints rounded to 0.1 degrees": (rounded(0.1), "rounded to 0.1 deg ("),
     "joints rounded to a degree": (rounded(1.0), "rounded to 1 deg ("),
@@ -400,7 +400,7 @@ IN_TABLES |= {
         "(q1, q2, q3)",
     ),
     "an arm that warms up": (grown, "the arm grows from row to row, by 0.1 %"),
-    "play in two joints": (of_joint_rows(of_two_sides), "either of two positions in every row, joint 1 by 2 mrad"),
+    "play in two joints": (of_joint_rows(of_two_sides), "backlash, joint 1 by 2 mrad"),
     "a reading missed, a later one taken twice": (
         values(lambda y: np.concatenate([y[:12], y[13:24], y[23:]])),
         "fit the joint values of the next row",

@@ -394,7 +394,7 @@ def test_exit_codes_say_the_verdict(monkeypatch, capsys, folder, tmp_path) -> No
 def test_more_lengths_do_not_tell_where_the_base_stands() -> None:
     result = ro.load("cable").calibrate()
     (reason,) = [text for text in ro.calibration.accept(result, ro.data.Requirement(1e-4)).reasons if "bound" in text]
-    assert reason.startswith("Missing: where the base stands, which cable readings do not determine")
+    assert reason.startswith("Missing: the base frame, which cable readings do not determine")
     assert "design PROBLEM --augment" not in reason
     said = str(ro.use.compensate(result, result.problem.data.blocks[0].q[:6, 0]))
     assert "In 6 of 6 rows the expanded uncertainty (k = 2) is larger than the error that is corrected" in said
@@ -409,7 +409,7 @@ def test_joints_that_stood_are_named() -> None:
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0][:, :3]
     noise = 5e-5 * np.random.default_rng(0).normal(size=y.shape)
     still = ro.calibrate(problem.on(ro.Dataset.of(q[:, 0], y + noise, 5e-5)), "tikhonov", 1.0)
-    said = "The region holds where joint 1 stood"
+    said = "The verdict holds only at the measured values of joint 1"
     assert said in str(ro.calibration.accept(still, ro.data.Requirement(1e-3)))
     assert said not in str(
         ro.calibration.accept(ro.calibrate(instance.problem, "tikhonov", 1.0), ro.data.Requirement(1e-3))

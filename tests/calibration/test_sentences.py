@@ -48,7 +48,7 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
     assert whole.sentences()[2:] == [
         "Expanded uncertainty of the position reached (U, 95 %): at most 0.090 mm (largest of 500 configurations, "
         "refined by a search), median 0.050 mm.",
-        "It is the uncertainty of the reflector; `compensate --tool` states that of another point.",
+        "U is that of the reflector; `compensate --tool` states that of another point.",
         "Held out: 4 rows.",
     ]
     assert whole.content()["checked"] == {"rows": 4}

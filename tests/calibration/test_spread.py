@@ -61,7 +61,7 @@ def stand_in(equations: float, dof: float, variance: float) -> Uncertainty:
     ("variance", "said"),
     [
         (1.0, "agree with the measurement"),
-        (0.3, "smaller than the problem says"),
+        (0.3, "smaller than stated"),
         (3.0, "times the measurement noise: the noise is larger"),
     ],
 )

@@ -50,7 +50,7 @@ def test_the_noise_is_compared_with_the_declared() -> None:
     for factor, word in (
         (1.0, "agree with the measurement"),
         (5.0, "rows are wrong"),
-        (0.2, "smaller than the problem says"),
+        (0.2, "smaller than stated"),
     ):
         problem, _ = simulated(noise=factor * 5e-5, seed=1)
         test = ro.calibrate(problem, ro.tikhonov, ro.reml).noise_test()

@@ -221,7 +221,7 @@ def test_a_formulation_that_forbids_what_is_true_limits_the_fit() -> None:
     problem = ro.load("position").problem
     fixed = ro.Formulation("fixed", penalty=cp.sum_squares, constraints=(ro.constraints.at_nominal("a?", "d?"),))
     heavy = ro.Formulation("heavy", lambda v: cp.sum(cp.huber(v, 1.5)), cp.norm1)
-    for formulation, weight, remedy in ((fixed, None, "at_nominal('a?', 'd?')"), (heavy, 1e3, "use a smaller weight")):
+    for formulation, weight, remedy in ((fixed, None, "at_nominal('a?', 'd?')"), (heavy, 1e3, "Use a smaller weight")):
         (reason,) = ro.calibrate(problem, formulation, weight).verdict.reasons
         assert "the formulation, not the robot, limits the fit" in reason
         assert remedy in reason

@@ -101,7 +101,7 @@ def test_the_report_says_the_figures_of_the_result(arm, arm_page) -> None:
     assert "Unidentifiable (no measurement depends on them): theta6." in text
     assert "T8-6" in text  # left out, with its reason
     assert "0.03 mm (x, y, z)" in text
-    assert re.search(r" \d+ % of the held-out coordinates lie in", text)
+    assert re.search(r"Held-out rows: \d+ % of the coordinates are within", text)
     for digest in arm.record.files.values():
         assert digest in text
     for row in arm.parameter_rows():
@@ -163,7 +163,7 @@ def test_other_formulations_have_a_report(formulation) -> None:
     problem, _ = simulated(("a?", "theta?", "base_*"), noise=5e-5)
     weight = 0.0 if formulation is ro.least_squares else 1.0
     text = page(ro.calibrate(problem, formulation, weight))
-    assert ("No uncertainties and prediction intervals" in text) == (formulation is not ro.least_squares)
+    assert ("No uncertainties or prediction intervals" in text) == (formulation is not ro.least_squares)
     assert ("L-curve: residual norm" in text) == (formulation is not ro.least_squares)
 
 

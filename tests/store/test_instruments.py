@@ -156,7 +156,7 @@ def test_turns_in_another_convention_are_asked_for_and_what_they_are_is_printed(
         (text([["Point", *(f"J{i}" for i in range(1, 7)), "X", "Y", "Z"], [*["deg"] * 5, *["mm"] * 4, "-"]], ROWS, ";"),
          {}, "(label of the row) in deg, accepted: one of no unit"),
         (text([["Axis", *HEAD[1:7], "Value [mm]"]], [["XYZ"[i % 3], *ROWS[0][1:7], "1"] for i in range(9)]), {},
-         "a column naming the point"),
+         "a column that names the point"),
         (text([["// export", "units: mm"]], ROWS), {}, "no header above 'P1, "),
         (text([HEAD], [["P1", *["1 mm"] * 9]] * 3), {"columns": "a,b", "separator": "semicolon"}, "none of numbers"),
         (text([["a", "b"]], [["P1", "1.5"]] * 3), {"columns": "a,b"}, "no known column (a, b)"),

@@ -232,7 +232,7 @@ def test_joint_limits_hold_and_the_rest_is_the_best_within_them() -> None:
         mine = np.sum(pose_error(result, found.q[i], target[i]) ** 2) / 2
         assert mine <= best.cost * (1 + 1e-6) + 1e-20
     for said in (str(found), str(ro.use.compensate(result, q, largest=0.5, limit=5e-4))):
-        assert re.search(r"mm off.*, joint 2 at its limit of 114.592 deg", said)
+        assert re.search(r"error .* mm.*, joint 2 at its limit of 114.592 deg", said)
     outside = q.copy()
     outside[:, 0] = 2.3
     assert (np.abs(ro.use.compensate(result, outside).q) <= 2.0).all()
@@ -288,7 +288,7 @@ def test_what_cannot_be_reached_is_named_with_what_is_left() -> None:
         # the outstretched arm: a flat valley
         assert found.position_error[i] == pytest.approx(np.sqrt(2 * nearest), abs=1e-3)
         assert np.linalg.norm(error(found.q[i])) == pytest.approx(found.position_error[i], abs=1e-10)
-    assert f"Unreachable in the robot's base frame: 1 ({1e3 * found.position_error[0]:.3f} mm off)" in str(found)
+    assert f"Unreachable in the robot's base frame: 1 (error {1e3 * found.position_error[0]:.3f} mm)" in str(found)
 
 
 def base_position(result: ro.calibration.Calibration, q: np.ndarray) -> np.ndarray:
@@ -529,7 +529,7 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     assert found.missed == [label for label, far in zip(found.label, above, strict=True) if far]
     assert 0 < len(found.missed) < 10
     said = str(found)
-    assert f"{found.missed[0]} (0.000 mm off, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in said
+    assert f"{found.missed[0]} (error 0.000 mm, U {2e3 * found.std[found.label.index(found.missed[0])]:.3f} mm" in said
     assert f"{above.sum()} of 10 commands reach their target by the model" in said
     assert "miss their target" not in said
     row = int(np.argmax(known_to.std))
@@ -539,7 +539,7 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
             rf"In row {row + 1} the U of the tool is {2e3 * known_to.std[row]:.3f} mm, the reflector's (.*) mm", text
         )
         assert float(known) == pytest.approx(reflector, abs=2e-3)
-        assert "No reflector, of however many, tells d6 and theta6 from the tool: state what is known" in text
+        assert "No number of reflectors separates d6 and theta6 from the tool: state what is known" in text
     p = result.problem.parameters
     flange = result.problem.identifying(p.identified & ~np.isin(p.names, ["d6", "theta6"]))
     stated = ro.calibrate(flange, ro.tikhonov, 1.0)

@@ -278,7 +278,7 @@ def test_bad_input_is_one_sentence(monkeypatch, capsys, tmp_path, crashed: Robot
     tables = {
         "columns": (table(crashed.after, drop=("q6_rad",)), "q6"),
         "values": (table(crashed.after, drop=("z_m",)), "z"),
-        "robot": (table(with_points(block.y[[3, 0, 6, 7, 1, 5, 2, 4]])), "mm off, whichever parameters change"),
+        "robot": (table(with_points(block.y[[3, 0, 6, 7, 1, 5, 2, 4]])), "mm, whichever parameters change"),
         "order": (
             table(with_points(block.y[::-1])),
             "the rows of joint values in the reverse order, accepted: reverse",

@@ -223,7 +223,7 @@ class Newton:
             if self.point.iterations:  # Clarabel's accuracy
                 tolerance = max(tolerance, INTERIOR)
             if promised < -INEXACT * size and promised < -INEXACT * abs(self._total(r)):
-                raise np.linalg.LinAlgError("the small program's minimum is none")
+                raise np.linalg.LinAlgError("the subproblem was not solved to a minimum")
             if promised <= tolerance * size:
                 break
             Ad = self.rows.A @ d

@@ -145,7 +145,7 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
         raise InputError(f"the key {chosen.how}", found, f"--key with a column of common values, {OTHER_KEYS}")
     right.sort(key=lambda i: place[chosen.right[i]])
     names = [chosen.right[i] for i in right]
-    counts = f"{len(right)} rows of {len(chosen.left)} with joints and {len(chosen.right)} measured"
+    counts = f"{len(right)} rows match, of {len(chosen.left)} with joints and {len(chosen.right)} measured"
     notes = [f"joined by {chosen.how}: {counts}."]
     lonely = [name for name in chosen.left if name not in set(names)]
     lonely += [name for name in chosen.right if name not in place]
@@ -299,15 +299,15 @@ def _by_time(joints: Understood, values: Understood, key: str, within: float) ->
         raise InputError("times", found, "synchronized clocks, or a larger --time-tolerance")
     labels = values.labels
     notes = [
-        f"joined by the nearest time: {len(right)} rows of {len(there)} with joints and {len(then)} measured; "
+        f"joined by the nearest time: {len(right)} rows match, of {len(there)} with joints and {len(then)} measured; "
         f"times differ by {np.abs(apart).max():.3g} s at most, {apart.mean():+.3g} s on average."
     ]
     moved = _motion(joints, there, left, then[right]) if len(there) > LOG * len(right) else np.zeros(1)
     if moved.max() > MOVED:
         count = np.count_nonzero(moved > MOVED)
         notes.append(
-            f"the robot moved at {count} of {len(right)} joined rows: between measurement and joint values by up to "
-            f"{moved.max():.2g} degrees."
+            f"the robot moved by up to {moved.max():.2g} degrees between measurement and joint values in {count} of "
+            f"{len(right)} joined rows."
         )
     lonely = [labels[i] for i in sorted(set(range(len(labels))) - set(right.tolist()))]
     if lonely:

@@ -106,7 +106,7 @@ class JointMapping:
             equally = f" (these explain the data equally well, with a reflector {far} from its stated place)"
         return (
             f"Table and robot file count joint values differently: {self.explanations}{equally}. The result holds for "
-            f"joint values as the table counts them. Look at the pendant: if the controller counts so, {WRITE}; if it "
+            f"joint values as the table counts them. Check the pendant: if the controller counts so, {WRITE}; if it "
             "counts as the robot file does, correct the table's columns and calibrate again before using this robot."
         )
 
@@ -139,8 +139,8 @@ class JointMapping:
             if other.mirror:
                 first = described(self.joint_types, self.sign, self.zero)
                 sentences.append(
-                    f"{what}, fits as well as {first}: lengths do not tell an arm from its mirror image; a few "
-                    f"positions would decide, or {WRITE}, as the set-up confirms."
+                    f"{what}, fits as well as {first}: lengths do not distinguish an arm from its mirror image. "
+                    f"Measure a few positions to decide, or {WRITE}, as the set-up confirms."
                 )
                 continue
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))
