@@ -142,7 +142,9 @@ def test_the_mean_of_the_errors_does_not_decide(result) -> None:
     found = accept(result, Requirement(1.2 * largest))
     assert found.bound > 1.2 * largest
     assert found.verdict == "inconclusive"
-    assert f"Held out: 40 rows, 40 of them in the region, maximum error there {1e3 * largest:.3f} mm (the" in str(found)
+    assert f"Held out: 40 rows, 40 of them in the region, maximum error there {1e3 * largest:.3f} mm (up to" in str(
+        found
+    )
     assert "their 95 % prediction intervals (at least 85 % are required for this number of rows)." in str(found)
 
 

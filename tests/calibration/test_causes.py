@@ -502,7 +502,7 @@ def test_a_base_that_is_held_elsewhere_is_named() -> None:
     held = problem.with_parameters(replace(p, nominal=np.where(base, p.nominal + 0.5, p.nominal)))
     found = ro.calibrate(held.identifying(p.identified & ~base))
     assert not found.verdict.delivered
-    assert any("the base is not identified" in reason for reason in found.verdict.reasons)
+    assert any("the stated base is wrong, and not identified" in reason for reason in found.verdict.reasons)
 
 
 def test_misread_orientations_are_named() -> None:

@@ -70,7 +70,7 @@ def test_what_active_bounds_do_is_said() -> None:
     assert "a5" in u.result.actively_constrained
     assert held(u) == set(u.result.actively_constrained)
     assert "At an active bound" in u._repr_html_()
-    with pytest.raises(ro.InputError, match="the penalty of formulation 'lasso' is no square"):
+    with pytest.raises(ro.InputError, match="the penalty of formulation 'lasso' is not quadratic"):
         ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.lasso, 1.0))
     with pytest.raises(ro.InputError, match="confidence: found 95"):
         ro.calibration.Uncertainty(ro.calibrate(instance.problem, ro.tikhonov, 1.0), confidence=95)

@@ -87,7 +87,10 @@ def test_a_fit_that_interpolates_needs_rows_that_check_it() -> None:
     three = problem.identifying(np.isin(problem.parameters.names, ("a2", "d4", "tool_z")))
     one = three.on(problem.data.take(np.array([0])))
     result = ro.calibrate(one, ro.least_squares)
-    assert any("interpolates the data: of 3 equations" in reason for reason in result.verdict.reasons)
+    assert any(
+        "interpolates the data: 3 equations leave no residual degrees of freedom" in reason
+        for reason in result.verdict.reasons
+    )
     checked = replace(result, record=replace(result.record, validation=problem.data.take(np.arange(1, 21))))
     assert not any("interpolates" in reason for reason in checked.verdict.reasons)
 
@@ -237,13 +240,13 @@ def test_a_formulation_that_forbids_what_is_true_limits_the_fit() -> None:
 def test_without_a_covariance_it_says_why_wherever_intervals_would_be() -> None:
     instance = ro.load("position")
     result = ro.calibrate(instance.problem, "lasso")
-    why = "the penalty of formulation 'lasso' is no square"
+    why = "the penalty of formulation 'lasso' is not quadratic"
     requirement = ro.data.Requirement(1e-4)
     texts = [ro.use.validate(result, instance.validation), ro.use.compensate(result, instance.validation.q[:2]).note]
     texts += [result, "".join(ro.calibration.accept(result, requirement).sentences())]
     assert all(why in str(text) for text in texts)
     for refused in (ro.calibration.Uncertainty, ro.influence, lambda r: r.predict(instance.validation.q)):
-        with pytest.raises(ro.InputError, match="is no square"):
+        with pytest.raises(ro.InputError, match="is not quadratic"):
             refused(result)
     loss = ro.use.validate(ro.calibrate(instance.problem, "minimax"), instance.validation)
     assert "the loss of formulation 'minimax' rests on a few equations" in str(loss)

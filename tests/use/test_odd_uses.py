@@ -121,7 +121,7 @@ def test_two_checks_show_no_course() -> None:
 
 
 def test_what_a_formulation_cannot_do_is_said() -> None:
-    with pytest.raises(ro.InputError, match="the penalty of formulation 'lasso' is no square"):
+    with pytest.raises(ro.InputError, match="the penalty of formulation 'lasso' is not quadratic"):
         ro.use.monitor(calibrated("lasso"), checks())
 
 
@@ -221,7 +221,9 @@ def test_rows_of_an_instrument_that_moved_are_named() -> None:
     moved = replace(instance.validation, blocks=(replace(block, y=block.y + np.array([6e-5, -6e-5, 6e-5])),))
     found, accepted = ro.use.validate(result, moved), ro.calibration.accept(result, requirement, moved)
     assert not found.mistake
-    assert "% are expected. The measurements are displaced as a whole by 0.1 mm" in " ".join(str(found).split())
+    assert "are required for this number of rows). The measurements are displaced as a whole by 0.1 mm" in " ".join(
+        str(found).split()
+    )
     assert accepted.verdict == "inconclusive"
     assert accepted.reasons[-1].endswith("If the instrument was moved since the calibration, use --register.")
     assert not ro.use.validate(result, moved, register=True).remarks[1:]

@@ -72,7 +72,7 @@ def with_errors(path: Path, target: Path, seed: int) -> None:
     tree.write(target)
 
 
-def drawn(arm: ro.robot.Described, count: int, rng: np.random.Generator) -> np.ndarray:
+def drawn(arm: ro.robot.RobotSetup, count: int, rng: np.random.Generator) -> np.ndarray:
     """Return joint values, angles of up to 2 rad and travels of up to 0.3 m."""
     reach = np.where(np.array(arm.robot.joint_dimensions) == "angle", 2.0, 0.3)
     return rng.uniform(-reach, reach, (count, arm.robot.dof))

@@ -150,7 +150,7 @@ def test_a_base_far_away_is_registered_again_and_no_joint_is_blamed() -> None:
     assert not found.changes
     assert {each.name[:5] for each in found.moved} == {"base_"}
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
-    assert str(found).startswith("The instrument or the base moved: the base is at x 1")
+    assert str(found).startswith("The instrument or the base moved: in the instrument's frame the base is at x 1")
     assert "Changed since then" not in str(found)
     assert np.allclose(found.result.x, ro.use.update(result, robot.after, reset=("base_*",)).result.x)
 
