@@ -42,14 +42,14 @@ PLAIN: Any = {"rich_markup_mode": None, "pretty_exceptions_enable": False}
 
 
 class Commands(TyperGroup):
-    """Our commands, then those of other packages, which are loaded where they are asked for."""
+    """The commands of this package, then those of other packages, which are loaded at first use."""
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """Return the names of the commands; of two with one name ours is meant."""
+        """Return the names of the commands; of two with one name that of this package."""
         return list(dict.fromkeys([*super().list_commands(ctx), *sorted(entry_points(group=OTHERS).names)]))
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        """Return the command of a name; one that cannot be loaded says so, and hides no other."""
+        """Return the command of a name; one that cannot be loaded reports that when it is called."""
         others = () if cmd_name in self.commands else entry_points(group=OTHERS, name=cmd_name)
         for each in others:
             alone = typer.Typer(add_completion=False, **PLAIN)
@@ -160,7 +160,7 @@ Code = Annotated[bool, Option("--allow-code", help="Allow running the folder's P
 
 
 class Answer(NamedTuple):
-    """What a command ends with: text and document, exit code, files written, and how its tables were read."""
+    """The result of a command: text and document, exit code, files written, and how its tables were read."""
 
     text: object
     document: dict[str, Any]
@@ -789,7 +789,7 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
 
 
 def main() -> None:
-    """Run the command line; what a user can mend is one sentence, never a traceback."""
+    """Run the command line; an error that a user can correct is one sentence, not a traceback."""
     atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
     with console.arriving():
         try:

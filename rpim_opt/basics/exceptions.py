@@ -51,7 +51,7 @@ class InputError(RpimError):
 
 @contextmanager
 def in_file(source: object) -> Iterator[None]:
-    """Let an InputError name the file that is read meanwhile; a source that is no path has no name."""
+    """Add the name of the file that is being read to an InputError, unless the source is no path."""
     try:
         yield
     except InputError as error:
@@ -88,9 +88,9 @@ class RowError(InputError):
 
 
 class Conflict(NamedTuple):
-    """A contradiction: by how much bounds of parameters and ``stated`` constraints would have to give way [SI].
+    """Contradictory constraints: how far to loosen bounds of parameters and ``stated`` constraints [SI].
 
-    ``constraints`` are those that cannot hold together, of which any one less would do.
+    ``constraints`` are those that cannot hold together, of which none can be left out.
     """
 
     parameters: dict[str, float]

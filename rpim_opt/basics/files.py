@@ -106,7 +106,7 @@ def read_json(path: Path) -> Any:
 
 
 def parse_json(text: str) -> Any:
-    """Return the content of a JSON text; ValueError if it is none, too deep, or has a key twice or half a character."""
+    """Return the content of a JSON text; ValueError for invalid or too deep JSON, duplicate keys, lone surrogates."""
     try:
         content = json.loads(text, object_pairs_hook=_unique)
         if _HALF_PAIR.search(text):

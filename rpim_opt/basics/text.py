@@ -35,7 +35,7 @@ def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 
 
 def visible(text: str) -> str:
-    r"""Return a text of somebody else that a terminal may print: non-printable characters are escaped (``\x1b``)."""
+    r"""Return untrusted text for a terminal: non-printable characters are escaped (``\x1b``)."""
     return "".join(
         c if c.isprintable() or c == "\n" or category(c) == "Zs" else c.encode("unicode_escape").decode("ascii")
         for c in text
@@ -153,7 +153,7 @@ Progress = Callable[[int, int], None]  # receives how many of how many are done
 
 @contextmanager
 def progress_bar(name: str, wanted: bool | Progress = True) -> Iterator[Progress]:
-    """Provide a function of the number done and the total: one's own, or a bar on a terminal or in a notebook."""
+    """Provide a function of the number done and the total: the user's, or a bar on a terminal or in a notebook."""
     if callable(wanted):
         yield wanted
         return

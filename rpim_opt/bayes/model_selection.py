@@ -43,9 +43,9 @@ KNOWN = Prior(joint_offset=1.0, frames=1.0)  # the prior once scales were estima
 
 
 class Candidate(NamedTuple):
-    """A candidate model: its price, its extensions, its marginal likelihood, and the optimum."""
+    """A candidate model: its penalized -2 ln L, its extensions, its marginal likelihood, and the optimum."""
 
-    price: float
+    criterion: float
     extensions: tuple[str, ...]
     evidence: Evidence
     point: Point
@@ -128,26 +128,26 @@ class Models:
         """Return which parameters (p,) the model with some extensions has."""
         return np.isin(self.names, [*self.own, *self.added(extensions)])
 
-    def compared(self, price: Callable[[tuple[str, ...]], Candidate]) -> list[Candidate]:
-        """Return the candidate models in the order of ``price``.
+    def compared(self, fitted: Callable[[tuple[str, ...]], Candidate]) -> list[Candidate]:
+        """Return the candidate models, each ``fitted`` to its extensions.
 
         Extensions of the arm are selected with all conditions in the model, which would stand for them else; then of
         the best one each condition is asked for.
         """
         conditions = tuple(condition for condition in CONDITIONS if condition in self.extensions)
         possible = [tuple(each for each in candidate if each in self.extensions) for candidate in CANDIDATES]
-        candidates = [price((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
-        best = min(candidates, key=lambda each: each.price)
+        candidates = [fitted((*candidate, *conditions)) for candidate in dict.fromkeys(possible)]
+        best = min(candidates, key=lambda each: each.criterion)
         further = FURTHER if len(np.unique(self.problem.data.configuration)) >= MANY else {}
         for extension, beside in further.items():
             if extension in self.extensions:
                 more = (*best.extensions, beside, extension)
                 arm = [each for each in ARM if each in more and each in self.extensions]
-                candidates.append(price((*arm, *conditions)))
-                best = min(best, candidates[-1], key=lambda each: each.price)
+                candidates.append(fitted((*arm, *conditions)))
+                best = min(best, candidates[-1], key=lambda each: each.criterion)
         kept = tuple(extension for extension in best.extensions if extension not in conditions)
         for count in range(len(conditions)):
-            candidates += [price((*kept, *some)) for some in combinations(conditions, count)]
+            candidates += [fitted((*kept, *some)) for some in combinations(conditions, count)]
         return candidates
 
 
@@ -158,7 +158,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
     before = _hyperparameters(fit.evidence, fit.point)
     known: dict[frozenset[str], dict[str, float]] = {}
 
-    def price(candidate: tuple[str, ...]) -> Candidate:
+    def fitted(candidate: tuple[str, ...]) -> Candidate:
         evidence = models.columns.restricted(models.members(candidate))
         conditions = frozenset(candidate).intersection(CONDITIONS)
         point = evidence.optima(_starts(evidence, known.get(conditions, before)), COMPARED)[0]
@@ -166,7 +166,7 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
             known[conditions] = _hyperparameters(evidence, point)
         return Candidate(point.value + GAIN * complexity(candidate), candidate, evidence, point)
 
-    candidates = sorted(models.compared(price), key=lambda each: each.price)
+    candidates = sorted(models.compared(fitted), key=lambda each: each.criterion)
     trials = tuple(Trial(each.extensions, each.point.value) for each in candidates)
     if not candidates[0].extensions:
         return fit, trials
@@ -244,12 +244,12 @@ class Comparison(Models):
 
     @cached_property
     def best(self) -> Candidate:
-        """The selected model, at a price of `SPEAK` an extension."""
+        """The selected model, with a penalty of `SPEAK` per extension."""
         learned = self.result.learned
         if learned is not None and learned.trials:  # it was selected then
             return self.plain
         candidates = self.compared(lambda some: self._fitted(some, self.members(some)) if some else self.plain)
-        return min([self.plain, *candidates], key=lambda each: each.price)
+        return min([self.plain, *candidates], key=lambda each: each.criterion)
 
     def rise_without(self, members: np.ndarray) -> float:
         """Return the increase of -2 ln L without a subset of the result's own parameters (n,)."""

@@ -172,7 +172,7 @@ def coherent(problem: CalibrationProblem, x: Array, rows: np.ndarray) -> np.ndar
 
 
 def beyond_noise(problem: Source, x: Array) -> dict[str, float]:
-    """Return the rows that the noise of a fit x (n,) [SI] cannot explain; of so many that no single one pulls it."""
+    """Return the rows that the noise of a fit x (n,) [SI] cannot explain, if no row alone influences it much."""
     norms, count = problem.whitened_errors(x)
     rare = chdtrc(count, norms**2) < FALSE_RATE
     typical = norms / np.sqrt(chdtri(count, 0.5))

@@ -78,15 +78,15 @@ def admitted(
     rest = _integrated(models.columns, columns, point)
     kept = {"gravity"}.intersection(trials[0].extensions)
 
-    def price(extensions: tuple[str, ...]) -> Candidate:
+    def fitted(extensions: tuple[str, ...]) -> Candidate:
         model = rest.restricted(models.members(extensions))
         best = model.optima(model.starts()[:1])[0]
-        price = EXTENSION_GAIN * complexity(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
+        penalty = EXTENSION_GAIN * complexity(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
         if not kept.issubset(extensions):
-            price = np.inf
-        return Candidate(best.value + price, extensions, model, best)
+            penalty = np.inf
+        return Candidate(best.value + penalty, extensions, model, best)
 
-    compared = sorted(models.compared(price), key=lambda each: each.price)
+    compared = sorted(models.compared(fitted), key=lambda each: each.criterion)
     best = compared[0]
     problem = extended(bare, models.added(best.extensions))
     prior = estimator.prior.stated(problem.parameters)

@@ -74,7 +74,7 @@ def coverage_text(coverage: float, rows: int) -> str:
 
 
 def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
-    """Say that measurements are displaced together, by the motion that registers them: as mistake or as remark.
+    """Return sentences on a common displacement of the measurements, by registration: as mistake or as remark.
 
     It is said where rows are outside their prediction intervals, or too many coordinates are. A mistake is a motion
     that takes more than half of the RMS error, for its six degrees of freedom, of rows that are outside; a remark one

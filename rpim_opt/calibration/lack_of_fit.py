@@ -20,7 +20,7 @@ from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.verdict import bent_upwards
+from rpim_opt.calibration.verdict import against_gravity
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import UNITS, Repeatability
 from rpim_opt.problem.problem import CalibrationProblem
@@ -291,7 +291,7 @@ def _upward(compared: Comparison, present: Mapping[str, float]) -> tuple[int, ..
     z = model.point.z
     moves = np.linalg.norm(model.evidence.data.X[compared.equations] * z, axis=0)
     names = compared.names[compared.members(model.extensions)].tolist()
-    return bent_upwards(names, z, np.sqrt(np.diag(model.point.C)), moves)
+    return against_gravity(names, z, np.sqrt(np.diag(model.point.C)), moves)
 
 
 def _repeated(problem: CalibrationProblem, x: Array, dimension: str) -> tuple[float | None, int]:

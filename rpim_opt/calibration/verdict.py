@@ -126,7 +126,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
 
 
 def kept_rows(result: Outcome) -> np.ndarray:
-    """Return which rows (N,) are not flagged after a robust fit; those that were excluded before are none any more."""
+    """Return which rows (N,) are not flagged after a robust fit; rows that were excluded before it are not counted."""
     out = () if result.squared_loss else result.single
     return ~np.isin(result.problem.labels, [flag.label for flag in out])
 
@@ -278,14 +278,14 @@ def _worse(result: Outcome) -> Iterator[str]:
         return
     if worse_than_nominal(nominal, identified):
         yield worse_sentence(nominal, identified)
-    elif rms(result.errors()) < rms(identified) and (moved := elsewhere(result, identified)):
+    elif rms(result.errors()) < rms(identified) and (moved := implausible(result, identified)):
         yield moved
 
 
-def elsewhere(result: Outcome, error: Array) -> str:
-    """Say that most rows, of errors (N,) [m], are further off than any robot is by itself; empty if they are not.
+def implausible(result: Outcome, error: Array) -> str:
+    """Return a sentence if most errors (N,) [m] are larger than any robot's own; otherwise an empty text.
 
-    Where the rows of the calibration are as far off, something else is wrong.
+    If errors of the calibration's own rows are as large, something else is wrong.
     """
     most = REACH * arm_length(result.problem)
     if not np.isfinite(error).any() or np.nanmedian(error) <= most or np.nanmedian(result.errors()) > most:
@@ -466,8 +466,8 @@ def _other_robot(result: Outcome, problem: CalibrationProblem) -> Better | None:
     return sibling(problem)
 
 
-def bent_upwards(names: Sequence[str], x: Array, sd: Array, moves: Array) -> tuple[int, ...]:
-    """Return the joints that surely turn against gravity, from x (n,), standard deviations (n,) and movements (n,)."""
+def against_gravity(names: Sequence[str], x: Array, sd: Array, moves: Array) -> tuple[int, ...]:
+    """Return the joints that significantly turn against gravity, from x, standard deviations and movements (n,)."""
     joints = {i: int(name.removeprefix("compliance")) for i, name in enumerate(names) if name.startswith("compliance")}
     largest = max((moves[i] for i in joints), default=0.0)
     return tuple(k for i, k in joints.items() if x[i] < -UPWARD * sd[i] and moves[i] > NOTABLE * largest)
@@ -480,7 +480,7 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if not bends or C is None or measured_torques(problem.data):
         return []
     moves = np.linalg.norm(problem.linearize(x).A * (x / free.scale), axis=0)
-    joints = bent_upwards(free.names, x, np.sqrt(np.diag(C)), moves)
+    joints = against_gravity(free.names, x, np.sqrt(np.diag(C)), moves)
     if not joints:
         return []
     return [

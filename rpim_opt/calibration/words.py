@@ -63,7 +63,7 @@ def parameter_table(result: Outcome) -> str:
 
 
 def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
-    """Return head and cells of the table of identified parameters."""
+    """Return header and cells of the table of identified parameters."""
     cells = []
     for row, of_curve in zip(result.parameter_rows(), result.problem.parameters.free.of_curves, strict=True):
         if not of_curve:
@@ -75,7 +75,7 @@ def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
 
 
 def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
-    """Return head and cells of the table of transmission errors, over the measured range of each joint."""
+    """Return header and cells of the table of transmission errors, over the measured range of each joint."""
     cells = []
     for curve in transmission_errors(result):
         inside = curve.inside

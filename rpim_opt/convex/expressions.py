@@ -249,7 +249,7 @@ Evaluation = Callable[[Any], tuple[Any, Any]]
 
 
 def evaluation(e: Any, v: Any, slopes: bool = True) -> Evaluation:
-    """Return how an expression is evaluated at numbers of a variable, in a quarter of the time of ``e.value``.
+    """Return a function that evaluates an expression at values of a variable, four times as fast as ``e.value``.
 
     With ``slopes`` by forward differentiation: entry i of every part depends on v_i alone.
     """

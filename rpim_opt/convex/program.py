@@ -136,7 +136,7 @@ class Program(Brief):
         return Program(warm.structure.formulation, model, warm.structure, warm)
 
     def beginning(self, z: Array) -> Program:
-        """Return the same program, whose next minimum is looked for from z (n,) on."""
+        """Return the same program with z (n,) as the start of its next solution."""
         self._warm.begin(z)
         return self
 
@@ -144,12 +144,12 @@ class Program(Brief):
 
     @property
     def loss_form(self) -> Quadratic | None:
-        """The quadratic of the residual that the loss is; None where it is something else."""
+        """The loss as a quadratic form of the residual; None if it is not quadratic."""
         return self.structure.loss_form
 
     @property
     def penalty_form(self) -> Quadratic | None:
-        """The quadratic |L z - c|^2 that the penalty is; None where it is something else, or there is none."""
+        """The quadratic |L z - c|^2 that the penalty is; None if it is not quadratic, or there is none."""
         return self.structure.penalty_form
 
     @property
@@ -164,7 +164,7 @@ class Program(Brief):
 
     @property
     def separable(self) -> bool:
-        """Whether the loss is a sum over equations or configurations, but no square."""
+        """Whether the loss is a sum over equations or configurations, and not quadratic."""
         return self.structure.loss is not None and self.structure.loss.separable
 
     @property
@@ -192,7 +192,7 @@ class Program(Brief):
 
     @property
     def rows(self) -> tuple[Array, Array]:
-        """A (m, n) and b (m,) of the residual that the loss gets: the QR factor, where that says all."""
+        """A (m, n) and b (m,) of the residual that the loss gets: the QR factor, where it suffices."""
         n = self.model.A.shape[1]
         if self.structure.equations == len(self.model.b):
             return self.model.A, self.model.b
@@ -212,7 +212,7 @@ class Program(Brief):
     # --- values --------------------------------------------------------------------------------------------------
 
     def value(self, z: Array, weight: float = 1.0) -> tuple[float, float]:
-        """Return loss(A z - b) and penalty(z); variables of the functions' own are at their best for the weight.
+        """Return loss(A z - b) and penalty(z), minimized over the functions' own variables at the weight.
 
         z is (n,) in units of the scales; the weight matters to variables of the functions' own alone.
         """
@@ -245,7 +245,7 @@ class Program(Brief):
         return self.model.norms(self.model.A @ z - self.model.b)
 
     def violation(self, z: Array) -> float:
-        """Return by how much z (n,) misses the constraints, in units of the scales.
+        """Return the violation of the constraints at z (n,), in units of the scales.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -269,7 +269,7 @@ class Program(Brief):
         """Return the point of the constraints of z that is nearest to z (n,); None where the solver finds none."""
         if self.box is not None:
             return np.clip(z, *self.box)
-        if not self.formulation.constraints or self.structure.met(z):
+        if not self.formulation.constraints or self.structure.feasible(z):
             return z
         try:
             return nearest(self.structure.canonical, z)

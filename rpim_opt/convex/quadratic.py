@@ -61,7 +61,7 @@ class Quadratic:
 
 
 def identity(n: int) -> Quadratic:
-    """Return |v|^2, which `cp.sum_squares` declares to be."""
+    """Return |v|^2, the quadratic form that `cp.sum_squares` declares."""
     return Quadratic(np.ones(n), np.zeros(n))
 
 

@@ -184,7 +184,7 @@ class Structure:
         return self.formulation.loss_over == "configuration"
 
     def of_r(self, stated: Any) -> Any:
-        """Return an expression of what the loss gets as one of r."""
+        """Return an expression of the loss's argument as one of r."""
         seen, r = self.expressions.loss.variable, self.expressions.r
         return stated if seen is r else substituted(stated, {id(seen): norms(r, self.groups)})
 
@@ -214,7 +214,7 @@ class Structure:
 
     @cached_property
     def loss_form(self) -> Quadratic | None:
-        """The quadratic of r that the loss is."""
+        """The loss as a quadratic form of r."""
         which = self.groups if self.over_norms else np.arange(self.equations)
         form = declared_form(self.formulation.loss, int(which.max()) + 1)
         form = form or quadratic(self.expressions.loss.expression, self.expressions.loss.variable)
@@ -226,7 +226,7 @@ class Structure:
 
     @cached_property
     def penalty_form(self) -> Quadratic | None:
-        """The quadratic of z that the penalty is."""
+        """The penalty as a quadratic form of z."""
         if self.formulation.penalty is None:
             return None
         groups = self.formulation.penalty_over is not None
@@ -265,7 +265,7 @@ class Structure:
 
     @cached_property
     def loss(self) -> Loss | None:
-        """The loss as the solver sees it, where it is no square."""
+        """The loss for the solver, where it is not quadratic."""
         if self.loss_form is not None:
             return None
         with self._lock:
@@ -291,7 +291,7 @@ class Structure:
         return [v for v in a.loss.expression.variables() if v.id in shared]
 
     def values(self, z: Array, r: Array, weight: float) -> tuple[float, float]:
-        """Return loss and penalty at numbers; variables of the functions' own are at their best."""
+        """Return loss and penalty at numbers; minimized over the functions' own variables."""
         if not self.inner:
             return self.loss_of(r), self.penalty_of(z)
         a, v, form = self.expressions, self.seen(r), self.loss
@@ -340,8 +340,8 @@ class Structure:
         """Return the argument of the loss for a residual: the residual, or the norms of the configurations."""
         return np.sqrt(np.bincount(self.groups, r**2)) if self.over_norms else r
 
-    def met(self, z: Array) -> bool:
-        """Whether z (n,) meets the constraints exactly; those with variables of their own are not tried."""
+    def feasible(self, z: Array) -> bool:
+        """Whether z (n,) satisfies the constraints exactly; those with variables of their own are not checked."""
         own = self.expressions.z
         with self._lock:
             if any(variable is not own for limit in self.expressions.flat for variable in limit.variables()):

@@ -66,7 +66,7 @@ class Requirement:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Errors of a calibration on N rows that it did not see.
+    """Errors of a calibration on N rows that it did not use.
 
     A record keeps them when a final fit uses these rows: they validate the procedure, and the parameters that are
     delivered come from all rows.

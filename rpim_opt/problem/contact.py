@@ -16,7 +16,7 @@ from rpim_opt.problem.noise import Stack, equation_numbers
 
 
 class Moved(NamedTuple):
-    """How a centre (3, c) [m], a normal (3, c) and directions in a plane (2, 3, c), if any, move."""
+    """Changes of a centre (3, c) [m], a normal (3, c) and, if any, directions in a plane (2, 3, c)."""
 
     centre: Array
     normal: Array
@@ -81,17 +81,17 @@ class Feature:
         return -scipy.linalg.helmert(len(self.places)).T
 
     def kept(self, equations: np.ndarray) -> np.ndarray:
-        """Return which of the touches' equations (K, 3) give a contrast its place, (k, 3 or 1)."""
+        """Return the touches' equations, of (K, 3), in whose places contrasts stand, (k, 3 or 1)."""
         return equations[self.places.shape[1] :, : len(self.shown)]
 
     def seen(self, values: Array) -> Array:
-        """Return what of values (K, 3, c) of the positions a touch shows, (K, 3, c)."""
+        """Return the components (K, 3, c) of values of the positions that a touch measures."""
         components = np.zeros_like(values)
         components[:, : len(self.shown)] = self.shown @ values
         return components
 
     def slopes(self, values: Array) -> Array:
-        """Return how what touches show, less the thing, changes (K, 3, c), where positions move by (K, 3, c)."""
+        """Return the changes (K, 3, c) of the touches' residuals for changes (K, 3, c) of the positions."""
         moved = self.moved(values)
         slopes = self.seen(values - moved.centre)
         q = self.places[:, 1:] @ self.across[: self.places.shape[1] - 1] + np.outer(self.height, self.normal)
@@ -99,7 +99,7 @@ class Feature:
         return slopes
 
     def moved(self, values: Array) -> Moved:
-        """Return how it moves where its touches move by values (K, 3, c).
+        """Return the change of the point or plane for changes (K, 3, c) of its touches.
 
         n is the eigenvector of M = sum_i q_i q_i', q_i = p_i - centre, with the least eigenvalue s's::
 
@@ -147,9 +147,9 @@ class Touches:
     these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for square ones,
     n_2 along two directions in the first for parallel ones.
 
-    ``names`` are those of the things, ``rows`` the numbers (K, 3) of the equations of the touches of each, ``planar``
-    which of these are planes, ``ties`` what is known of two of them, ``equations`` how many there are before the
-    elimination.
+    ``names`` are those of the points and planes, ``rows`` the numbers (K, 3) of the equations of the touches of each,
+    ``planar`` which of these are planes, ``ties`` what is known of two of them, ``equations`` how many there are before
+    the elimination.
     """
 
     names: tuple[str, ...]
@@ -186,19 +186,19 @@ class Touches:
         return cls(tuple(at), rows, tuple(planar.values()), tuple(ties), sum(map(np.size, numbers)))
 
     def located(self, residual: Array) -> Features:
-        """Return where points and planes are, of a residual (m,) that is -p_i for touches."""
+        """Return the points and planes of best fit, from a residual (m,) that is -p_i for touches."""
         return [Feature.of(-residual[index], flat) for index, flat in zip(self.rows, self.planar, strict=True)]
 
     def size(self, residual: Array) -> float:
-        """Return how far all touches spread (RMS distance from their mean) [m], of a residual as `located` has it."""
+        """Return the RMS distance of all touches from their mean [m], from a residual as for `located`."""
         p = -residual[np.concatenate(self.rows)]
         return float(np.sqrt(np.mean(np.sum((p - p.mean(axis=0)) ** 2, axis=1))))
 
     def centred(self, residual: Array, jacobian: Array, size: float) -> tuple[Array, Array]:
-        """Return residual (m,) and Jacobian (m, n) with every point and plane where its touches put it.
+        """Return residual (m,) and Jacobian (m, n) about the points and planes of best fit.
 
         A robot that shrinks to nothing would touch everything at once. What touches leave is therefore counted in
-        units of how far they spread, times the nominal robot's: how large the robot is they do not say.
+        units of their spread, times the nominal robot's: they do not determine the size of the robot.
         ``size`` is that of the nominal robot; touches that spread by less than `CLOSE` count as they are.
         """
         where = self.located(residual)
@@ -228,7 +228,7 @@ class Touches:
         return left, slopes
 
     def through(self, tie: Tie, where: Features) -> list[tuple[np.ndarray, Array]]:
-        """Return equations (K, 3) of a tie's two things, and how what it compares follows their positions (e, 3K)."""
+        """Return the equations (K, 3) of a tie's two features, and its slopes (e, 3K) by their touches' positions."""
         first, second = (where[end] for end in tie.ends)
         rows = [self.rows[end] for end in tie.ends]
         eyes = [np.eye(index.size).reshape(*index.shape, -1) for index in rows]
@@ -252,7 +252,7 @@ class Touches:
         return [(index, np.atleast_2d(G)) for index, G in zip(rows, slopes, strict=True)]
 
     def kept(self, where: Features) -> np.ndarray:
-        """Return which of the equations' places contrasts have (m,)."""
+        """Return which equations (m,) remain: all but those of touches, and those in whose places contrasts stand."""
         mask = np.ones(self.equations, dtype=bool)
         for thing, index in zip(where, self.rows, strict=True):
             mask[index] = False
@@ -260,7 +260,7 @@ class Touches:
         return mask
 
     def contrasts(self, values: Array, where: Features) -> Array:
-        """Return what m equations' values (m, c), as of `centred`, say without points and planes, (k, c)."""
+        """Return values (m, c) of the equations, as from `centred`, with contrasts in place of touches, (k, c)."""
         contrasts = values.copy()
         for thing, index in zip(where, self.rows, strict=True):
             shown = values[index[:, : len(thing.shown)]]
@@ -268,7 +268,7 @@ class Touches:
         return contrasts[self.kept(where)]
 
     def noise(self, where: Features) -> scipy.sparse.csr_matrix:
-        """Return by which noise of the m equations that of the contrasts is made, (k, m)."""
+        """Return the matrix (k, m) from the noise of the equations to that of the contrasts."""
         transform = scipy.sparse.identity(self.equations, format="lil")
         for thing, index in zip(where, self.rows, strict=True):
             transform[thing.kept(index).ravel()[:, None], index.ravel()] = np.kron(thing.aside.T, thing.shown)
@@ -279,7 +279,7 @@ class Touches:
 
 
 def contrasted(touches: Touches, stacks: Sequence[Stack], where: Features, stop: np.ndarray) -> list[Stack]:
-    """Return what divides the contrasts' noise, of the equations' ``stacks`` and the numbers (m,) of their stops."""
+    """Return the noise components of the contrasts, from the equations' ``stacks`` and numbers (m,) of stops."""
     mask = touches.kept(where)
     place = np.cumsum(mask) - 1
     noise = touches.noise(where)
@@ -308,7 +308,7 @@ def contrasted(touches: Touches, stacks: Sequence[Stack], where: Features, stop:
 
 
 def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Features, reading: bool) -> list[Array]:
-    """Return the covariance of every row's residual, of those (N, k, k) or (1, k, k) [SI] of rows by themselves."""
+    """Return the covariance of every row's residual about its feature, from those (N, k, k) or (1, k, k) [SI] alone."""
     numbers = [index[:, 0] for index in equation_numbers(data)]
     touch = np.zeros((touches.equations, 3, 3))
     for block, V, first in zip(data.blocks, each, numbers, strict=True):

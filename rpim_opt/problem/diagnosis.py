@@ -459,9 +459,9 @@ def _commanded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     steps = [each for each in _roundings(problem) if each.step and each.made > ALIKE[1] * error]
     for each in steps[-1:]:
         yield (
-            f"joint values are multiples of {each.step}, but rounding is excluded, which would contribute "
-            f"{three_digits(1e3 * each.made)} mm: they are the commanded values, and the arm stops "
-            f"{three_digits(1e3 * error)} mm beside them; log the measured ones."
+            f"joint values are multiples of {each.step}, but errors of {three_digits(1e3 * error)} mm are smaller than "
+            f"rounding would cause ({three_digits(1e3 * each.made)} mm): these are commanded joint values. Log the "
+            "measured ones."
         )
 
 

@@ -127,7 +127,7 @@ def _require_alike(name: str, first: str, p: Parameters, second: str, other: Par
 
 
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
-    """Return the problem with the sessions of its data identified, in the same way as the present ones.
+    """Return the problem with the sessions of its data identified, as the known ones are.
 
     Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
     session is identified, or all are. Rows that name no session are of one more.

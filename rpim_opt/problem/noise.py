@@ -39,7 +39,7 @@ class Repeatability:
 
 @dataclass(frozen=True, eq=False)
 class Stack:
-    """Configurations with the same number k of equations: what divides their noise, one array each.
+    """Configurations with the same number k of equations: the components of their noise, one array each.
 
     ``index`` (N, k) numbers of the equations; ``instrument`` (N, k, k) covariance as the rows state it [SI]; ``length``
     and ``angle`` (N, k) which are such; ``joint`` (N, k, dof) slopes by the revolute joints' angles [SI], dof columns a

@@ -59,7 +59,7 @@ class RobotModel(Tabled):
     repeatability: Repeatability | None = field(default=None, kw_only=True)
 
     def sample(self) -> CalibrationProblem:
-        """Return rows enough to place frames by: all of them, of measurements in blocks the first block."""
+        """Return rows that suffice to register frames: all of them, or the first of several blocks."""
         raise NotImplementedError
 
     def identify(self, patterns: Iterable[str]) -> Self:
@@ -156,7 +156,7 @@ class RobotModel(Tabled):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CalibrationProblem(RobotModel):
-    """What was measured on which robot (of several by name, as `together` has them), and which parameters explain it.
+    """Measurements, the nominal robot (several by name, see `together`), and the parameters that explain them.
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand in the order
     of the data's blocks. ``frozen_functions`` are those that `frozen` keeps, None where every call asks the measurement
@@ -204,7 +204,7 @@ class CalibrationProblem(RobotModel):
                 require_loads(robot, self.parameters.of_robot(name), own)
 
     def alone(self, robot: str) -> CalibrationProblem:
-        """Return the problem of one of several robots: its parameters, as itself calls them, and its rows."""
+        """Return the problem of one of several robots: its parameters, under their own names, and its rows."""
         if robot not in self.arms:
             raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
         if not robot:
@@ -282,7 +282,7 @@ class CalibrationProblem(RobotModel):
         return self.on(self.data.without(labels))
 
     def sample(self) -> CalibrationProblem:
-        """Return rows enough to place frames by: here all of them, of measurements in blocks the first block."""
+        """Return rows that suffice to register frames: here all of them."""
         return self
 
     def rows(self) -> Iterator[CalibrationProblem]:
@@ -587,7 +587,7 @@ def around(model: LinearModel, x: Array | None, farthest: Array | None = None) -
 
 
 def error_dimensions(block: Block) -> list[str]:
-    """Return what the components of a block's residual count as in errors: ``length``, ``angle``, ``stated``."""
+    """Return the dimensions of a block's residual, by component, as errors count: ``length``, ``angle``, ``stated``."""
     dimensions = list(block.measurement.components.values())
     if block.measurement.metres is not None:
         return ["length"] * len(dimensions)

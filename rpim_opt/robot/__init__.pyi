@@ -1,4 +1,4 @@
-from .chain import Described as Described
+from .chain import RobotSetup as RobotSetup
 from .chain import without_beta as without_beta
 from .extensions import bend_names as bend_names
 from .extensions import extension_scales as extension_scales

@@ -41,8 +41,8 @@ SAME_PLACE = (0.01, 0.1)  # two frames nearer than this [m], [rad] are one and t
 
 
 @dataclass(frozen=True, eq=False)
-class Described:
-    """A robot from a file; the tip of the file is at base @ MDH chain(q) @ tool."""
+class RobotSetup:
+    """A robot with its base and tool frames; the tip of a file is at base @ MDH chain(q) @ tool."""
 
     robot: Robot
     base: Array  # (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them

@@ -9,7 +9,7 @@ import numpy as np
 
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
-from rpim_opt.robot.chain import Described
+from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.formats.tables import SHEETS, read_robot, read_sheet
 
 READY = Path(__file__).resolve().parent / "ready"
@@ -52,7 +52,7 @@ def find_robot(name: str, folder: Path | None = None) -> Path:
 
 def read_arm(
     file: Path, urdf_base: str | None = None, urdf_tip: str | None = None, convention: str = "", origins: bool = False
-) -> Described:
+) -> RobotSetup:
     """Return the robot of a file, with base and tool if a URDF or a standard DH table states them."""
     if file.suffix == ".urdf":
         from rpim_opt.robot.formats.urdf import read_urdf
@@ -70,7 +70,7 @@ def read_arm(
         raise InputError(
             "--dh", f"'{convention}' of {file.name}", "a table of numbers; other files state their convention"
         )
-    return Described(read_robot(file), np.zeros(6), np.zeros(6))
+    return RobotSetup(read_robot(file), np.zeros(6), np.zeros(6))
 
 
 def find_source(robot: str | Path) -> Path:

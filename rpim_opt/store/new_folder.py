@@ -28,7 +28,7 @@ from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
 from rpim_opt.problem.registration.camera import camera_blocks, posed
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
-from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, Described, carried_by, placed, same_place
+from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, RobotSetup, carried_by, placed, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
@@ -168,7 +168,7 @@ def new_problem(
     return Started(folder, counts, notes, replace(understanding, kind=kind), not dry_run)
 
 
-def _remarks(arm: Described, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
+def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
     """Yield the assumed noise, where base and flange of a converted table are, and joint values of no joint."""
     if noise:
         assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
@@ -196,7 +196,7 @@ def _remarks(arm: Described, source: Path, understanding: Understanding, noise: 
         )
 
 
-def _ignored_joints(arm: Described, understanding: Understanding) -> str:
+def _ignored_joints(arm: RobotSetup, understanding: Understanding) -> str:
     """Return the columns of joints behind the robot's last one; empty if there are none."""
     beyond = {f"q{i}" for i in range(arm.robot.dof + 1, arm.robot.dof + 9)}
     further = [name for name in understanding.left_out if recognize(split(name)[0], arm.names).stem in beyond]
@@ -225,7 +225,7 @@ def _with_chains(folder: Path, robot: Path, chain: str) -> bytes:
     return files.read_bytes(stated)
 
 
-def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: Described, source: Path, chains: bool) -> None:
+def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: RobotSetup, source: Path, chains: bool) -> None:
     """Write a new folder with its robot beside its place, and move it there when it is whole."""
     with ExitStack() as stack:
         files.make_folder(folder.parent, stack.enter_context(files.undoing()))
@@ -286,7 +286,7 @@ def stated_target(text: str, file: str = TABLES[-1]) -> StatedTarget:
 
 
 def _kind(
-    arm: Described, found: Understanding, target: StatedTarget, measurement: str | None
+    arm: RobotSetup, found: Understanding, target: StatedTarget, measurement: str | None
 ) -> tuple[Measurement, str]:
     """Return the measurement type and how it is known; refuse pixels without a board, and a board without pixels."""
     kind = found.kind
@@ -307,7 +307,7 @@ def _kind(
     return kind, f"guessed: rows with the same {column} touched it, {count} in all, and nothing else is measured"
 
 
-def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
+def _camera(arm: RobotSetup, columns: Columns) -> tuple[Measurement, str]:
     """Return whether the camera is on the flange or beside the robot, by what its poses fit, and how that was found."""
     misfit = {}  # RMS [m] of the views' poses where base and tool fit best
     for name, kind in CAMERAS.items():
@@ -328,7 +328,7 @@ def _camera(arm: Described, columns: Columns) -> tuple[Measurement, str]:
 # --- the text of problem.toml -------------------------------------------------------------------------------------
 
 
-def _problem_text(arm: Described, kind: Measurement, rows: Dataset, chain: str, **context: Any) -> tuple[str, str]:
+def _problem_text(arm: RobotSetup, kind: Measurement, rows: Dataset, chain: str, **context: Any) -> tuple[str, str]:
     """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
     from jinja2 import Environment
 
@@ -384,7 +384,7 @@ def _at_links(names: Sequence[str], carried: Sequence[Carried], at_base: bool) -
     return [name if frame == frame_of(name) else frame + axis for frame, axis, name in moved if frame]
 
 
-def _base(arm: Described, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:
+def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
     rows = posed(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):

@@ -32,7 +32,7 @@ from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.record import CONFIDENCE, Requirement
 from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import identifiable
-from rpim_opt.robot.chain import Described
+from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.formats.tables import Mounting, PayloadTable, gravity_with
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
 from rpim_opt.robot.library import find_robot, read_arm
@@ -389,7 +389,7 @@ def _checked(content: dict[str, Any], kinds: dict[str, Measurement], path: Path)
     return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path), placed
 
 
-def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> Described:
+def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> RobotSetup:
     """Return the robot with its gravity, and terms of a script or of the file."""
     file = find_robot(table.robot, path.parent)
     if file.suffix != ".urdf" and (table.urdf_base or table.urdf_tip or table.chain):

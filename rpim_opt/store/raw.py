@@ -26,7 +26,7 @@ from rpim_opt.data.tables.names import ORDERS, recognize
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.data.tables.understanding import Meant, Understood, understand
 from rpim_opt.problem.misreadings import pose_misfit
-from rpim_opt.robot.chain import Described
+from rpim_opt.robot.chain import RobotSetup
 
 CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.
 USUAL = "extrinsic xyz"
@@ -96,7 +96,11 @@ def usual_noise(kind: Measurement) -> dict[str, float]:
 
 
 def rows_of(
-    found: Understanding, columns: Columns, arm: Described, kind: Measurement, noise: Mapping[str, float] | None = None
+    found: Understanding,
+    columns: Columns,
+    arm: RobotSetup,
+    kind: Measurement,
+    noise: Mapping[str, float] | None = None,
 ) -> Dataset:
     """Return the measurements of interpreted columns; errors use the file's column names."""
     try:
@@ -118,7 +122,7 @@ def rows_of(
 
 
 def understand_of(
-    arm: Described,
+    arm: RobotSetup,
     data: Sequence[Any],
     measurement: str | Measurement | None = None,
     options: TableOptions | None = None,
@@ -165,7 +169,7 @@ def _sheets(source: Any, options: TableOptions) -> Files:
     return [(path, read_raw(path, replace(options, sheet=sheet.strip()))) for sheet in options.sheet.split(",")]
 
 
-def _upright(raw: RawTable, arm: Described) -> RawTable:
+def _upright(raw: RawTable, arm: RobotSetup) -> RawTable:
     """Return a table that has a row a quantity with a column a quantity; any other unchanged."""
     first, *others = raw.columns.items()
     names = [str(cell).strip() for cell in first[1]]
@@ -179,7 +183,7 @@ def _upright(raw: RawTable, arm: Described) -> RawTable:
 
 
 def _tables(
-    files: Files, arm: Described, kind: Measurement, options: TableOptions, targets: bool = False
+    files: Files, arm: RobotSetup, kind: Measurement, options: TableOptions, targets: bool = False
 ) -> list[Understood]:
     tables = []
     for path, raw in files:
@@ -190,7 +194,7 @@ def _tables(
 
 
 def _whole(
-    files: Files, arm: Described, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
+    files: Files, arm: RobotSetup, kind: Measurement, options: TableOptions, tables: Sequence[Understood]
 ) -> Understanding:
     with in_file(files[0][0] if len(files) == 1 else None):
         whole = together(tables, arm.robot, kind, options.key, options.within)
@@ -224,7 +228,7 @@ def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: s
     return tuple(replace(table, meant=tuple(map(told, table.meant))) for table in tables)
 
 
-def _checked(first: Understanding, files: Files, arm: Described, doubt: str) -> Understanding:
+def _checked(first: Understanding, files: Files, arm: RobotSetup, doubt: str) -> Understanding:
     """Return poses with the order of a quaternion that fits the nominal robot; refuse turns that are not as usual."""
     alternatives: dict[str, Understanding] = {}
     misfit: dict[str, float] = {}

@@ -48,7 +48,7 @@ WEIGHED = "a calibration with compliances identified from torques of gravity, or
 
 @dataclass(frozen=True, eq=False)
 class Compensation:
-    """Corrected joint commands of a ``robot`` for N targets, and what the calibrated model says of them.
+    """Corrected joint commands of a ``robot`` for N targets, and their errors by the calibrated model.
 
     ``nominal`` and ``q`` (N, dof) are the commands of the nominal controller and the corrected ones [rad or m].
     ``position_before`` and ``position_error`` (N,) [m] are by how much these miss the target, both by the calibrated

@@ -28,7 +28,7 @@ from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.chain import OF_JOINTS, Described, placed, same_place
+from rpim_opt.robot.chain import OF_JOINTS, RobotSetup, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
@@ -60,7 +60,7 @@ Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
 
 
-def identified(result: Calibration, marker: str | None = None) -> Described:
+def identified(result: Calibration, marker: str | None = None) -> RobotSetup:
     """Return the identified robot, its base in the instrument's frame, and a reflector as tool.
 
     ``marker`` names the reflector, the first by default. Refused are identified parameters that no description of a
@@ -84,7 +84,7 @@ def identified(result: Calibration, marker: str | None = None) -> Described:
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
     base, tool = (np.array([of[frame + c] for c in FRAME]) for frame in ("base_", prefix))
-    return Described(replace(result.robot, joint_map=joint_map), base, tool)
+    return RobotSetup(replace(result.robot, joint_map=joint_map), base, tool)
 
 
 def export_files(

@@ -25,7 +25,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.joining import seconds, time_column
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.robot.chain import Described
+from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.store.raw import Understanding, rows_of, understand_of
 
 
@@ -135,7 +135,7 @@ def read_measurements(
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
     noise = _typical_noise([block for block in blocks if block.measurement is calibrated], kind)
-    data = rows_of(understanding, columns, Described(robot, np.zeros(6), np.zeros(6)), kind, noise)
+    data = rows_of(understanding, columns, RobotSetup(robot, np.zeros(6), np.zeros(6)), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
     left_out = tuple(column for column in understanding.left_out if column.lower() != name)
@@ -169,7 +169,7 @@ def _understood(
     if not all(Path(str(each)).suffix.lower() in EXCEL for each in sources):
         reading.pop("sheet", None)
     options = TableOptions.stated({**reading, **stated.texts()})
-    arm = Described(result.problem.robot, np.zeros(6), np.zeros(6), options.joints)
+    arm = RobotSetup(result.problem.robot, np.zeros(6), np.zeros(6), options.joints)
     try:
         return understand_of(arm, sources, kind, options, targets)
     except InputError:

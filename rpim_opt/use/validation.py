@@ -14,7 +14,7 @@ from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.held_out import compared, coverage_text, displaced, registered
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import elsewhere, misread, worse_sentence, worse_than_nominal
+from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
@@ -85,7 +85,7 @@ class Validation(HeldOut):
         return columns_csv(self._rows())
 
     def tables(self) -> list[tuple[list[str], list[list[str]]]]:
-        """Return head and rows of the table of errors as text, and of that of touches where there are any."""
+        """Return header and rows of the table of errors as text, and of that of touches if there are any."""
         content = self.content()
         figures = {"nominal": content["nominal"], "identified": content["identified"]}
         for axis, of_axis in content["axes"].items():
@@ -100,7 +100,7 @@ class Validation(HeldOut):
         return [errors, (HEADER, touch_rows(self.touched))] if self.touched else [errors]
 
     def sentences(self) -> list[str]:
-        """Return the largest error, the rows outside their intervals, and what a reader of the errors has to know."""
+        """Return the largest error, the rows outside their intervals, and remarks."""
         largest = ""
         if np.isfinite(self.error).any():
             largest = f"Largest error: row {self.label[np.nanargmax(self.error)]}, {1e3 * self.largest:.3f} mm."
@@ -161,6 +161,6 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         outside=result.outside(data),
         touched=touched,
         remarks=tuple(remarks),
-        mistake=misread(result, data) or moved or elsewhere(result, held.error),
+        mistake=misread(result, data) or moved or implausible(result, held.error),
         no_intervals=result.no_intervals,
     )

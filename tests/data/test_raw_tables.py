@@ -291,7 +291,7 @@ def test_a_german_controllers_and_a_trackers_export_need_no_renaming(tmp_path: P
     text = f"Messprotokoll\nEinheit: mm\n\n{head};Unsicherheit U95\n"
     text += "".join(f"{i};1,5;2,5;3,5;4,5;5,5;6,5;100,125;200,25;{i}00,5;0,01\n" for i in (1, 2, 3))
     (tmp_path / "raw.csv").write_text(text, encoding="utf-8")
-    arm = ro.robot.Described(robot, np.zeros(6), np.zeros(6))
+    arm = ro.robot.RobotSetup(robot, np.zeros(6), np.zeros(6))
     found = understand_of(arm, [tmp_path / "raw.csv"], options=ro.data.TableOptions(units="deg,mm"))
     assert found.kind is position
     assert set(found.columns) == {"label", *(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm", "u95_mm"}

@@ -23,7 +23,7 @@ from rpim_opt.convex.constraint_parser import sentence
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
-from rpim_opt.robot.chain import Described
+from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.library import find_robot
 from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
 from rpim_opt.store.raw import understand_of, usual_noise
@@ -134,7 +134,7 @@ def raw(data: bytes, folder: Path) -> None:
     """Understand a raw table."""
     path = folder / "raw.csv"
     path.write_bytes(data)
-    arm = Described(TWO, IDENTITY, IDENTITY, ("A1", "A2"))
+    arm = RobotSetup(TWO, IDENTITY, IDENTITY, ("A1", "A2"))
     found = None
     for units in ("", "deg,mm"):
         with suppress(ro.InputError):

@@ -115,7 +115,7 @@ def urdf_kinematics(path: Path, tip: str, q: np.ndarray) -> np.ndarray:
     return result
 
 
-def reach(arm: ro.robot.Described, q: np.ndarray) -> np.ndarray:
+def reach(arm: ro.robot.RobotSetup, q: np.ndarray) -> np.ndarray:
     """Return the transforms (N, 4, 4) of the tip."""
     return numeric_frame(arm.base) @ ro.robot.forward_kinematics(arm.robot, q) @ numeric_frame(arm.tool)
 
@@ -149,7 +149,7 @@ def test_identified_parameters_written_to_a_urdf_move_it_the_same(tmp_path: Path
     rng = np.random.default_rng(seed)
     mdh = arm.robot.mdh + 0.01 * rng.normal(size=arm.robot.mdh.shape)
     base, tool = arm.base + 0.01 * rng.normal(size=6), arm.tool + 0.01 * rng.normal(size=6)
-    better = ro.robot.Described(replace(arm.robot, mdh=mdh), base, tool)
+    better = ro.robot.RobotSetup(replace(arm.robot, mdh=mdh), base, tool)
     ro.robot.write_urdf(path, better.robot, target, tip="tip", base_frame=base, tool_frame=tool)
     q = configurations(arm.robot.dof)
     assert np.abs(reach(better, q) - urdf_kinematics(target, "tip", q)).max() < ROUNDING
@@ -184,7 +184,7 @@ def test_origins_that_the_file_leaves_out_are_put_in(tmp_path: Path, mark: str) 
     arm = ro.read_urdf(path)
     assert np.isinf(arm.robot.limits).all()  # no limit element, and a continuous joint
     mdh = arm.robot.mdh + np.random.default_rng(0).uniform(-0.1, 0.1, (2, 5)) * [[1, 1, 1, 1, 1], [1, 1, 1, 1, 0]]
-    better = ro.robot.Described(replace(arm.robot, mdh=mdh), arm.base, arm.tool)
+    better = ro.robot.RobotSetup(replace(arm.robot, mdh=mdh), arm.base, arm.tool)
     ro.robot.write_urdf(path, better.robot, target)
     q = configurations(2)
     assert np.abs(reach(better, q) - urdf_kinematics(target, "hand", q)).max() < EXACT
@@ -374,7 +374,7 @@ def test_the_chain_between_any_two_links(tmp_path: Path, seed: int) -> None:
     assert np.abs(reach(arm, q) - between_links(path, arm.names, base, tip, q)).max() < EXACT
     mdh = arm.robot.mdh + 0.01 * rng.normal(size=arm.robot.mdh.shape)
     place, tool = arm.base + 0.01 * rng.normal(size=6), arm.tool + 0.01 * rng.normal(size=6)
-    better = ro.robot.Described(replace(arm.robot, mdh=mdh), place, tool)
+    better = ro.robot.RobotSetup(replace(arm.robot, mdh=mdh), place, tool)
     ro.robot.write_urdf(path, better.robot, target, base=base, tip=tip, base_frame=place, tool_frame=tool)
     assert np.abs(reach(better, q) - between_links(target, arm.names, base, tip, q)).max() < EXACT
 

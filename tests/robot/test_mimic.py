@@ -29,13 +29,13 @@ URDF = """<robot name="palletizer"><link name="base"/><link name="column"/><link
 
 
 @pytest.fixture
-def arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ro.robot.Described:
+def arm(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> ro.robot.RobotSetup:
     monkeypatch.chdir(tmp_path)
     Path("arm.urdf").write_text(URDF)
     return ro.read_urdf("arm.urdf")
 
 
-def test_what_the_controller_moves_is_fewer_than_the_table_has(arm: ro.robot.Described) -> None:
+def test_what_the_controller_moves_is_fewer_than_the_table_has(arm: ro.robot.RobotSetup) -> None:
     robot = arm.robot
     assert (robot.dof, len(robot.mdh), arm.names) == (2, 4, ("turn", "slide2"))
     assert robot.joint_dimensions == ("angle", "length")
@@ -48,7 +48,7 @@ def test_what_the_controller_moves_is_fewer_than_the_table_has(arm: ro.robot.Des
             assert np.array_equal(getattr(again, what), getattr(robot, what))
 
 
-def test_errors_of_joints_that_follow_are_found_and_go_back_into_the_file(arm: ro.robot.Described) -> None:
+def test_errors_of_joints_that_follow_are_found_and_go_back_into_the_file(arm: ro.robot.RobotSetup) -> None:
     rng = np.random.default_rng(0)
     robot = arm.robot
     parameters = ro.robot.model_parameters(robot, arm.base, {"": arm.tool}).identify(["d3", "a4", "theta4"])
@@ -69,7 +69,7 @@ def test_errors_of_joints_that_follow_are_found_and_go_back_into_the_file(arm: r
     assert Path("identified.urdf").read_text().count("<mimic") == 2
 
 
-def test_commands_of_joints_that_others_follow_are_corrected(arm: ro.robot.Described) -> None:
+def test_commands_of_joints_that_others_follow_are_corrected(arm: ro.robot.RobotSetup) -> None:
     rng = np.random.default_rng(1)
     robot = arm.robot
     q = rng.uniform(*robot.limits.T, (30, 2))

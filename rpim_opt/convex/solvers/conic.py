@@ -176,8 +176,8 @@ class Canonical:
         cones = [clarabel.ZeroConeT(self.zero), clarabel.NonnegativeConeT(self.linear - self.zero)]
         return [cone for cone, count in zip(cones, (self.zero, self.linear - self.zero), strict=True) if count]
 
-    def price(self, variable: Any, slope: float) -> None:
-        """Make a scalar variable cost so much in the objective."""
+    def set_slope(self, variable: Any, slope: float) -> None:
+        """Set the slope of a scalar variable in the objective."""
         column = self._columns[variable.id]
         self.q[column] = slope * self.column_scale[column]
 
@@ -186,7 +186,7 @@ class Canonical:
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
 
     def missed(self, x: Array) -> float:
-        """Return by how much x (N,) misses equations, inequalities and second-order cones, as they were stated."""
+        """Return the violation of equations, inequalities and second-order cones at x (N,), as they were stated."""
         slack = np.divide(self.b - self.A @ x, self.row_scale, out=np.zeros(len(self.b)), where=self.row_scale > 0)
         worst = [0.0, *np.abs(slack[: self.zero]), *-slack[self.zero : self.linear]]
         begin = self.linear
@@ -263,14 +263,14 @@ def _settings(attempt: Attempt) -> Any:
 
 
 class Clarabel:
-    """Clarabel for programs that differ in numbers alone: a solver is set up once, and gets the numbers of the next."""
+    """Clarabel for programs of one sparsity pattern: the solver is set up once and updated for the next program."""
 
     def __init__(self, cones: list[Any], attempts: Sequence[Attempt] = ATTEMPTS):
         self.cones, self.attempts = cones, attempts
         self.renew()
 
     def renew(self) -> None:
-        """Forget the solver: the next program has entries at other places."""
+        """Discard the solver: the next program has another sparsity pattern."""
         self._solver: Any = None
         self._numbers: dict[str, Array] = {}
 
@@ -306,7 +306,7 @@ class Clarabel:
 
 
 class Unsolved(RuntimeError):
-    """A program that the solver does not solve; its argument is the solver's word."""
+    """A program that the solver does not solve; its argument is the solver's status."""
 
 
 class Damping(NamedTuple):
@@ -369,7 +369,7 @@ class ReducedProgram:
         self, canonical: Canonical, rows: int, loss: Canonical | None = None, counts: np.ndarray | None = None
     ):
         self.canonical, self.rows, self.loss, self.counts = canonical, rows, loss, counts
-        self.face = np.zeros(0, dtype=int)
+        self.working = np.zeros(0, dtype=int)
         self.near = np.zeros(canonical.size)
 
     def solve(self, squares: ReducedSquares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
@@ -377,47 +377,47 @@ class ReducedProgram:
         p = self.canonical
         if self.loss is not None or not p.polyhedral:
             return self._by_cones(squares, weight, A, b)[0]
-        exact = self._by_active_set(squares, weight, self.face, self.near)
+        exact = self._by_active_set(squares, weight, self.working, self.near)
         if exact is not None:
             return exact
         point, slack = self._by_cones(squares, weight, A, b)
         active = np.arange(p.zero, p.linear)
-        face = active[(point.dual > slack)[active]]
-        exact = self._by_active_set(squares, weight, face, point.x)
+        working = active[(point.dual > slack)[active]]
+        exact = self._by_active_set(squares, weight, working, point.x)
         return point if exact is None else replace(exact, iterations=point.iterations)
 
     # --- active set --------------------------------------------------------------------------------------------------
 
-    def _by_active_set(self, squares: ReducedSquares, weight: float, face: np.ndarray, near: Array) -> Point | None:
+    def _by_active_set(self, squares: ReducedSquares, weight: float, working: np.ndarray, near: Array) -> Point | None:
         """Return the minimum by a primal-dual active set; None where the sets of active rows cycle."""
         p = self.canonical
         A = p.dense[0]
         inequalities = np.arange(p.zero, p.linear)
         seen: set[bytes] = set()
         for _ in range(MOST_ACTIVE_SETS):
-            if face.tobytes() in seen:
+            if working.tobytes() in seen:
                 return None
-            seen.add(face.tobytes())
-            active = np.concatenate([np.arange(p.zero), face])
-            solution = on_face(squares, weight, p, active, near)
+            seen.add(working.tobytes())
+            active = np.concatenate([np.arange(p.zero), working])
+            solution = on_working_set(squares, weight, p, active, near)
             if solution is None:
                 return None
             x, multipliers = solution
             slack = p.b[inequalities] - A[inequalities] @ x
             tight = np.zeros(len(inequalities), dtype=bool)
-            tight[face - p.zero] = True
+            tight[working - p.zero] = True
             dual = multipliers[p.zero :]
             rounding = 1e-9 * max(weight * np.abs(p.q).max(initial=0.0), np.abs(dual).max(initial=0.0))
             met = slack[~tight] >= -1e-11 * (1 + np.abs(p.b[inequalities][~tight]))
             if met.all() and (dual >= -rounding).all():
-                self.face, self.near = face, x
+                self.working, self.near = working, x
                 every = np.zeros(len(p.b))
                 every[active] = multipliers
                 return Point(x, every)
             keep = np.zeros(len(p.b), dtype=bool)
-            keep[face[dual > 0]] = True
+            keep[working[dual > 0]] = True
             keep[inequalities[~tight & (slack < 0)]] = True
-            face = np.flatnonzero(keep)
+            working = np.flatnonzero(keep)
         return None
 
     # --- Clarabel ----------------------------------------------------------------------------------------------------
@@ -637,7 +637,7 @@ def by_triangle(T: Array, b: Array, transposed: bool = False) -> Array:
     return TRTRS(T, b, trans=int(transposed))[0]
 
 
-def on_face(
+def on_working_set(
     squares: ReducedSquares, weight: float, p: Canonical, active: np.ndarray, near: Array
 ) -> tuple[Array, Array] | None:
     """Return the minimum (N,) next to ``near`` where some rows are equations A x = b, and their multipliers, or None.

@@ -353,7 +353,7 @@ def gram(A: Array, weights: Array) -> Array:
 
 
 class Loss:
-    """A loss f(v) that is no square, of residuals v (M,), or where ``positive`` of configurations' norms.
+    """A loss f(v) that is not quadratic, of residuals v (M,), or where ``positive`` of configurations' norms.
 
     Where it is ``separable``, f(v) = sum_i f_i(v_i); with a ``threshold`` t min_t rate t + sum_i f_i(v_i, t). It has
     ``shared`` own variables with penalty or constraints.
@@ -426,13 +426,13 @@ class Loss:
         return one if proportional else np.nan
 
     def at_threshold(self, t: float) -> Evaluation:
-        """Return how f_i(v_i, t) and its slope by v_i are evaluated at numbers v (M,)."""
+        """Return functions for f_i(v_i, t) and its slope by v_i at numbers v (M,)."""
         with self._lock:
             self.threshold.save_value(np.array(t))
             return evaluation(self.entries, self.variable)
 
     def by_threshold(self, v: Array) -> Evaluation:
-        """Return how f_i(v_i, t) and its slope by t are evaluated at a number t."""
+        """Return functions for f_i(v_i, t) and its slope by t at a number t."""
         with self._lock:
             self.variable.save_value(v)
             return evaluation(self.entries, self.threshold)

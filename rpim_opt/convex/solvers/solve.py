@@ -170,7 +170,7 @@ def _coupled(loss: Loss, rows: Rows, warm: WarmStart, weight: float, damping: Da
             small = rows.program(loss, working, warm.canonical, len(terms.y))
             small.data.clarabel.attempts = (EQUILIBRATED,)
         part: Any = small.loss
-        part.price(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
+        part.set_slope(loss.threshold, loss.rate + float(tangent.by_threshold[outside].sum()))
         try:
             point = small.solve(replace(terms, g=terms.g + rows.A.T @ slope), weight, *rows.equations(working))
         except Unsolved:

@@ -33,7 +33,7 @@ from rpim_opt.problem.registration.closed_forms import (
     transforms,
 )
 from rpim_opt.problem.registration.points import Candidates, Points, fit_arms
-from rpim_opt.robot.chain import Described
+from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm
 from rpim_opt.robot.mdh import Robot
@@ -148,7 +148,7 @@ MISPLACED = 3.0  # how many scales a frame may be from where it is stated before
 
 
 def problem_from(
-    robot: Robot | Described | str | Path,
+    robot: Robot | RobotSetup | str | Path,
     data: Dataset,
     identify: Iterable[str] = "auto",
     base: ArrayLike | Literal["auto"] = "auto",
@@ -172,7 +172,7 @@ def problem_from(
     """
     if isinstance(robot, str | Path):
         robot = read_arm(Path(robot) if Path(robot).is_file() else find_robot(str(robot)))
-    if isinstance(robot, Described):
+    if isinstance(robot, RobotSetup):
         tool = robot.tool if tool is None else tool
         robot = robot.robot
     if not isinstance(robot, Robot):

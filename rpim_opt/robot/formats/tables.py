@@ -19,7 +19,7 @@ from rpim_opt.basics.layout import PART_OF_PI, read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import UNITS, accepted_units, display, split
-from rpim_opt.robot.chain import Chain, Described, describe, standard_table, without_beta
+from rpim_opt.robot.chain import Chain, RobotSetup, describe, standard_table, without_beta
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
@@ -184,7 +184,7 @@ def read_robot(path: str | Path) -> Robot:
 
 
 @of_file
-def read_sheet(path: Path, convention: str = "") -> Described:
+def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     """Return the robot of a table with one row per joint, in the convention stated there or by ``convention``.
 
     ``modified`` (Craig, proximal) is that of this package. ``standard`` (Paul, distal) and, with a column beta, that of
@@ -222,7 +222,7 @@ def read_sheet(path: Path, convention: str = "") -> Described:
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
     if known == {"modified"}:
-        return Described(robot, np.zeros(6), np.zeros(6))
+        return RobotSetup(robot, np.zeros(6), np.zeros(6))
     if robot.gravity.masses:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
     return _from_standard(robot)
@@ -235,17 +235,17 @@ def _stem(name: str) -> tuple[str, str]:
     return SHEET.get(stem, stem), unit
 
 
-def _from_standard(robot: Robot) -> Described:
+def _from_standard(robot: Robot) -> RobotSetup:
     """Return the arm of numbers in the standard convention, with Hayati's beta behind every link."""
     robot = replace(robot, source="converted from a DH table in the standard convention (Paul)")
     alpha, a, theta, d, beta = robot.mdh.T
     shifted = np.column_stack([np.append(0.0, alpha[:-1]), np.append(0.0, a[:-1]), theta, d, beta])
     if not beta.any():  # the same numbers, alpha and a one row further
-        return Described(replace(robot, mdh=shifted), np.zeros(6), np.array([a[-1], 0.0, 0.0, alpha[-1], 0.0, 0.0]))
+        return RobotSetup(replace(robot, mdh=shifted), np.zeros(6), np.array([a[-1], 0.0, 0.0, alpha[-1], 0.0, 0.0]))
     turns = [numeric_link(theta=each, d=along) for each, along in zip(theta, d, strict=True)]
     links = [turn @ numeric_link(alpha[i], a[i], beta=beta[i]) for i, turn in enumerate(turns)]
     mdh, base, tool, _ = describe(Chain.about_z([np.eye(4), *links[:-1]], links[-1]), shifted)
-    return Described(replace(robot, mdh=mdh), frame_numbers(base), frame_numbers(tool))
+    return RobotSetup(replace(robot, mdh=mdh), frame_numbers(base), frame_numbers(tool))
 
 
 def _joint(cells: dict[str, str]) -> dict[str, Any]:

@@ -17,7 +17,7 @@ from rpim_opt.basics.files import read_bytes, write_bytes
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
     Chain,
-    Described,
+    RobotSetup,
     corrected,
     describe,
     origin_numbers,
@@ -60,7 +60,7 @@ def _in_base(robot: Robot) -> Robot:
 
 
 @of_file
-def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
+def read_ur_calibration(path: str | Path, nominal: Robot) -> RobotSetup:
     """Return the robot that a controller's ``calibration.conf`` describes, in the controller's Base.
 
     Its section ``[mounting]`` lists ``delta_theta``, ``delta_a``, ``delta_d`` and ``delta_alpha``, from the base
@@ -91,7 +91,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> Described:
     tail = numeric_link(alpha=deltas["alpha"][-1], a=deltas["a"][-1])
     plain, base, tool, _ = describe(Chain.about_z([numeric_link(*row) for row in table], tail), nominal.mdh)
     robot = Robot(nominal.name, plain, nominal.joint_types, nominal.joint_map, nominal.limits, path.name)
-    return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
+    return RobotSetup(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
 @of_file
@@ -150,7 +150,7 @@ def _deltas(data: bytes) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
 
 
 @of_file
-def read_ur_kinematics(path: str | Path) -> Described:
+def read_ur_kinematics(path: str | Path) -> RobotSetup:
     """Return the robot of a ``kinematics.yaml`` of ROS, in the controller's Base (``base_link`` turned half a turn).
 
     Under ``kinematics`` stand shoulder, upper_arm, forearm, wrist_1, wrist_2 and wrist_3, each with the origin of its
@@ -169,7 +169,7 @@ def read_ur_kinematics(path: str | Path) -> Described:
     chain, _ = _yaml_chain(read_bytes(path))
     table, base, tool, _ = describe(chain)
     robot = Robot("Universal Robots", table, source=path.name)
-    return Described(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
+    return RobotSetup(robot, frame_numbers(base), frame_numbers(tool), JOINTS)
 
 
 @of_file

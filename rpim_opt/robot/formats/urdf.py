@@ -30,8 +30,8 @@ from rpim_opt.robot.chain import (
     ROUNDING,
     Carried,
     Chain,
-    Described,
     Origin,
+    RobotSetup,
     corrected,
     describe,
     displaced,
@@ -54,7 +54,7 @@ TAG = re.compile(rb"<(?:[^\"'>]|\"[^\"]*\"|'[^']*')*>")  # a tag: quoted values 
 
 
 @of_file
-def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None, origins: bool = False) -> Described:
+def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None, origins: bool = False) -> RobotSetup:
     """Return the chain between two links of a URDF file as a robot in modified DH with Hayati's beta.
 
     ``base @ MDH chain(q) @ tool`` is the transform from link ``base`` to link ``tip``, with q the file's joint values;
@@ -104,12 +104,12 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
         if joint.kind != urdf.joints[name].kind:
             found = f"a mimic of joint '{name}' of another kind, which is not between base and tip"
             raise joint.error("mimic", found, "a joint of the same kind, or a joint between base and tip")
-    return Described(robot, frame_numbers(T_base), frame_numbers(T_tool), way.names)
+    return RobotSetup(robot, frame_numbers(T_base), frame_numbers(T_tool), way.names)
 
 
 @of_file
 def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
-    """Return a name for the chain between two links that goes up through joints that move; nothing for another one."""
+    """Return a name for a chain between two links that goes up through moving joints; otherwise an empty text."""
     if path.suffix != ".urdf":
         return ""
     steps = _read(path).steps_between(base, tip)
@@ -119,7 +119,7 @@ def branching_tip(path: Path, base: str | None, tip: str | None) -> str:
 
 @of_file
 def remembered_ends(path: str | Path, robot: Robot) -> tuple[str | None, str | None]:
-    """Return the links of a file between which a robot is, by its source as `read_urdf` states it; None twice else."""
+    """Return the links of a file between which a robot is, by its source as from `read_urdf`; otherwise None twice."""
     ends = re.fullmatch(r".*, (.+) to (.+)", robot.source)
     return (ends[1], ends[2]) if ends and set(ends.groups()) <= set(_read(Path(path)).links) else (None, None)
 
