@@ -117,4 +117,4 @@ def test_two_logs_are_read_alike_by_every_command_that_takes_measurements(
     assert found["validate"]["left_out"] == []
     other = logs("other", slice(25, 33), "Nummer")
     assert run(monkeypatch, "validate", cell, *other, "--key", "Nummer") == 0
-    assert "joined by column 'nummer': 8 rows of 8" in capsys.readouterr().out
+    assert "joined by column 'nummer': 8 rows match, of 8" in capsys.readouterr().out

@@ -389,7 +389,7 @@ def _fill(rows: Sequence[list[str]], width: int, options: TableOptions) -> None:
     """Give every row as many cells as the header; blank ones at the end may be missing or too many."""
     what = "the header"
     if options.columns:
-        what = "--columns, which applies to all files (or write a header into those without one)"
+        what = "--columns, the names for every file (or write a header into those without one)"
     for number, row in enumerate(rows, start=1):
         while len(row) > width and not row[-1]:
             row.pop()

@@ -394,7 +394,7 @@ def _standing(result: Calibration) -> str:
     still = [str(i + 1) for i in np.flatnonzero(np.ptp(measured, axis=0) < least)]
     if not still:
         return ""
-    return f"The verdict holds only at the measured values of joint{'s' * (len(still) > 1)} {joined(still)}: not moved."
+    return f"Joint{'s' * (len(still) > 1)} {joined(still)} did not move: the verdict holds only at the measured values."
 
 
 def _held_out(

@@ -45,7 +45,7 @@ def test_a_sweep_that_the_model_lacks_is_kept_and_said() -> None:
     refit = result.without_flagged()
     assert sweep <= set(refit.problem.labels)
     assert not {problem.labels[17], problem.labels[55]} & set(refit.problem.labels)
-    assert any("they are not outliers" in text for text in words.remarks(result, result.verdict))
+    assert any("have errors like their neighbours" in text for text in words.remarks(result, result.verdict))
 
 
 def test_suspects_dealt_out_at_random_are_no_cluster() -> None:

@@ -411,7 +411,7 @@ def test_joints_that_stood_are_named() -> None:
     y = problem.modelled(np.zeros(len(problem.parameters.free)))[0][:, :3]
     noise = 5e-5 * np.random.default_rng(0).normal(size=y.shape)
     still = ro.calibrate(problem.on(ro.Dataset.of(q[:, 0], y + noise, 5e-5)), "tikhonov", 1.0)
-    said = "The verdict holds only at the measured values of joint 1"
+    said = "Joint 1 did not move: the verdict holds only at the measured values"
     assert said in str(ro.calibration.accept(still, ro.data.Requirement(1e-3)))
     assert said not in str(
         ro.calibration.accept(ro.calibrate(instance.problem, "tikhonov", 1.0), ro.data.Requirement(1e-3))

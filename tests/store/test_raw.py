@@ -229,7 +229,7 @@ def test_joints_and_points_need_a_key(monkeypatch, capsys, tmp_path, arm) -> Non
     points.write_text(text([["Point", *HEAD[7:]]], [[f"P{i}", *row] for i, row in enumerate(POINTS)]))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0
     said = capsys.readouterr().out
-    assert f"joined by label: {COUNT - 1} rows of {COUNT} with joints and {COUNT} measured" in said
+    assert f"joined by label: {COUNT - 1} rows match, of {COUNT} with joints and {COUNT} measured" in said
     assert f"without a match, ignored: P{COUNT}, P0." in said
 
 
@@ -240,7 +240,7 @@ def test_joints_of_axes_are_known_and_lost_columns_are_named(monkeypatch, capsys
     for pattern in ("AX{}_ACT [deg]", "AX{} [deg]", "Ax {} [deg]"):
         joints.write_text(text([["Point", *(pattern.format(i) for i in range(1, 7))]], beside(NAMED, JOINTS)))
         assert new(monkeypatch, arm, tmp_path / "cell", [joints, points], "--dry-run") == 0, capsys.readouterr().err
-        assert f"joined by label: {COUNT} rows of {COUNT}" in capsys.readouterr().out
+        assert f"joined by label: {COUNT} rows match, of {COUNT}" in capsys.readouterr().out
     joints.write_text(text([["Point", "Foo", "Bar"]], beside(NAMED, [row[:2] for row in JOINTS])))
     assert new(monkeypatch, arm, tmp_path / "cell", [joints, points]) == 2
     said = capsys.readouterr().err
@@ -411,7 +411,7 @@ def test_files_of_two_clocks_are_joined_by_the_nearest_time(monkeypatch, capsys,
     files = clocked(tmp_path, rate=100.0, apart=0.003)
     assert new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.006") == 0
     said = capsys.readouterr().out
-    assert f"joined by the nearest time: {COUNT} rows of {10 * COUNT} with joints and {COUNT} measured" in said
+    assert f"joined by the nearest time: {COUNT} rows match, of {10 * COUNT} with joints and {COUNT} measured" in said
     assert "times differ by 0.003 s at most, +0.003 s on average" in said
     assert "the robot moved" not in said
     assert "joins the files" in said
@@ -432,7 +432,8 @@ def test_a_robot_that_moves_as_it_is_measured_is_named(monkeypatch, capsys, tmp_
     new(monkeypatch, arm, tmp_path / "cell", files, "--time-tolerance", "0.1", "--dry-run")
     said = capsys.readouterr().out
     assert (
-        f"the robot moved at 30 of {COUNT} joined rows: between measurement and joint values by up to 0.4 deg" in said
+        f"the robot moved by up to 0.4 degrees between measurement and joint values in 30 of {COUNT} joined rows"
+        in said
     )
 
 
@@ -487,7 +488,7 @@ def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, ar
     points.write_text(text([["No", "Point Name", *HEAD[7:]]], other_order))
     for more in ([], ["--key", "Point Name"]):
         assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--dry-run", *more) == 0
-        assert f"joined by Pose = Point Name: {COUNT} rows of {COUNT}" in capsys.readouterr().out
+        assert f"joined by Pose = Point Name: {COUNT} rows match, of {COUNT}" in capsys.readouterr().out
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "row") == 2
     said = capsys.readouterr().err
     assert f"{COUNT - COUNT % 2} of {COUNT} rows whose Pose matches Point Name in another row" in said
@@ -508,7 +509,7 @@ def test_names_that_differ_by_zeros_are_joined_in_the_order_of_time(monkeypatch,
     assert new(monkeypatch, arm, tmp_path / "cell", files, *more) == 0
     said = capsys.readouterr().out
     how = "Punkt = Target" if key else "label"
-    assert f"joined by {how} ('p0' as 'P000'): {COUNT} rows of {COUNT} with joints and {COUNT} measured." in said
+    assert f"joined by {how} ('p0' as 'P000'): {COUNT} rows match, of {COUNT} with joints and {COUNT} measured." in said
     assert "rows are in the order of 'Timestamp'." in said
     data = ro.load(tmp_path / "cell").problem.data
     assert list(data.label) == [f"P{i:03d}" for i in reversed(range(COUNT))]
