@@ -437,6 +437,8 @@ def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -
     gradient, f, among, S = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), np.zeros((q, p, p))
     if not q:
         return gradient, f, among, np.zeros((p, 0))
+    if sum(residual.size for residual in residuals) < p:
+        return _by_noise_of_few(parts, residuals, C)
     for part, residual in zip(parts, residuals, strict=True):
         X = part.X.reshape(-1, p)
         moved = (part.noise @ residual[:, :, None]).reshape(q, -1)
@@ -449,6 +451,28 @@ def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -
     M = C @ S
     among -= M.reshape(q, -1) @ M.transpose(0, 2, 1).reshape(q, -1).T
     return gradient, f, among, np.einsum("aij,ji->ia", M, C)
+
+
+def _by_noise_of_few(
+    parts: Sequence[Whitened], residuals: Sequence[Array], C: Array
+) -> tuple[Array, Array, Array, Array]:
+    """Return the same from W_a = R_a P (m, m): a third of the time where deviations outnumber equations."""
+    q, p = len(parts[0].noise), len(C)
+    X = np.concatenate([part.X.reshape(-1, p) for part in parts])
+    XC = X @ C
+    P = np.eye(len(X)) - XC @ X.T
+    W, moved, C_by_noise, first = np.zeros((q, *P.shape)), np.zeros((q, len(X))), np.zeros((p, q)), 0
+    for part, residual in zip(parts, residuals, strict=True):
+        own = slice(first, first + residual.size)
+        first = own.stop
+        shape = (*part.noise.shape[1:3], -1)
+        W[:, own] = (part.noise @ P[own].reshape(shape)).reshape(q, residual.size, -1)
+        moved[:, own] = (part.noise @ residual[:, :, None]).reshape(q, -1)
+        C_by_noise += np.einsum("ankp,nkp->pa", part.noise @ XC[own].reshape(shape), XC[own].reshape(shape))
+    u = np.concatenate([residual.ravel() for residual in residuals])
+    gradient = np.einsum("amm->a", W) - moved @ u
+    among = 2 * moved @ moved.T - W.reshape(q, -1) @ W.transpose(0, 2, 1).reshape(q, -1).T
+    return gradient, moved @ X, among, C_by_noise
 
 
 # --- linear algebra ---------------------------------------------------------------------------------------------
