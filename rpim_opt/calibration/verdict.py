@@ -240,14 +240,14 @@ def _repeatability(result: Outcome) -> Iterator[str]:
 
 def _deviations(result: Outcome) -> Iterator[str]:
     """Say which machined parameter deviates most, where no robot is machined so."""
+    p = result.problem.parameters
+    types = [(robot, *each) for robot, arm in result.problem.arms.items() for each in enumerate(arm.joint_types, 1)]
+    zeros = {p.called(robot, f"d{joint}") for robot, joint, kind in types if kind == "prismatic"}
     worst = (1.0, "")
-    for name, x in zip(result.problem.parameters.free.names, result.x, strict=True):
+    for name, x in zip(p.free.names, result.x, strict=True):
         kind = own_name(name).rstrip("0123456789")
         joint = own_name(name).removeprefix(kind)
-        if kind not in MACHINED or not joint:
-            continue
-        types = result.problem.arms[name.rpartition(".")[0]].joint_types
-        if kind == "d" and types[int(joint) - 1] == "prismatic":  # the zero of that joint
+        if kind not in MACHINED or not joint or name in zeros:
             continue
         unit, largest = MACHINED[kind]
         sentence = f"{name} deviates by {three_digits(1e3 * x)} {unit}"

@@ -187,3 +187,16 @@ def test_intervals_of_two_arms_hold() -> None:
         far.append(there.errors(result.x).mean())
     assert 0.92 < np.mean(covered) < 0.99
     assert np.mean(far) < 6e-5
+
+
+@pytest.mark.parametrize("shared", [["a?"], ["[!b]*", "beta?"]])
+def test_links_that_two_campaigns_share_are_judged_saved_reported_and_used(shared: list[str], tmp_path: Path) -> None:
+    whole = ro.load("position").problem
+    parts = {name: whole.on(whole.data.take(range(k, k + 20))) for name, k in (("spring", 0), ("autumn", 20))}
+    result = ro.calibrate(ro.together(**parts, shared=shared))
+    assert result.verdict.delivered
+    assert "a1" in str(result)
+    ro.store.save_result(result, tmp_path / "result.json")
+    ro.report.write_report(result, tmp_path / "report.html")
+    ro.use.compensate(ro.load_result(tmp_path / "result.json"), whole.data.q[:3], robot="spring")
+    ro.use.update(result, result.problem.data)
