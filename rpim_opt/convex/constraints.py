@@ -76,13 +76,13 @@ class Ready:
 
 def name_of(function: Any, k: int) -> str:
     """Return the user's name of a constraint function."""
-    if isinstance(function, Box | Parsed):
+    if isinstance(function, Parsed):
         return function.name
     call = getattr(function, "stated", None)
     if call:
         maker, *arguments = call
         return f"{maker}({', '.join(repr(a) for a in arguments)})"
-    name = getattr(function, "__name__", "<lambda>")
+    name = function.name if isinstance(function, Box) else getattr(function, "__name__", "<lambda>")
     return f"constraint {k + 1}" if name == "<lambda>" else name
 
 

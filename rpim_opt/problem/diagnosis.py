@@ -480,7 +480,9 @@ def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
         columns = {name: i for i, (name, of) in enumerate(block.measurement.columns.items()) if of == "length"}
         if len(block.y) < FEWEST or not columns:  # lengths of a drawing are round
             continue
-        units = np.array([_unit(1e3 * block.y[:, i]) for i in columns.values()])
+        values = [1e3 * block.y[:, i] for i in columns.values()]
+        gaps = [np.diff(np.unique(each)).min(initial=np.inf) for each in values]
+        units = np.array([_unit(each, gap, min(gaps)) for each, gap in zip(values, gaps, strict=True)])
         each = np.sqrt(np.mean(units**2, axis=1) / 12)
         made = float(np.linalg.norm(each))
         coarse = [name for name, part in zip(columns, each, strict=True) if 10 * part > made]
@@ -498,11 +500,11 @@ def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
         yield Rounding(what, made, "export them with more decimals", step=step if steps.all() else "")
 
 
-def _unit(values: Array) -> Array:
-    """Return to what values (N,) [mm] are rounded: a grid of any step, or their last of 3 or 4 digits; zeros if not."""
+def _unit(values: Array, *steps: float) -> Array:
+    """Return to what values (N,) [mm] are rounded: a grid of such a step, or 3 or 4 digits; zeros if to none."""
     exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
-    gap = np.diff(np.unique(values)).min(initial=np.inf)
-    for unit in (np.full(values.shape, gap), 10.0 ** (exponents - 2), 10.0 ** (exponents - 3)):
+    grids = [np.full(values.shape, step) for step in steps]
+    for unit in (*grids, 10.0 ** (exponents - 2), 10.0 ** (exponents - 3)):
         if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < ON_GRID:
             return unit
     return np.zeros(values.shape)

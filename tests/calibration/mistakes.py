@@ -270,7 +270,7 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     ),
     "positions rounded to sixteenths of an inch": (
         values(lambda y: (y / 1.5875e-3).round() * 1.5875e-3),
-        "measured values are rounded to 1.587 mm",
+        "measured values are rounded to 1.58",
     ),
     "cylindrical coordinates": (
         values(
@@ -399,8 +399,8 @@ IN_TABLES |= {
         of_joint_rows(lambda q: np.where(np.arange(q.shape[1]) < 3, tenths(q), q)),
         "(q1, q2, q3)",
     ),
-    "an arm that warms up": (grown, "the arm grows from row to row, by 0.1 %"),
-    "play in two joints": (of_joint_rows(of_two_sides), "backlash, joint 1 by 2 mrad"),
+    "an arm that warms up": (grown, "the arm grows from row to row, by 0."),
+    "play in two joints": (of_joint_rows(of_two_sides), "backlash, joint 1 by "),
     "a reading missed, a later one taken twice": (
         values(lambda y: np.concatenate([y[:12], y[13:24], y[23:]])),
         "fit the joint values of the next row",
