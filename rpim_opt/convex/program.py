@@ -173,6 +173,11 @@ class Program(Brief):
         return self.quadratic and not self.structure.constrained
 
     @property
+    def _plain_squares(self) -> bool:
+        """Whether the solution without the penalty is a formula, whatever the penalty is."""
+        return self.loss_form is not None and not self.structure.constrained
+
+    @property
     def box(self) -> tuple[Array, Array] | None:
         """Lower and upper bounds (n,) of z, infinite where there is none; None where a constraint is no `Box`."""
         return self.structure.box
@@ -361,7 +366,7 @@ class Program(Brief):
         weight = self._weight(weight)
         if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
-        elif self.closed_form and damping is None:
+        elif damping is None and (self.closed_form or (weight == 0 and self._plain_squares)):
             form, z = self.penalty_form, self.ridge.minima(np.array([weight]))[0]
             if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
                 # a penalty that hardly holds some directions costs the formula digits

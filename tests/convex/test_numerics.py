@@ -193,3 +193,10 @@ def test_small_weights_on_a_singular_problem_are_solved_to_the_last_digits(loss,
         known = found.objective + found.gained
     assert estimate.objective <= known * (1 + 1e-7)
     assert program.violation(estimate.z) <= 1e-7
+
+
+def test_weight_zero_is_least_squares_whatever_the_penalty() -> None:
+    problem = ro.load("rank_deficient").problem
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    least, lasso = (ro.convex.pose(each, model).solve(0.0) for each in (ro.least_squares, ro.lasso))
+    assert lasso.loss == pytest.approx(least.loss, rel=1e-9)
