@@ -364,30 +364,48 @@ def likely_causes(result: Outcome) -> list[str]:
     if signs or not result.converged:
         causes = _held_base(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
+        shared += together
     elif (other := _other_robot(result, problem)) is not None:
         causes = [other.sentence]
+        shared += together
     else:
-        causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
-        if not causes and together:
-            causes = list(diagnosis.part_way(ordered))
-            together = [] if causes else together
-        if causes:
-            causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
-        if not causes and len(problem.arms) == 1:
-            limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
-            shared += [f"{BAD}: residuals; {text}" for text in limits]
-            alone, x = _without_outliers(result, ordered)
-            causes = list(diagnosis.shown_by_residuals(alone, x)) if noticed and not limits else []
-            if not causes and not limits:
-                error = rms(problem.errors(result.x)[kept])
-                slight = diagnosis.roundings(problem, error, (1 - SLIGHT) ** -0.5)
-                shared += [f"{SLIGHTLY}: {text}" for text in first(slight, diagnosis.slight_effects(alone, x))]
-    shared += together
+        causes, remarks = _beside_a_good_fit(result, problem, ordered, together, noticed)
+        shared += remarks
     if noticed:
         causes += _upward(result, problem)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []
+
+
+def _beside_a_good_fit(
+    result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem, together: list[str], noticed: bool
+) -> tuple[list[str], list[str]]:
+    """Return likely causes of what single rows or residuals show, and remarks: limits of the fit, slight effects.
+
+    ``together`` are sentences on rows that were left out next to each other, ``noticed`` is whether residuals are
+    beyond the noise.
+    """
+    kept = kept_rows(result)
+    causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
+    if not causes and together:
+        causes = list(diagnosis.part_way(ordered))
+        together = [] if causes else together
+    if causes:
+        causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
+        return causes, together
+    if len(problem.arms) > 1:
+        return [], together
+    limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
+    if limits:
+        return [], [*(f"{BAD}: residuals; {text}" for text in limits), *together]
+    alone, x = _without_outliers(result, ordered)
+    causes = list(diagnosis.shown_by_residuals(alone, x)) if noticed else []
+    if causes:
+        return causes, together
+    slight = diagnosis.roundings(problem, rms(problem.errors(result.x)[kept]), (1 - SLIGHT) ** -0.5)
+    effects = first(slight, diagnosis.slight_effects(alone, x))
+    return [], [*(f"{SLIGHTLY}: {text}" for text in effects), *together]
 
 
 def _large_residuals(result: Outcome, residuals: Mapping[str, tuple[float, float]]) -> Iterator[str]:
