@@ -399,7 +399,7 @@ def _beside_a_good_fit(
     limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
     if limits:
         return [], [*(f"{BAD}: residuals; {text}" for text in limits), *together]
-    alone, x = _without_outliers(result, ordered)
+    alone, x = _without_outliers(result, ordered, again=noticed)
     causes = list(diagnosis.shown_by_residuals(alone, x)) if noticed else []
     if causes:
         return causes, together
@@ -548,13 +548,18 @@ def _in_table_order(result: Outcome, problem: CalibrationProblem) -> Calibration
     return problem.on(Dataset.together(list(there.values()), list(there)).take(order))
 
 
-def _without_outliers(result: Outcome, ordered: CalibrationProblem) -> tuple[CalibrationProblem, Array]:
-    """Return the rows without outliers, others with no larger errors, and the deviations (n,) [SI] that fit them."""
+def _without_outliers(
+    result: Outcome, ordered: CalibrationProblem, again: bool = True
+) -> tuple[CalibrationProblem, Array]:
+    """Return the rows without outliers, others with no larger errors, and the deviations (n,) [SI] that fit them.
+
+    Not ``again``: the result's own, where outliers are too small to matter.
+    """
     kept = set(result.problem.labels) - {flag.label for flag in result.single}
     errors, own = ordered.errors(result.x), np.isin(ordered.labels, list(kept))
     largest = np.nan_to_num(errors[own]).max()
     alone = ordered.on(ordered.data.take(np.flatnonzero(own | (errors <= largest))))
-    return alone, ridge_deviations(alone) if result.single and result.squared_loss else result.x
+    return alone, ridge_deviations(alone) if again and result.single and result.squared_loss else result.x
 
 
 def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Iterator[str]:

@@ -30,9 +30,9 @@ class Formulation(Brief):
 
         minimize    loss(A z - b) + weight * penalty(z)     subject to    constraints(z)
 
-    The functions may hold variables and parameters of their own, and read whatever they like: every calibration calls
-    them anew, once for its iterations and once for its certificate, in every round where constraints use positions, and
-    in every iteration for some thousand rows at a time of data in blocks.
+    The functions may hold variables and parameters of their own, and read whatever they like: a calibration calls them
+    twice, for its iterations and for its certificate; twice a round where constraints use positions. Of data in blocks
+    the loss is called in every linearization, for some thousand rows at a time, and not for the certificate.
 
     Parameters
     ----------

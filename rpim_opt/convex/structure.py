@@ -1,9 +1,9 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
 What is canonicalized lives as long as its `Structure`: programs keep theirs, and `MOST_KEPT` are kept for the next
-ones, then all are forgotten. Functions of a user are called for every program; where they return what they returned
-before, the structure of that serves again. Warm starts and Clarabel's solvers live as long as the programs that
-`Program.on` makes of one another.
+ones, then all are forgotten. A user's functions are called whenever a program is posed (`pose`), never by `Program.on`;
+where they return what they returned before, the structure of that serves again. Warm starts and Clarabel's solvers live
+as long as the programs that `Program.on` makes of one another.
 """
 
 from __future__ import annotations

@@ -441,12 +441,17 @@ class Rounding(NamedTuple):
 
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit, or what it excludes."""
-    yield from first(roundings(problem, error, ALIKE[1]), _commanded(problem, error))
+    every = list(_roundings(problem))
+    yield from first(_alike(every, error, ALIKE[1]), _commanded(every, error))
 
 
 def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
     """Report rounding of joint or measured values, if the RMS error [m] of a fit is less than so many times its own."""
-    for each in _roundings(problem):
+    yield from _alike(_roundings(problem), error, most)
+
+
+def _alike(every: Iterable[Rounding], error: float, most: float) -> Iterator[str]:
+    for each in every:
         if each.least * each.made < error < most * each.made:
             yield (
                 f"{each.what}: that alone contributes {three_digits(1e3 * each.made)} mm, the residual RMS is "
@@ -454,9 +459,9 @@ def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterato
             )
 
 
-def _commanded(problem: CalibrationProblem, error: float) -> Iterator[str]:
+def _commanded(every: Iterable[Rounding], error: float) -> Iterator[str]:
     """Report joint values that are all multiples of a step to which they are not rounded, as errors are smaller."""
-    steps = [each for each in _roundings(problem) if each.step and each.made > ALIKE[1] * error]
+    steps = [each for each in every if each.step and each.made > ALIKE[1] * error]
     for each in steps[-1:]:
         yield (
             f"joint values are multiples of {each.step}, but errors of {three_digits(1e3 * error)} mm are smaller than "

@@ -78,7 +78,10 @@ def identified(result: Calibration, marker: str | None = None) -> RobotSetup:
         joint_map[i] *= 1 + of.pop(f"ratio{i + 1}")
     extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
     if extras:
-        accepted = "MDH parameters, base and tool: files support nothing else; use `compensate` for other parameters"
+        accepted = (
+            "MDH parameters, base and tool: files support nothing else. `export_files` fits the geometry without model "
+            "extensions, `compensate` uses all parameters"
+        )
         raise InputError("the calibration", listed(extras, 6), accepted)
     prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
     if prefix + "x" not in of:

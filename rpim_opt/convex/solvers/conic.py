@@ -188,12 +188,12 @@ class Canonical:
     def missed(self, x: Array) -> float:
         """Return the violation of equations, inequalities and second-order cones at x (N,), as they were stated."""
         slack = np.divide(self.b - self.A @ x, self.row_scale, out=np.zeros(len(self.b)), where=self.row_scale > 0)
-        worst = [0.0, *np.abs(slack[: self.zero]), *-slack[self.zero : self.linear]]
+        worst = [np.abs(slack[: self.zero]).max(initial=0.0), -slack[self.zero : self.linear].min(initial=0.0)]
         begin = self.linear
         for count in self.cone_sizes[: self.second_order]:
-            worst.append(float(np.linalg.norm(slack[begin + 1 : begin + count]) - slack[begin]))
+            worst.append(np.linalg.norm(slack[begin + 1 : begin + count]) - slack[begin])
             begin += count
-        return max(worst)
+        return float(max(worst))
 
     def duals(self, x: Array, z: Array) -> dict[int, Array]:
         """Return the multipliers of the stated constraints by their id, from those of all rows (m,)."""

@@ -69,16 +69,19 @@ class WarmStart:
 
 
 def minimum(rows: Rows, warm: WarmStart, weight: float, damping: Damping | None = None, accuracy: float = 0.0) -> Point:
-    """Return the minimum of a convex program; the structure of the loss selects the solver.
+    """Return the minimum of a convex program; the structure of the loss selects the method.
 
     ============================ ===================================================
     quadratic                    the small program of its QR factor
-    separable, few entries       all rows as they are, where that is quicker
+    separable, few entries       all rows in Clarabel, where that is quicker
     separable, smooth            proximal Newton, a sequence of small programs
     separable, non-smooth        the same on the smoothed loss, then rows where it bends
     with a threshold             entries near a kink as they are, tangents of others
-    any other                    all rows
+    any other                    all rows in Clarabel
     ============================ ===================================================
+
+    Penalty and constraints select what solves a small program of n + 1 rows: an active set where they are linear or
+    quadratic, else Clarabel. Entries are equations, or configurations where the loss gets their norms.
 
     ``accuracy`` is the part of the loss that a sum over rows may be above its minimum. Unsolved where no minimum is
     found, also by a small program of proximal Newton: then CVXPY solves all rows (`Program.solve`).
