@@ -380,7 +380,7 @@ class Loop:
 
     def _solved(self, program: Program, state: State, accuracy: float = 0.0) -> Array:
         o = self.options
-        damping = Damping(state.z, np.sqrt(state.damping) * state.size) if state.damping else None
+        damping = Damping(state.z, np.diag(np.sqrt(state.damping) * state.size)) if state.damping else None
         how = {"solver": o.solver, "settings": o.settings, "verbose": o.verbose}
         return program.solve(state.choice.weight, damping=damping, accuracy=accuracy, **how).z
 

@@ -30,6 +30,8 @@ ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
+PROXIMAL_STEPS, PROXIMAL = 10, 1e-9
+"""Most steps of the proximal point method, and the part of the loss that its term is in the last one."""
 STATUS = {
     "PrimalInfeasible": "infeasible",
     "AlmostPrimalInfeasible": "infeasible_inaccurate",
@@ -130,10 +132,14 @@ class Program(Brief):
 
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""
-        if self._warm.squares is None:
-            self._warm.squares = WarmStart(self.structure.on_squares())
-        warm = self._warm.squares
-        return Program(warm.structure.formulation, model, warm.structure, warm)
+        return self._on(self.structure.on_squares, model)
+
+    def _on(self, changed: Callable[[], Structure], model: LinearModel | None = None) -> Program:
+        """Return the program of a part of the formulation, with warm starts of its own."""
+        if changed.__name__ not in self._warm.parts:
+            self._warm.parts[changed.__name__] = WarmStart(changed())
+        warm = self._warm.parts[changed.__name__]
+        return Program(warm.structure.formulation, model or self.model, warm.structure, warm)
 
     def beginning(self, z: Array) -> Program:
         """Return the same program with z (n,) as the start of its next solution."""
@@ -171,11 +177,6 @@ class Program(Brief):
     def closed_form(self) -> bool:
         """Whether every solution on the path is a formula in the singular values (Tikhonov, least squares)."""
         return self.quadratic and not self.structure.constrained
-
-    @property
-    def _plain_squares(self) -> bool:
-        """Whether the solution without the penalty is a formula, whatever the penalty is."""
-        return self.loss_form is not None and not self.structure.constrained
 
     @property
     def box(self) -> tuple[Array, Array] | None:
@@ -335,7 +336,7 @@ class Program(Brief):
                 price = above
             total = total + weight * price
         if damping is not None:
-            total = total + cp.sum_squares(cp.multiply(damping.size, z - damping.centre))
+            total = total + cp.sum_squares(damping.F @ (z - damping.centre))
         return cp.Problem(cp.Minimize(total), every), z, groups
 
     @one_blas_thread
@@ -351,8 +352,8 @@ class Program(Brief):
     ) -> Estimate:
         """Return the solution at a weight.
 
-        Weight zero is the limit of small weights: directions that the data do not see stay nominal. With another loss
-        than a squared one they may go anywhere: give it a penalty with a weight, or constraints.
+        At weight zero there is no penalty, and directions that the data do not identify stay nominal but where
+        constraints move them.
 
         ``damping`` is a term that keeps the solution near a point. With a ``solver`` of CVXPY, its ``settings`` or
         ``verbose``, `problem` is solved by it, whatever the structure. ``accuracy`` is the part of a loss that is a sum
@@ -366,7 +367,10 @@ class Program(Brief):
         weight = self._weight(weight)
         if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
-        elif damping is None and (self.closed_form or (weight == 0 and self._plain_squares)):
+        elif weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
+            alone = self._on(self.structure.without_penalty).solve(damping=damping, accuracy=accuracy)
+            estimate = replace(alone, penalty=self.value(alone.z, 0.0)[1])
+        elif damping is None and self.closed_form:
             form, z = self.penalty_form, self.ridge.minima(np.array([weight]))[0]
             if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
                 # a penalty that hardly holds some directions costs the formula digits
@@ -374,6 +378,8 @@ class Program(Brief):
                 b = np.concatenate([self.squared.triangle[:, -1], np.sqrt(weight) * form.c])
                 z = z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
             estimate = self._at(z, weight)
+        elif weight == 0 and damping is None and not self.model.svd[1].all():
+            estimate = self._unseen_nominal(accuracy)
         else:
             estimate = self._by_structure(weight, damping, accuracy)
         return replace(estimate, seconds=time.perf_counter() - begin)
@@ -457,10 +463,23 @@ class Program(Brief):
         if self.structure.joint and loss is not None and optimum.rest is not None:  # own variables as they are there
             values = loss.canonical.value(optimum.rest) + self.model.offset, penalty.value(optimum.x)
             self._values[z.tobytes(), weight] = values
-        if weight == 0 and damping is None and not self.structure.constrained:  # what the data do not see stays nominal
-            _, s, V = self.model.svd
-            z = z - V[s == 0].T @ (V[s == 0] @ z)
         return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
+
+    def _unseen_nominal(self, accuracy: float) -> Estimate:
+        """Return the minimum at weight zero by the proximal point method, from nominal values on.
+
+        z <- argmin loss(A z - b) + |F (z - last z)|^2 subject to constraints(z); F (k, n) are the directions that the
+        data do not identify (Rockafellar, SIAM J. Control Optim. 14(5), 1976).
+        """
+        _, s, V = self.model.svd
+        z, F = np.zeros(len(s)), V[s == 0]
+        for _ in range(PROXIMAL_STEPS):
+            term = Damping(z, F)
+            estimate = self._by_structure(0.0, term, accuracy)
+            z = estimate.z
+            if term.value(z) <= PROXIMAL * max(abs(estimate.loss), 1.0):
+                break
+        return estimate
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""

@@ -190,17 +190,33 @@ class Structure:
 
     def on_squares(self) -> Structure:
         """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
-        made = copy.copy(self)
-        for name in ("loss_form", "loss", "joint", "inner", "_over_own"):
-            vars(made).pop(name, None)
-        if self._called is not None:  # the functions of penalty and constraints are not called again
-            own = made._called = copy.copy(self._called)
+        made = self._changed("loss_form", "loss")
+        if made._called is not None:
+            own = made._called
             own.r = cp.Variable(self.n + 1, name="r")
             own.loss = Term(cp.sum_squares(own.r), own.r)
             own.stated = (own.loss.expression, *own.stated[1:])
             own.live = (own.loss.expression, *own.live[1:])
         made.formulation = replace(self.formulation, loss=SQUARES, loss_over="equation")
         made.equations = self.n + 1
+        return made
+
+    def without_penalty(self) -> Structure:
+        """Return the same loss and constraints without the penalty."""
+        made = self._changed("penalty_form", "canonical")
+        if made._called is not None:
+            own = made._called
+            own.penalty = own.penalty_of_z = None
+            own.stated, own.live = ((loss, None, groups) for loss, _, groups in (own.stated, own.live))
+        made.formulation = replace(self.formulation, penalty=None)
+        return made
+
+    def _changed(self, *properties: str) -> Structure:
+        """Return a copy for another formulation, whose functions that stay are not called again."""
+        made = copy.copy(self)
+        for name in (*properties, "joint", "inner", "_over_own"):
+            vars(made).pop(name, None)
+        made._called = copy.copy(self._called)
         return made
 
     @property

@@ -227,7 +227,7 @@ def test_damping_is_a_term_of_the_objective(loss: str) -> None:
     mine = ro.Formulation("mine", penalty=cp.norm1, **LOSSES[loss])
     damped = ro.Formulation("d", penalty=lambda z: cp.norm1(z) + cp.sum_squares(cp.multiply(size, z - centre)),
                             **LOSSES[loss])  # fmt: skip
-    ours = ro.convex.pose(mine, model).solve(1.0, damping=Damping(centre, size)).z
+    ours = ro.convex.pose(mine, model).solve(1.0, damping=Damping(centre, np.diag(size))).z
     best = ro.convex.pose(damped, model).solve(1.0)
     assert ro.convex.pose(damped, model).objective(ours, 1.0) == pytest.approx(best.objective, rel=1e-7)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cvxpy as cp
 import numpy as np
 import pytest
@@ -195,8 +197,52 @@ def test_small_weights_on_a_singular_problem_are_solved_to_the_last_digits(loss,
     assert program.violation(estimate.z) <= 1e-7
 
 
-def test_weight_zero_is_least_squares_whatever_the_penalty() -> None:
+LOSSES_ALONE: dict[str, dict[str, Any]] = {
+    "squares": {"loss": cp.sum_squares},
+    "Huber": {"loss": lambda r: cp.sum(cp.huber(r, 1.35))},
+    "sum of norms": {"loss": cp.sum, "loss_over": "configuration"},
+    "L1": {"loss": cp.norm1},
+    "minimax": {"loss": cp.norm_inf},
+}
+
+
+@pytest.mark.parametrize("loss", LOSSES_ALONE)
+@pytest.mark.parametrize("constraint", [(), (ro.in_ball(1.5, "*"),)], ids=["none", "ball"])
+def test_weight_zero_is_the_minimum_without_a_penalty_on_a_singular_problem(loss: str, constraint: Any) -> None:
+    """A penalty that costs nothing bounds nothing: its variables drift, and unidentified directions with them."""
     problem = ro.load("rank_deficient").problem
     model = problem.linearize(np.zeros(len(problem.parameters.free)))
-    least, lasso = (ro.convex.pose(each, model).solve(0.0) for each in (ro.least_squares, ro.lasso))
-    assert lasso.loss == pytest.approx(least.loss, rel=1e-9)
+    _, s, V = model.svd
+    y = cp.Variable(model.A.shape[1])  # z = V y of the identified directions alone, where there are no constraints
+    z, held = V.T @ y, [] if constraint else [y[s == 0] == 0]
+    seen: Any = model.A @ z - model.b
+    if "loss_over" in LOSSES_ALONE[loss]:
+        seen = cp.hstack([cp.norm(seen[np.flatnonzero(model.group == k)]) for k in np.unique(model.group)])
+    objective = LOSSES_ALONE[loss]["loss"](seen)
+    least = cp.Problem(cp.Minimize(objective), [*held, *([cp.norm(z) <= 1.5] if constraint else [])])
+    value = least.solve(solver="CLARABEL")
+    formulation = ro.Formulation("free", penalty=cp.norm1, constraints=constraint, **LOSSES_ALONE[loss])
+    program = ro.convex.pose(formulation, model)
+    estimate = program.solve(0.0)
+    assert estimate.objective <= value * (1 + 1e-6)  # CVXPY's point may lie 1e-8 outside a ball that costs 1e5
+    assert program.violation(estimate.z) <= 1e-7
+    assert np.isfinite(estimate.penalty)
+    if not constraint:
+        assert np.abs(V[s == 0] @ estimate.z).max() <= 1e-6
+
+
+@pytest.mark.parametrize("loss", ["squares", "Huber", "L1"])
+def test_at_weight_zero_constraints_move_what_the_data_do_not_identify(loss: str) -> None:
+    problem = ro.load("rank_deficient").problem
+    model = problem.linearize(np.zeros(len(problem.parameters.free)))
+    _, s, V = model.svd
+    relation = V[s == 0][0] + V[len(s[s > 1]) - 1]  # an unidentified direction and the weakest identified one
+
+    def stated(z: Any, _: Any) -> Any:
+        return relation @ z == 5.0
+
+    free = ro.Formulation("free", **LOSSES_ALONE[loss])
+    bound = ro.Formulation("bound", constraints=(stated,), **LOSSES_ALONE[loss])
+    least, estimate = (ro.convex.pose(each, model).solve(0.0) for each in (free, bound))
+    assert estimate.objective <= least.objective * (1 + 1e-6)  # the unidentified one meets it, at no cost
+    assert relation @ estimate.z == pytest.approx(5.0, abs=1e-6)

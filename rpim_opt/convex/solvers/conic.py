@@ -310,19 +310,19 @@ class Unsolved(RuntimeError):
 
 
 class Damping(NamedTuple):
-    """|size (z - centre)|^2, added to the objective: the term of Levenberg and Marquardt. Both (n,)."""
+    """|F (z - centre)|^2, added to the objective: the term of Levenberg and Marquardt. F (k, n), centre (n,)."""
 
     centre: Array
-    size: Array
+    F: Array
 
     def value(self, z: Array) -> float:
         """Return the term at z (n,)."""
-        return float(np.sum((self.size * (z - self.centre)) ** 2))
+        return float(np.sum((self.F @ (z - self.centre)) ** 2))
 
     def along(self, z: Array, d: Array) -> tuple[float, float]:
         """Return first and second derivative of the term at z (n,) along a step d (n,)."""
-        slope = self.size**2 * d
-        return float(2 * slope @ (z - self.centre)), float(2 * slope @ d)
+        step = self.F @ d
+        return float(2 * step @ (self.F @ (z - self.centre))), float(2 * step @ step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -342,7 +342,7 @@ class ReducedSquares:
         """Return the squares with damping added."""
         if damping is None:
             return self
-        rows = np.column_stack([np.diag(damping.size), damping.size * damping.centre])
+        rows = np.column_stack([damping.F, damping.F @ damping.centre])
         T: Any = np.linalg.qr(np.vstack([np.column_stack([self.R, self.y]), rows]), mode="r")
         missing = np.zeros((T.shape[1] - len(T), T.shape[1]))
         return replace(ReducedSquares.of_factor(np.vstack([T, missing])), g=self.g)
@@ -680,7 +680,7 @@ def on_working_set(
             for _ in range(3):
                 x = x - Z @ (V.T @ (V @ slope / values**2))
                 slope = Z.T @ gradient(x)
-            rounding = 1e-14 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
+            rounding = 1e-9 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
             pull = 2 * squares.R.T @ squares.y - squares.g
             allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-14 * np.abs(pull).max(initial=0.0), rounding)
             if not np.abs(slope - V.T @ (V @ slope)).max(initial=0.0) <= allowed:

@@ -45,7 +45,7 @@ class WarmStart:
     part: tuple[np.ndarray, ReducedProgram] | None = None
     small: dict[Any, ReducedProgram] = field(default_factory=dict)
     kink: float = -1.0
-    squares: WarmStart | None = None
+    parts: dict[str, WarmStart] = field(default_factory=dict)
     lock: Any = field(default_factory=threading.RLock)
 
     @property
