@@ -195,7 +195,8 @@ class State:
     """State of the loop: the program linearized at z (n,) [scales], the weight, and the nonlinear objective.
 
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2; ``idle``
-    counts iterations in a row that promised nothing. ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``), and
+    counts iterations in a row that promised nothing, and ``rejected`` says whether the full step from z was one that
+    raised the objective. ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``), and
     ``floor`` is what vanishing objectives are compared with.
     """
 
@@ -209,6 +210,7 @@ class State:
     history: tuple[Iteration, ...] = ()
     evaluations: int = 1
     idle: int = 0
+    rejected: bool = False
     outcome: str = ""
 
     def weighted(self, choice: WeightChoice) -> State:
@@ -334,7 +336,8 @@ class Loop:
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, promised <= accuracy
         if state.damping > 0 and (short or nothing):
-            return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
+            # a short step of a damped program says nothing: ask for the full one, unless that has failed here
+            return _rested(state) if state.rejected else replace(state, damping=0.0)
         state = replace(state, idle=state.idle + 1 if nothing else 0)
         if choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED):
             return replace(state, outcome="rest")
@@ -369,11 +372,9 @@ class Loop:
         state = replace(state, evaluations=state.evaluations + 1)
         if after <= state.merit + rounding:
             return replace(self._accepted(state, candidate, z, after, short), damping=damping)
-        state = replace(state, damping=damping)
-        if short or nothing:  # the loop is at rest
-            if state.choice.settled:
-                return replace(state, outcome="rest")
-            return replace(state, choice=state.choice.after(0.0))
+        state = replace(state, damping=damping, rejected=state.rejected or state.damping == 0)
+        if short or nothing:
+            return _rested(state)
         if damping > DAMPING_MOST or not np.isfinite(damping):
             return replace(state, outcome="stuck")
         return state
@@ -423,6 +424,7 @@ class Loop:
             merit=after,
             history=(*state.history, passed),
             size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
+            rejected=False,
             outcome="rest" if state.choice.settled and short else "",
         )
         return replace(there, choice=state.choice.after(there.relative(length)))
@@ -504,6 +506,13 @@ def _certified(loop: Loop, problem: Source, state: State) -> Ended:
         model = around(anew.linearize(loop.scale * state.z), *loop.about)
     certificate = certified(loop.solved, model, state.z, state.choice.weight, state.floor, residual, state.program)
     return Ended(state, loop.scale * state.z, certificate)
+
+
+def _rested(state: State) -> State:
+    """Return the state where no step lowers the objective: the end, or a choice of the weight."""
+    if state.choice.settled:
+        return replace(state, outcome="rest")
+    return replace(state, choice=state.choice.after(0.0), rejected=False)
 
 
 def damped(damping: float, gain: float, promised: float, effect: float) -> float:

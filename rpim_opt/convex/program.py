@@ -30,8 +30,8 @@ ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
-PROXIMAL_STEPS, PROXIMAL = 10, 1e-9
-"""Most steps of the proximal point method, and the part of the loss that its term is in the last one."""
+PROXIMAL = 1e-2, 1e-4, 1e-6
+"""Sizes of the proximal term after the first."""
 STATUS = {
     "PrimalInfeasible": "infeasible",
     "AlmostPrimalInfeasible": "infeasible_inaccurate",
@@ -379,7 +379,7 @@ class Program(Brief):
                 z = z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
             estimate = self._at(z, weight)
         elif weight == 0 and damping is None and not self.model.svd[1].all():
-            estimate = self._unseen_nominal(accuracy)
+            estimate = self._unidentified(accuracy)
         else:
             estimate = self._by_structure(weight, damping, accuracy)
         return replace(estimate, seconds=time.perf_counter() - begin)
@@ -465,21 +465,23 @@ class Program(Brief):
             self._values[z.tobytes(), weight] = values
         return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
 
-    def _unseen_nominal(self, accuracy: float) -> Estimate:
-        """Return the minimum at weight zero by the proximal point method, from nominal values on.
+    def _unidentified(self, accuracy: float) -> Estimate:
+        """Return the minimum at weight zero where the data do not identify all, by the proximal point method.
 
-        z <- argmin loss(A z - b) + |F (z - last z)|^2 subject to constraints(z); F (k, n) are the directions that the
-        data do not identify (Rockafellar, SIAM J. Control Optim. 14(5), 1976).
+        z <- argmin loss(A z - b) + |F (z - last z)|^2 subject to constraints(z) from z = 0 on, with F'F ever smaller
+        parts of the projection on what is not identified (Rockafellar, SIAM J. Control Optim. 14(5), 1976).
         """
         _, s, V = self.model.svd
-        z, F = np.zeros(len(s)), V[s == 0]
-        for _ in range(PROXIMAL_STEPS):
-            term = Damping(z, F)
-            estimate = self._by_structure(0.0, term, accuracy)
-            z = estimate.z
-            if term.value(z) <= PROXIMAL * max(abs(estimate.loss), 1.0):
+        best = self._by_structure(0.0, Damping(np.zeros(len(s)), V[s == 0]), accuracy)
+        for part in PROXIMAL if self.structure.constrained else ():  # else the term is zero there
+            try:
+                found = self._by_structure(0.0, Damping(best.z, part * V[s == 0]), accuracy)
+            except NoSolutionFound:
                 break
-        return estimate
+            if found.loss >= best.loss or self.violation(found.z) > feasibility_tolerance(best.z):
+                break
+            best = found
+        return best
 
     def _duals(self, found: Point) -> tuple[Array, ...]:
         """Return the multipliers by constraint function."""
