@@ -537,18 +537,19 @@ def export(
     urdf_tip: UrdfTip = None,
     tip_measured: Annotated[bool, Option("--tip-measured", help=TIP)] = False,
     marker: Marker = None,
+    robot: Annotated[str, Option(help="Robot to export, of several in one calibration.")] = "",
     despite_verdict: Despite = False,
 ) -> Answer:
     """Export the identified robot to files of other tools; all requested files are written, or none.
 
     Exit code 1 if the robot is not delivered, or rejected by its acceptance test, and nothing is written; 4 if that is
-    inconclusive, which files and output say.
+    inconclusive, or its limit is met by the whole model alone, not by the geometry of files, which they say.
     """
     with _loaded(result) as (loaded, _):
         exported = ro.use.export_files(
             loaded, out, urdf=urdf, ur_kinematics=ur_kinematics, ur_calibration=ur_calibration, camera_info=camera_info,
             mdh=mdh, dh=dh, robodk=robodk, corrections=corrections, root=urdf_base, tip=urdf_tip,
-            tip_measured=tip_measured, marker=marker, despite_verdict=despite_verdict,
+            tip_measured=tip_measured, marker=marker, robot=robot, despite_verdict=despite_verdict,
         )  # fmt: skip
     code = CODES["inconclusive" if exported.inconclusive else "accepted"]
     return Answer("\n".join(exported.notes), {"notes": exported.notes}, code, exported.files)

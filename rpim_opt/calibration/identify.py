@@ -149,7 +149,7 @@ def calibrate(
             prior = (prior or Prior()) & _wide_zeros(mapping)
         if (elsewhere := relocated(problem)) is not None:
             notes, problem = _displaced_frames(problem, elsewhere), elsewhere
-    again: Callable[[Source], Calibration] = partial(
+    again: Callable[..., Calibration] = partial(
         calibrate,
         formulation=formulation,
         weight=weight,
@@ -283,12 +283,12 @@ def _contradicted(prior: Prior, problem: Source, x: Array) -> list[str]:
 
 
 def mapped_as(
-    mapping: JointMapping | None, again: Callable[[Source], Calibration], notes: Sequence[str] = ()
-) -> Callable[[Source], Calibration]:
+    mapping: JointMapping | None, again: Callable[..., Calibration], notes: Sequence[str] = ()
+) -> Callable[..., Calibration]:
     """Return a calibration of problems with estimated joint mappings or registered frames, with notes on them."""
 
-    def mapped(problem: Source) -> Calibration:
-        result = again(problem)
+    def mapped(problem: Source, **other: Any) -> Calibration:
+        result = again(problem, **other)
         return replace(result, mapping=mapping, message=" ".join([result.message, *notes]))
 
     return mapped if mapping or notes else again

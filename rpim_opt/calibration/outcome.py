@@ -98,7 +98,7 @@ class Outcome:
     history: tuple[Iteration, ...]
     program: Program
     certificate: Certificate
-    calibrate_again: Callable[[Source], Self]
+    calibrate_again: Callable[..., Self]
     record: Record = field(default_factory=Record)
     learned: Learned | None = None
     mapping: JointMapping | None = None

@@ -43,7 +43,7 @@ class Calibration(Outcome):
     certificate
         Evidence that this is a solution, computed anew from the functions that define it.
     calibrate_again
-        `calibrate` with all its arguments but the problem.
+        `calibrate` with all its arguments but the problem; others may be given in their place.
     record
         Origin of the data, for files and reports.
     learned

@@ -326,10 +326,10 @@ def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
 
 
 def tool_uncertainty(
-    result: Calibration, q: Array, tool: Sequence[float] | Array | None = None, marker: str = ""
+    result: Calibration, q: Array, tool: Sequence[float] | Array | None = None, marker: str = "", robot: str = ""
 ) -> tuple[Array, Array]:
     """Return ``std`` and ``orientation_std`` of a `Compensation` (N,) at commands q (N, dof)."""
-    cell = _Cell.of(result, "", result.problem.robot, pose, tool, marker, False, False)
+    cell = _Cell.of(result, robot, result.problem.arms[robot], pose, tool, marker, False, False)
     return cell.uncertainty(q, None, None)
 
 

@@ -15,18 +15,19 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
+from rpim_opt.bayes.model_selection import CONDITIONS
 from rpim_opt.bayes.prior_terms import prior_penalty
 from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
-from rpim_opt.convex.formulation import Formulation
 from rpim_opt.data.measurements.camera import INTRINSICS
+from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import OF_JOINTS, RobotSetup, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, write_robodk, write_robot
@@ -60,23 +61,25 @@ Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
 """A file, and what writes to the path that it is given and says what the user has to know of it."""
 
 
-def identified(result: Calibration, marker: str | None = None) -> RobotSetup:
+def identified(result: Calibration, marker: str | None = None, robot: str = "") -> RobotSetup:
     """Return the identified robot, its base in the instrument's frame, and a reflector as tool.
 
-    ``marker`` names the reflector, the first by default. Refused are identified parameters that no description of a
-    robot holds (ratios, harmonics, backlash, compliances, bends, terms of a user's own), and unknown markers.
+    ``marker`` names the reflector, the first by default, ``robot`` is which of several. Refused are parameters that no
+    description of a robot holds (`beyond_geometry`), unknown markers and unknown robots.
 
     >>> import rpim_opt as ro
     >>> arm = ro.use.identified(ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml))
     >>> arm.base.round(2), (1e3 * arm.tool[:3]).round(1)  # [m, rad], [mm]
     (array([ 1.8 , -0.7 ,  0.35,  0.02, -0.04,  1.9 ]), array([18.8, -3.7, 61. ]))
     """
-    p = result.problem.parameters
-    of = dict(zip(p.names, p.values_at(result.x), strict=True))
-    joint_map = result.robot.joint_map.copy()
-    for i in set(range(len(joint_map))) - set(result.robot.leading):  # of joints that follow others the multipliers
-        joint_map[i] *= 1 + of.pop(f"ratio{i + 1}")
-    extras = [name for name, value in of.items() if value and (of_term(name) or name in p.terms)]
+    arm = pick(result.robots, robot, "robot")
+    whole = result.problem.parameters
+    p = whole.of_robot(robot)
+    of = dict(zip(p.names, whole.values_at(result.x)[whole.places_of(robot)], strict=True))
+    joint_map = arm.joint_map.copy()
+    for i in set(range(len(joint_map))) - set(arm.leading):
+        joint_map[i] *= 1 + of[f"ratio{i + 1}"]
+    extras = [name for name, value in beyond_geometry(result, robot).items() if value]
     if extras:
         accepted = (
             "MDH parameters, base and tool: files support nothing else. `export_files` fits the geometry without model "
@@ -87,35 +90,50 @@ def identified(result: Calibration, marker: str | None = None) -> RobotSetup:
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
     base, tool = (np.array([of[frame + c] for c in FRAME]) for frame in ("base_", prefix))
-    return RobotSetup(replace(result.robot, joint_map=joint_map), base, tool)
+    return RobotSetup(replace(arm, joint_map=joint_map), base, tool)
+
+
+def beyond_geometry(result: Calibration, robot: str) -> dict[str, float]:
+    """Return the values [SI] of a robot's parameters that no description of it holds, by name: those of terms.
+
+    Ratios (but of joints that follow others: files hold their multipliers), harmonics, backlash, compliances, bends,
+    terms of a user's own; and origins, which only a URDF holds.
+    """
+    p, arm = result.problem.parameters, result.robots[robot]
+    values = p.values_at(result.x)
+    held = [p.called(robot, f"ratio{i + 1}") for i in range(len(arm.joint_map)) if i not in arm.leading]
+    terms = {name for name in p.names if of_term(name) or name in p.terms}.difference(held)
+    return {p.names[i]: float(values[i]) for i in p.places_of(robot) if p.names[i] in terms}
 
 
 def export_files(
     result: Calibration,
-    out: Path | None = None,
+    out: str | Path | None = None,
     *,
-    urdf: Path | None = None,
-    ur_kinematics: Path | None = None,
-    ur_calibration: Path | None = None,
-    camera_info: Path | None = None,
-    mdh: Path | None = None,
+    urdf: str | Path | None = None,
+    ur_kinematics: str | Path | None = None,
+    ur_calibration: str | Path | None = None,
+    camera_info: str | Path | None = None,
+    mdh: str | Path | None = None,
     dh: str = "modified",
-    robodk: Path | None = None,
-    corrections: Path | None = None,
+    robodk: str | Path | None = None,
+    corrections: str | Path | None = None,
     marker: str | None = None,
+    robot: str = "",
     despite_verdict: bool = False,
     **frames: Any,
 ) -> Exported:
     """Export the identified robot to files of other tools; all requested files are written, or none.
 
-    Of a calibration with model extensions `geometry_alone` is written, with its transmission errors beside it.
+    Of a calibration with more than geometry `geometry_alone` is written, its transmission errors beside it.
 
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
     ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
     a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
     numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
     ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
-    ``marker`` is the reflector, ``frames`` are ``root``, ``tip`` and ``tip_measured`` of `export_urdf`.
+    ``marker`` is the reflector, ``robot`` which of several (`together`), ``frames`` are ``root``, ``tip`` and
+    ``tip_measured`` of `export_urdf`.
 
     A robot that is neither accepted nor rejected, or no more certain than the nominal one errs, is written with the
     note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
@@ -126,24 +144,27 @@ def export_files(
     result, notes = geometry_alone(whole)
     others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
     if corrections and any(others) and not transmission_errors(whole):
-        notes.append(f"Not written: {corrections.name}, since the calibration has no curves of transmission errors.")
+        notes.append(
+            f"Not written: {Path(corrections).name}, since the calibration has no curves of transmission errors."
+        )
         corrections = None
     note, remarks, undecided = _judged(whole, result, despite_verdict)
     note = " ".join(filter(None, [note, whole.caution]))
-    frames |= {"marker": marker, "despite_verdict": True}  # it was asked
-    corrected: list[tuple[Path | None, Callable[[Path, Path], Any]]] = [
+    which: dict[str, Any] = {"marker": marker, "robot": robot}
+    frames |= {**which, "despite_verdict": True}  # it was asked
+    corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
-        (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, marker).robot, target)),
-        (ur_calibration, partial(export_ur_calibration, result)),
+        (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, **which).robot, target)),
+        (ur_calibration, partial(export_ur_calibration, result, robot=robot)),
         (camera_info, partial(export_camera, result)),
     ]
-    made: list[tuple[Path | None, Callable[[Path], Any]]] = [
-        (mdh, partial(_write_table, result, marker, dh)),
-        (robodk, lambda target: write_robodk(identified(result, marker).robot, target)),
+    made: list[tuple[str | Path | None, Callable[[Path], Any]]] = [
+        (mdh, lambda target: _write_table(identified(result, **which), dh, target)),
+        (robodk, lambda target: write_robodk(identified(result, **which).robot, target)),
         (corrections, partial(_write_joint_corrections, whole)),
     ]
-    writers = _beside([(source, write) for source, write in corrected if source], out)
-    writers += [(target, write) for target, write in made if target]
+    writers = _beside([(Path(source), write) for source, write in corrected if source], out)
+    writers += [(Path(target), write) for target, write in made if target]
     if not writers:
         options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
         raise InputError("export", "nothing to write", f"{options}, one or several")
@@ -152,7 +173,7 @@ def export_files(
     return Exported([target for target, _ in writers], notes, undecided)
 
 
-def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: Path | None) -> list[Writer]:
+def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: str | Path | None) -> list[Writer]:
     """Return the writers of corrected files: to ``out``, or of several into that folder."""
     if sources and out is None:
         raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
@@ -182,22 +203,22 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         undecided = bool(doubt) and verdict.delivered
         remarks += [accepted.summary] if accepted.verdict == "accepted" else []
     note = verdict.require(despite_verdict) or doubt
-    if whole.learned is None or alone is whole or found is None:
+    if alone is whole or found is None:
         return note, remarks, undecided
     limit = found.requirement.limit if accepted else np.inf
-    less, above = _of_geometry(alone, joined(whole.learned.extensions), found, limit)
+    less, above = _of_geometry(alone, found, limit)
     other = "Other points and the orientation of the flange may be less certain: `compensate --tool` states their"
     return " ".join(filter(None, [note, less])), [*remarks, f"{other} uncertainty."], undecided or above
 
 
-def _of_geometry(alone: Calibration, extensions: str, found: Workspace, limit: float) -> tuple[str, bool]:
-    """Return the uncertainty of geometry without extensions as sentences, and whether it is above the limit [m]."""
+def _of_geometry(alone: Calibration, found: Workspace, limit: float) -> tuple[str, bool]:
+    """Return the uncertainty of geometry alone as sentences, and whether it is above the limit [m]."""
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
     bound, required = float((found.expanded + stays).max()), found.requirement
     text = (
         f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at most "
-        f"{1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes the error of geometry without "
-        f"{extensions}, at most {1e3 * stays.max():.3f} mm there."
+        f"{1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes what geometry alone misses, at "
+        f"most {1e3 * stays.max():.3f} mm there."
     )
     above = bound > limit
     if above:
@@ -206,41 +227,59 @@ def _of_geometry(alone: Calibration, extensions: str, found: Workspace, limit: f
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
-    """Return the calibration without the model extensions selected by evidence, and a sentence on the loss of accuracy.
+    """Return the calibration without what no description of a robot holds, and a sentence on the loss of accuracy.
 
-    Its geometry is not the best one without them: the same rows are calibrated once more, also those that only the
-    extension explains. A calibration to which nothing was added is returned as it is.
+    That are model extensions, selected by evidence or identified as stated, and terms of a user's own
+    (`beyond_geometry`), but for the origins of a URDF. The geometry of the whole model is not the best one without
+    them: the same rows are calibrated once more with the same settings, also those that only they explain. A
+    calibration in which they are zero is returned as it is.
     """
-    if result.learned is None or not result.learned.added:
+    beyond = {
+        name: value
+        for robot in result.robots
+        for name, value in beyond_geometry(result, robot).items()
+        if not own_name(name).startswith(OF_JOINTS)
+    }
+    if not any(beyond.values()):
         return result, []
-    form = result.program.penalty_form
-    if not result.record.earlier or form is None:
-        stated = result.stated.without({row.label for row in result.learned.left_out})
-        alone = calibrate(stated, result.formulation)
+    free = result.problem.parameters.free.names
+
+    def bare(problem: Source) -> Source:
+        p = problem.parameters
+        zero = np.isin(p.names, list(beyond))
+        nominal = np.where(zero, 0.0, p.nominal)
+        return problem.with_parameters(replace(p, nominal=nominal, identified=np.isin(p.names, free) & ~zero))
+
+    penalty = result.formulation.penalty
+    if getattr(penalty, "maker", "") != prior_penalty.__name__:
+        stated = bare(result.stated)
+        if result.learned is not None:
+            stated = stated.without({row.label for row in result.learned.left_out})
+        alone = result.calibrate_again(stated, model="geometry")
         if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.learned.left_out:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
-    else:  # beside the prior of earlier results with that prior's rows, extensions at zero
-        free = np.array(result.problem.parameters.free.names)
-        geometry = ~np.isin(free, result.learned.added)
-        none = [0.0] * int(geometry.sum())
-        penalty = prior_penalty(None, none, none, form.matrix[:, geometry], form.c, None)
-        problem = result.problem.identifying(np.isin(result.problem.parameters.names, free[geometry]))
-        alone = calibrate(problem, Formulation("geometry alone", penalty=penalty), weight=result.penalty_weight)
+    else:  # a prior of all its parameters, in units of their scales: as it is, with what is beyond geometry at zero
+        among = np.eye(len(free))[:, ~np.isin(free, list(beyond))]
+        form = replace(result.formulation, penalty=lambda z: penalty(among @ z))
+        alone = calibrate(bare(result.problem), form, weight=result.weight)
     alone = replace(alone, record=result.record, known={"causes": result.causes})  # the extension is no mistake
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
+    learned = result.learned
+    selected, added = ([], ()) if learned is None else (learned.extensions, learned.added)
+    lost = [each for each in selected if each not in CONDITIONS]
+    lost += [name for name, value in beyond.items() if value and name not in added]
     sentence = (
-        f"Files cannot hold {joined(result.learned.extensions)}: their geometry is from a fit to the same measurements "
-        f"without it, with {left:.3f} mm RMS on the {where} rows ({whole:.3f} mm with the whole model)."
+        f"Files cannot hold {listed(lost, 6)}: their geometry is from a fit of its own to the same measurements, with "
+        f"{left:.3f} mm RMS on the {where} rows ({whole:.3f} mm with the whole model)."
     )
     return alone, [sentence]
 
 
-def _write_table(result: Calibration, marker: str | None, dh: str, target: Path) -> list[str]:
+def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
     """Write a DH table; say in which convention."""
-    arm = identified(result, marker)
     robot = arm.robot
     write_robot(robot, target, dh)
     convention = CONVENTIONS[dh.lower()]
@@ -280,6 +319,7 @@ def export_urdf(
     marker: str | None = None,
     tip_measured: bool = False,
     despite_verdict: bool = False,
+    robot: str = "",
 ) -> list[str]:
     """Write a URDF with the identified origins, and base and tool if they belong to the file.
 
@@ -289,8 +329,9 @@ def export_urdf(
     sentences on the places of root and reflector in the frames of the instrument and of the tip link.
 
     ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`, by
-    default those that the robot was read between; ``despite_verdict`` as for `export_files`. InputError for several
-    reflectors of which none is named as the tip.
+    default those that the robot was read between; ``robot`` and ``despite_verdict`` as for `export_files`. InputError
+    for several reflectors of which none is named as the tip, and for ends of one chain where origins were identified:
+    those of all chains are written.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -307,12 +348,20 @@ def export_urdf(
     note = result.verdict.require(despite_verdict)
     of = {own_name(name): x for name, x in zip(result.problem.parameters.free.names, result.x, strict=True)}
     if any(name.startswith(OF_JOINTS) for name in of):
+        options = {"root": root, "tip": tip, "tip_measured": tip_measured, "marker": marker, "robot": robot}
+        stated = [name for name, value in options.items() if value]
+        if stated:
+            raise InputError(
+                "export of origins",
+                joined(stated),
+                "none of these: all origins are written; mount_* in identify moves a tip link",
+            )
         return write_all([(Path(target), partial(_write_tree, result, of, source))], note)
-    arm = identified(result, marker)
-    ends = remembered_ends(source, result.problem.robot)
+    arm = identified(result, marker, robot)
+    ends = remembered_ends(source, result.problem.arms[robot])
     own = read_urdf(source, root or ends[0], tip or ends[1])
     root, tip = remembered_ends(source, own.robot)
-    p = result.problem.parameters
+    p = result.problem.parameters.of_robot(robot)
     known = reflectors(p.names)
     if tip_measured and marker is None and len(known) > 1:
         raise InputError("--tip-measured", f"{len(known)} reflectors", f"--marker with one of {', '.join(known)}")
@@ -338,7 +387,7 @@ def export_urdf(
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
         there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
         notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
-    notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker)
+    notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker, robot)
 
     def write(path: Path) -> list[str]:
         write_urdf(source, arm.robot, path, root, tip, base, tool)
@@ -347,13 +396,13 @@ def export_urdf(
     return write_all([(Path(target), write)], note)
 
 
-def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None) -> list[str]:
+def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None, robot: str) -> list[str]:
     """Say how well the pose of the tip link is known, at ``tool`` in the flange frame or at the reflector."""
-    problem = result.problem.sample()
+    problem = result.problem.sample().alone(robot)
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
     name = reflectors(problem.parameters.names)[0] if marker is None else marker
-    position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, name))
+    position, turn = (float(each.max()) for each in tool_uncertainty(result, q, tool, name, robot))
     if not (position or turn):  # nothing identified moves it
         return []
     if not np.isfinite([position, turn]).all():
@@ -362,7 +411,7 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
     rests = "" if seen else ". Positions of one reflector do not determine all of its pose; the rest is the prior's"
     measured = ""
     if tool is not None:
-        measured = f"the reflector {2e3 * tool_uncertainty(result, q, marker=name)[0].max():.2g} mm, "
+        measured = f"the reflector {2e3 * tool_uncertainty(result, q, None, name, robot)[0].max():.2g} mm, "
     return [
         "URDF: expanded uncertainty in the instrument's frame (k = 2, largest of the measured configurations): "
         f"{measured}{tip} {2e3 * position:.2g} mm and {2e3 * turn:.2g} mrad{rests}."
@@ -384,22 +433,22 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
     return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []
 
 
-def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
+def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path, robot: str = "") -> list[str]:
     """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
-    robot = identified(result).robot
-    if np.abs(result.problem.robot.mdh[0, :2]).max() > 0:
+    arm = identified(result, robot=robot).robot
+    nominal = result.problem.arms[robot]
+    if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
-    nominal = _catalogued(result.problem.robot)
-    mdh = robot.mdh.copy()
+    mdh = arm.mdh.copy()
     mdh[0, :2] = 0.0
-    write_ur_calibration(source, replace(robot, mdh=mdh), nominal, target)
+    write_ur_calibration(source, replace(arm, mdh=mdh), _catalogued(nominal), target)
     notes = []
     if b"joint_checksum" in read_bytes(Path(source)):
         notes.append(
             "joint_checksum is copied from the source: its algorithm is not published, so a controller may refuse "
             "the file. Keep the original."
         )
-    if not np.array_equal(mdh, robot.mdh):
+    if not np.array_equal(mdh, arm.mdh):
         notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
     return notes
 

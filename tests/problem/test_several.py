@@ -12,6 +12,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
+from rpim_opt.robot.kinematics import numeric_frame
 from tests.simulate import ALL, ARM, simulated
 
 SIGMA = 5e-5
@@ -364,3 +365,21 @@ def test_sessions_by_the_hundred_are_refused_with_what_they_cost() -> None:
     problem = ro.CalibrationProblem(arm.robot, parameters, data)
     with pytest.raises(ro.InputError, match=r"session: found 400 of them and 2,434 parameters, .* about 4 minutes"):
         ro.calibrate(problem)
+
+
+def test_one_of_several_robots_goes_to_files(tmp_path: Path) -> None:
+    """As the problem of this robot alone would at the same deviations: the place of its base and tool, too."""
+    first, second, _ = two()
+    whole = ro.together(left=first, right=second, shared=TOOL)
+    result = ro.calibrate(whole)
+    with pytest.raises(ro.InputError, match=r"robot: found '', accepted: left, right"):
+        ro.use.export_files(result, mdh=tmp_path / "arm.toml")
+    for name in ("left", "right"):
+        notes = ro.use.export_files(result, robot=name, mdh=tmp_path / f"{name}.toml").notes
+        written = ro.read_robot(tmp_path / f"{name}.toml")
+        assert np.array_equal(written.mdh, result.robots[name].mdh)
+        arm = ro.use.identified(result, robot=name)
+        q = np.random.default_rng(0).uniform(-1, 1, (5, written.dof))
+        chain = numeric_frame(arm.base) @ ro.robot.forward_kinematics(written, q) @ numeric_frame(arm.tool)
+        assert np.abs(chain - result.forward(q, robot=name)).max() < 1e-12
+        assert any(f"{1e3 * arm.tool[0]:.3f}" in note for note in notes)

@@ -332,6 +332,32 @@ def test_commands_are_corrected_for_a_users_term_as_for_a_built_in_one() -> None
         ro.use.identified(found)
 
 
+@pytest.mark.parametrize("weight", [None, 1.0, "reml"])
+def test_files_hold_the_geometry_of_a_calibration_without_a_users_term(
+    weight: float | str | None, tmp_path: Path
+) -> None:
+    _, own = both("ecc2_cos")
+    own = measured(own, noise=SIGMA, own2=3e-4, own4=-2e-4, a2=5e-4)
+    found = ro.calibrate(own, weight=weight)
+    written = ro.use.export_files(found, mdh=tmp_path / "arm.toml")
+    assert "Files cannot hold own2, own3, own4: their geometry is from a fit of its own" in " ".join(written.notes)
+    assert "It includes what geometry alone misses, at most 0." in " ".join(written.notes)
+    rigid = ro.calibrate(blank().on(own.data), weight=weight)
+    assert np.abs(ro.read_robot(tmp_path / "arm.toml").mdh - rigid.robot.mdh).max() < 1e-9
+    known = own.parameters.names.index("own2")  # stated by the problem, not identified
+    nominal = np.where(np.arange(len(own.parameters)) == known, 3e-4, own.parameters.nominal)
+    stated = own.with_parameters(
+        replace(
+            own.parameters,
+            nominal=nominal,
+            identified=own.parameters.identified & ~np.isin(own.parameters.names, own.parameters.terms),
+        )
+    )
+    alone, (said,) = ro.use.geometry_alone(ro.calibrate(stated, weight=weight))
+    assert "Files cannot hold own2: " in said
+    assert np.abs(alone.robot.mdh - rigid.robot.mdh).max() < 1e-9
+
+
 def test_commands_are_corrected_for_links_and_a_tool_under_any_payload() -> None:
     terms = [
         ro.robot.Term(

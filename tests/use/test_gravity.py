@@ -7,6 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -125,7 +126,7 @@ def test_uncertainty_of_exported_geometry_contains_what_files_cannot_hold(tmp_pa
     said = " ".join(ro.use.export_files(result, mdh=tmp_path / "arm.toml").notes)
     stated, of_gravity = (
         float(re.search(rf"{before} ([\d.]+) mm", said)[1])
-        for before in (r"this geometry \(U, 95 %\): at most", "error of geometry without gravity, at most")
+        for before in (r"this geometry \(U, 95 %\): at most", "what geometry alone misses, at most")
     )
     others = np.random.default_rng(3).uniform(q.min(axis=0), q.max(axis=0), (2000, 6))
     alone = ro.use.geometry_alone(result)[0].forward(others)[:, :3, 3]
@@ -153,6 +154,40 @@ def test_exported_geometry_is_fitted_to_the_rows_that_only_gravity_explains() ->
     assert not result.learned.left_out
     assert ro.calibrate(result.stated).learned.left_out  # the geometry alone takes them for outliers
     assert ro.use.geometry_alone(result)[0].problem.labels == result.problem.labels
+
+
+def bent() -> ro.CalibrationProblem:
+    """Return the problem of a geometry alone, measured on an arm that bends."""
+    robot = arm()
+    q = np.random.default_rng(1).uniform(-2.0, 2.0, (40, 6))
+    real = ro.CalibrationProblem(robot, table(robot), data_at(q))
+    y = real.modelled(truth(real.parameters, 1))[0] + SIGMA * np.random.default_rng(2).normal(size=(40, 3))
+    rigid = ro.robot.model_parameters(robot, tools={"": TOOL}).identify(GEOMETRY)
+    return ro.CalibrationProblem(robot, rigid, ro.Dataset.of(q, y, SIGMA))
+
+
+def test_of_extensions_at_a_given_weight_files_hold_the_geometry_of_a_formulation_of_ones_own(tmp_path: Path) -> None:
+    problem = bent()
+    own = ro.Formulation("own", cp.sum_squares, lambda z: cp.sum_squares(z))
+    result = ro.calibrate(problem, own, 0.5, model="auto")
+    notes = " ".join(ro.use.export_files(result, mdh=tmp_path / "arm.toml").notes)
+    assert "Files cannot hold compliance2, compliance3, compliance4, compliance5: their geometry" in notes
+    rigid = ro.calibrate(problem, own, 0.5)
+    assert np.abs(ro.read_robot(tmp_path / "arm.toml").mdh - rigid.robot.mdh).max() < 1e-9
+
+
+def test_a_prior_holds_for_exported_geometry_also_of_a_result_that_was_read(tmp_path: Path) -> None:
+    known = ro.bayes.Prior.known("a2 = nominal + 0.4 +- 0.001 mm")
+    result = ro.calibrate(bent(), prior=known, model="auto")
+    assert result.learned is not None
+    assert result.learned.extensions == ("gravity",)
+    ro.store.save_result(result, tmp_path / "result.json")
+    tables = []
+    for each in (result, ro.load_result(tmp_path / "result.json")):
+        ro.use.export_files(each, mdh=tmp_path / "arm.toml")
+        tables.append(ro.read_robot(tmp_path / "arm.toml").mdh)
+    assert np.abs(tables[1] - tables[0]).max() < 1e-9
+    assert abs(tables[0][1, 1] - ARM.mdh[1, 1] - 4e-4) < 5e-6
 
 
 def test_payloads_may_differ_by_row_and_lie_elsewhere() -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -389,6 +390,18 @@ def test_one_joint_off_its_zero_leaves_the_others_where_they_are(tmp_path: Path)
         missed = np.concatenate(elsewhere.modelled(x)) - np.concatenate(elsewhere.modelled(result.x))
         errors.append(np.sqrt(np.mean(missed**2)))
     assert errors[1] < 1.1 * errors[0]
+
+
+@pytest.mark.parametrize("stated", [{"tip": "tip0"}, {"root": "root"}, {"tip_measured": True}, {"robot": "left"}])
+def test_ends_of_one_chain_are_refused_where_all_origins_are_written(
+    stated: dict[str, Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder(monkeypatch, tmp_path, 'identify = ["origin_*"]')
+    result = ro.calibrate(ro.load(".").problem, ro.tikhonov, weight=1.0)
+    (name,) = stated
+    with pytest.raises(ro.InputError, match=f"origins: found {name}, accepted: none of these.*mount_"):
+        ro.use.export_files(result, Path("new.urdf"), urdf=Path("robot.urdf"), despite_verdict=True, **stated)
+    assert not Path("new.urdf").exists()
 
 
 def test_what_a_urdf_does_not_hold_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
