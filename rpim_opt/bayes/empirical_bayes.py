@@ -11,7 +11,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
-from rpim_opt.bayes.outliers import beyond_noise, error_vectors, isolated, outlier_candidates, unexplained
+from rpim_opt.bayes.outliers import beyond_noise, isolated, largest_errors, outlier_candidates, unexplained
 from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.bayes.transmission import admitted
 from rpim_opt.problem.blocks import Source
@@ -74,10 +74,9 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         outliers = beyond_noise(laid, fit.x)
     left_out: list[ExcludedRow] = []
     if outliers:
-        vectors = np.concatenate([error_vectors(part, fit.x) for part in laid.rows()])
-        size = dict(zip(laid.labels, np.linalg.norm(vectors, axis=1).tolist(), strict=True))
+        errors = dict(zip(laid.labels, largest_errors(laid, fit.x), strict=True))
         for label, ratio in sorted(outliers.items(), key=lambda item: -item[1]):
-            left_out.append(ExcludedRow(label, ratio, size[label] if np.isfinite(size[label]) else None))
+            left_out.append(ExcludedRow(label, ratio, *errors[label]))
         laid = laid.without(outliers)
     hyperparameters = learned(
         fit,

@@ -26,7 +26,7 @@ from rpim_opt.bayes.prior_terms import ScaledPrior
 from rpim_opt.convex.formulation import Formulation, tikhonov
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.noise import Repeatability
+from rpim_opt.problem.noise import Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.terms import Curve
 
@@ -59,16 +59,17 @@ class Trial(NamedTuple):
 
 
 class ExcludedRow(NamedTuple):
-    """A row that was excluded as an outlier: its error over the median of all rows' errors, and the error [m]."""
+    """A row that was excluded as an outlier: its error over the median of all rows' errors, and the error [SI]."""
 
     label: str
     ratio: float
-    error: float | None = None  # None where the row measures no position
+    error: float | None = None  # None where the row has neither length nor angle
+    dimension: str = "length"
 
     def __str__(self) -> str:
         """Return the row with its error."""
-        size = "" if self.error is None else f"{1e3 * self.error:.3g} mm, "
-        return f"{self.label} ({size}{self.ratio:.0f} times the median error)"
+        error = filter(None, [in_unit(self.error, self.dimension), f"{self.ratio:.0f} times the median error"])
+        return f"{self.label} ({', '.join(error)})"
 
 
 class Transmitted(NamedTuple):

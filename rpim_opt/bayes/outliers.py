@@ -55,6 +55,23 @@ def error_vectors(problem: CalibrationProblem, x: Array) -> Array:
     return vectors
 
 
+def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
+    """Return the error [SI] of every row at x (n,) [SI], and of which dimension: that of more times the median.
+
+    None for rows without length and angle; what is known of a distance counts as its length.
+    """
+    found: list[tuple[float | None, str]] = [(None, "length")] * len(problem.labels)
+    most = np.zeros(len(found))
+    for dimension in ("length", "stated length", "angle", "stated angle"):
+        errors = problem.errors(x, dimension)
+        known = errors[np.isfinite(errors)]
+        ratio = np.nan_to_num(errors) / max(float(np.median(known)) if len(known) else 0.0, FINEST)
+        for i in np.flatnonzero(ratio > most):
+            found[i] = float(errors[i]), dimension.rpartition(" ")[2]
+        most = np.maximum(most, ratio)
+    return found
+
+
 def error_ratios(problem: CalibrationProblem, x: Array) -> Array:
     """Return the larger ratio (N,) of errors in length and in angle to the median of the measurement type.
 

@@ -11,21 +11,29 @@ import numpy as np
 from scipy.special import chdtri
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes.outliers import largest_errors
 from rpim_opt.convex.robust_loss import RARE, outlying
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.blocks import Source
+from rpim_opt.problem.noise import in_unit
 
 SLACK = 0.1  # share of a measured joint range by which values may exceed it: its extremes are drawn by chance
 SLACK_LEAST = np.radians(1.0)  # what they may exceed it by in any case [rad; for prismatic joints 17 mm]
 
 
 class Flag(NamedTuple):
-    """An outlier: label, residual in standard deviations, and error [mm]."""
+    """An outlier: label, residual in standard deviations, and error [SI] of its dimension, as of `largest_errors`."""
 
     label: str
     sigmas: float
-    error_mm: float
+    error: float | None
+    dimension: str
+
+    @property
+    def size(self) -> str:
+        """The error with its unit."""
+        return in_unit(self.error, self.dimension)
 
 
 class ActiveBound(NamedTuple):
@@ -72,12 +80,11 @@ def flagged(problem: Source, x: Array) -> tuple[Flag, ...]:
     """Return the outliers at x (n,) [SI], by the threshold `outlying`, the worst first."""
     norms, count = problem.whitened_errors(x)
     limit = outlying(norms, count)
-    error = problem.errors(x)
-    error = 1e3 * np.where(np.isfinite(error), error, problem.errors(x, "stated length"))
+    errors = largest_errors(problem, x)
     noise = limit / np.sqrt(chdtri(count, RARE / len(norms)))
     labels = problem.labels
     worst = [i for i in np.argsort(-norms) if norms[i] > limit[i]]
-    return tuple(Flag(labels[i], float(norms[i] / noise[i]), float(error[i])) for i in worst)
+    return tuple(Flag(labels[i], float(norms[i] / noise[i]), *errors[i]) for i in worst)
 
 
 @dataclass(frozen=True)

@@ -524,7 +524,7 @@ class Outcome:
         Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
         """
         rest = self.stated.without({flag.label for flag in self.single})
-        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.error_mm:.2f} mm" for f in self.single}
+        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.size}" for f in self.single}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.calibrate_again(rest), record=record)
 

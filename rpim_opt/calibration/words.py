@@ -167,7 +167,7 @@ def _outlying(result: Outcome, advised: bool) -> list[str]:
     if not flagged:
         return []
     together = result.clustered
-    named = [f"{f.label} ({f.sigmas:.0f} standard deviations, residual {f.error_mm:.2f} mm)" for f in flagged]
+    named = [f"{f.label} ({f.sigmas:.0f} standard deviations, residual {f.size})" for f in flagged]
     lines = [f"Outliers: {listed(named, MOST_ROWS)}."]
     if together:
         lines.append(

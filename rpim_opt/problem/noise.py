@@ -14,6 +14,12 @@ UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
 """Unit in which residuals and their deviations are said, and its size in SI."""
 
 
+def in_unit(error: float | None, dimension: str) -> str:
+    """Return an error [SI] with its unit; an empty text for None."""
+    unit, si = UNITS[dimension]
+    return "" if error is None else f"{error / si:.3g} {unit}"
+
+
 @dataclass(frozen=True, eq=False)
 class Repeatability:
     """Repeatability of a robot: standard deviations of positions, orientations and joints about its model.

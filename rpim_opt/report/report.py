@@ -29,6 +29,7 @@ from rpim_opt.convex.rules.selection import Selection
 from rpim_opt.data.dataset import Block as Rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.design import combination, observe
+from rpim_opt.problem.noise import in_unit
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import plot, summary
 from rpim_opt.report.page import Block, Figure, Table, figure, render
@@ -386,17 +387,17 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
 def _flagged(result: Calibration) -> Block:
     flagged = result.flagged
     status = "flagged, in the data"
-    rows = [[flag.label, f"{flag.sigmas:.1f}", mm(flag.error_mm), status] for flag in flagged[:MOST_FLAGGED]]
+    rows = [[flag.label, f"{flag.sigmas:.1f}", flag.size, status] for flag in flagged[:MOST_FLAGGED]]
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
     for row in () if result.learned is None else result.learned.left_out:
         if row.label not in result.record.excluded:
-            error = "" if row.error is None else mm(1e3 * row.error)
+            error = in_unit(row.error, row.dimension)
             rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} x the median error"])
     if not rows:
         return "text", ["No row is flagged or excluded (one in a hundred good data sets has a flagged row)."]
-    head = ["row", "standardized residual", "error [mm]", "status"]
+    head = ["row", "standardized residual", "error", "status"]
     return "table", Table("Largest first", head, rows, prose=True)
 
 

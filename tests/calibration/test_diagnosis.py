@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+import re
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from scipy.stats import chi2
 
 import rpim_opt as ro
 from rpim_opt.bayes.outliers import error_vectors
 from rpim_opt.calibration.diagnosis import Flag, flagged
 from rpim_opt.convex.robust_loss import limits
+from rpim_opt.report import report
 from tests.simulate import simulated
 
 COUNT = np.array([3, 3, 1, 3, 6, 3, 3, 3])
@@ -24,7 +28,7 @@ LABELS = tuple("abcdefgh")
 def flags(norms: np.ndarray) -> tuple[Flag, ...]:
     """Of rows that have these whitened norms, and errors of as many millimetres."""
     problem: Any = SimpleNamespace(
-        whitened_errors=lambda x: (norms, COUNT), labels=LABELS, errors=lambda x, dimension="length": 1e-3 * norms
+        whitened_errors=lambda x: (norms, COUNT), labels=LABELS, errors=lambda x, dimension: 1e-3 * norms
     )
     return flagged(problem, np.zeros(3))
 
@@ -42,7 +46,29 @@ def test_flags_are_told_in_sigmas_of_the_noise_that_the_others_show(noise: float
     found = flags(norms)
     assert [flag.label for flag in found] == ["g", "c"]
     assert [flag.sigmas for flag in found] == pytest.approx([90.0 / max(noise, 1.0), 60.0 / max(noise, 1.0)], rel=1e-9)
-    assert [flag.error_mm for flag in found] == pytest.approx([90.0, 60.0], rel=1e-12)
+    assert [flag.error for flag in found] == pytest.approx([0.09, 0.06], rel=1e-12)
+
+
+@pytest.mark.parametrize(("formulation", "weight"), [("tikhonov", None), ("robust", 1.0)])
+def test_an_outlier_is_told_in_the_unit_of_what_stands_out(formulation: str, weight: float | None) -> None:
+    """Two poses, one turned by 50 mrad and one moved by 3 mm."""
+    problem = ro.load("pose").problem
+    (block,) = problem.data.blocks
+    y = block.y.copy()
+    turned = Rotation.from_rotvec([0.05, 0, 0]) * Rotation.from_quat(y[3, 3:], scalar_first=True)
+    y[3, 3:] = turned.as_quat(scalar_first=True)
+    y[7, 0] += 3e-3
+    result = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, y=y),))), formulation, weight)
+    if weight is None:
+        assert {row.label: row.dimension for row in result.learned.left_out} == {"c3": "angle", "c7": "length"}
+        (said,) = [line for line in str(result).splitlines() if line.startswith("Excluded outliers")]
+    else:
+        assert {flag.label: flag.dimension for flag in result.flagged} == {"c3": "angle", "c7": "length"}
+        said = " ".join(result.without_flagged().record.excluded.values())
+    assert re.search(r"(49|50|51)(\.\d+)? mrad", said)
+    assert re.search(r"(2\.9\d*|3|3\.0\d*) mm", said)
+    if weight is None:  # also in the report
+        assert " mrad</td>" in report.page(result)
 
 
 def test_a_row_is_flagged_from_its_own_limit_on() -> None:

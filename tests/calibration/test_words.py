@@ -45,7 +45,7 @@ def test_a_parameter_without_covariance_has_a_dash() -> None:
 
 
 def flagged(count: int, squared_loss: bool = False) -> list[str]:
-    flags = tuple(Flag(f"r{k}", 10.4 + k, 1.234) for k in range(count))
+    flags = tuple(Flag(f"r{k}", 10.4 + k, 1.234e-3, "length") for k in range(count))
     held = tuple(ActiveBound("a2", 0.0005, 1.0, 0.05) for _ in range(count))
     stand_in: Any = SimpleNamespace(
         active_constraints=[],
