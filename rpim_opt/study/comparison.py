@@ -25,7 +25,8 @@ from rpim_opt.study import studies
 from rpim_opt.study.methods import (
     FOLDER,
     METRICS,
-    UNCONVERGED,
+    OK,
+    UNDELIVERED,
     USUAL,
     WITH_FIGURES,
     Row,
@@ -181,10 +182,10 @@ class Comparison:
     """Replicates of methods on problems, one row each.
 
     ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
-    and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not converged``, ``impossible``, ``failed``) with
-    its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``.
-    ``drawn`` are problems that every seed draws anew, ``asked`` the grid in words, ``made`` script, package, versions
-    and time.
+    and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not delivered`` by its figures, ``impossible``,
+    ``failed``) with its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the
+    ``metrics``. ``drawn`` are problems that every seed draws anew, ``asked`` the grid in words, ``made`` script,
+    package, versions and time.
 
     >>> import rpim_opt as ro
     >>> def arms(seed):
@@ -296,7 +297,7 @@ class Comparison:
 class Standing:
     """Metrics of a method, and its ratio to the reference on the same replicates.
 
-    Of its ``replicates`` some are ``missing`` (without a figure) or ``unconverged`` (their figures count); ``median``
+    Of its ``replicates`` some are ``missing`` (without a figure) or ``undelivered`` (their figures count); ``median``
     and ``worst`` are of its figures. ``ratio`` is the geometric mean of its figures over those of the reference, every
     problem counting the same (None without pairs), ``low`` and ``high`` the ends of its 95 % interval (None where there
     is too little to say). On ``wins``, ``ties`` and ``losses`` replicates it is better than the reference, as good
@@ -306,7 +307,7 @@ class Standing:
     method: str
     replicates: int
     missing: int
-    unconverged: int
+    undelivered: int
     median: float | None
     worst: float | None
     ratio: float | None
@@ -327,7 +328,7 @@ class Summary:
     """Methods ranked by the geometric mean of their metric.
 
     Less of the ``metric`` is better; others are compared with the ``reference``. ``standings`` are one a method that
-    has figures; ``notes`` say of what the intervals speak, and what has no results, with the reason.
+    has figures; ``notes`` say of what the intervals speak, and what is not delivered or has no results.
 
     >>> import rpim_opt as ro
     >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
@@ -409,9 +410,9 @@ def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[s
         wins = sum(log < -TIE for log in logs.values())
         losses = sum(log > TIE for log in logs.values())
         paired = {pair: logs[pair] for pair in own if pair in other}
-        unconverged = sum(row["status"] == UNCONVERGED for row in mine)
+        undelivered = sum(row["status"] == UNDELIVERED for row in mine)
         standing = Standing(
-            method, len(mine), len(mine) - len(own), unconverged, float(np.median(list(own.values()))),
+            method, len(mine), len(mine) - len(own), undelivered, float(np.median(list(own.values()))),
             max(own.values()), *interval(paired, drawn), wins, len(logs) - wins - losses, losses,
         )  # fmt: skip
         known.append(standing)
@@ -485,13 +486,12 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
         yield text
     elif len(standings) > 1:
         yield f"There are no intervals: fewer than {ENOUGH} problems, and fewer than {ENOUGH} seeds or folds on one."
-    late = sum(each.unconverged for each in standings)
-    if late:
-        yield f"{late} replicates did not converge; their results are included (column status)."
     every = Counter(row["method"] for row in rows)
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
-        if row["status"] not in WITH_FIGURES:
+        if row["status"] == UNDELIVERED:  # each for reasons with figures of its own
+            row = {**row, "reason": "their figures count; the column reason says why."}
+        if row["status"] != OK:
             without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
     for (method, status, reason), missing in without.items():
         where = f" ({listed(list(dict.fromkeys(missing)), 4)})" if len(missing) < every[method] else ""

@@ -18,6 +18,7 @@ from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
 from rpim_opt.calibration.held_out import compared
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.verdict import judge
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of, tikhonov
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.rules.selection import require_weight
@@ -42,8 +43,8 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 }
 """Methods without convex programming; ``nominal`` fits base and tools alone."""
 OK = "ok"
-UNCONVERGED = "not converged"
-WITH_FIGURES = (OK, UNCONVERGED)  # statuses of replicates that have figures
+UNDELIVERED = "not delivered"
+WITH_FIGURES = (OK, UNDELIVERED)  # statuses of replicates that have figures
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]
 """A problem, or a function of a seed with another problem for every seed."""
@@ -378,8 +379,9 @@ def replicate(
         row["parameters"] = len(instance.problem.parameters.free)
         if result is not None:
             row["weight"] = float(result.weight)
-            if not result.converged:
-                row |= {"status": UNCONVERGED, "reason": result.message}
+            reasons = judge(result).reasons  # without likely mistakes in the data, which all methods share
+            if reasons:
+                row |= {"status": UNDELIVERED, "reason": " ".join(reasons)}
         return row | values
     except InputError as error:
         row |= {"status": "impossible", "reason": str(error)}

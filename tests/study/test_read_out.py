@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.study.comparison import number
-from rpim_opt.study.methods import UNCONVERGED, problems_of
+from rpim_opt.study.methods import UNDELIVERED, problems_of
 from rpim_opt.study.studies import Report, load_study, write
 from tests import ROOT
 from tests.study.test_comparison import POSITION, rows_of
@@ -48,9 +48,20 @@ def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
         some.summary("max_mm")
 
 
-def test_replicates_that_did_not_converge_are_counted() -> None:
-    found = compared({"a": even(1.0), "b": even(0.5)}, status=UNCONVERGED, reason="")
-    assert "12 replicates did not converge; their results are included (column status)." in found.summary().notes
+def test_replicates_that_are_not_delivered_are_counted() -> None:
+    found = compared({"a": even(1.0), "b": even(0.5)}, status=UNDELIVERED, reason="")
+    notes = found.summary().notes
+    assert "b: not delivered, 6 of 6 replicates. Their figures count; the column reason says why." in notes
+    assert [each.undelivered for each in found.summary().standings] == [6, 6]
+
+
+def test_a_fit_that_no_robot_has_is_not_delivered() -> None:
+    found = ro.compare("position", "tikhonov", ["reml", 1e9], splits=2, progress=False)
+    assert [row["status"] for row in found.rows] == ["ok", "not delivered"] * 2
+    assert found.rows[1]["reason"].startswith("Residual RMS ")
+    assert found.rows[1]["rms_mm"] > 1
+    assert "2 ok, 2 not delivered" in repr(found)
+    assert found.summary().notes[-1].startswith("tikhonov, 1e+09: not delivered, 2 of 2 replicates.")
 
 
 @pytest.mark.parametrize(
