@@ -51,7 +51,7 @@ def together(
     >>> problem = ro.load("position").problem
     >>> data = problem.data
     >>> half = [problem.on(data.take(range(20))), problem.on(data.take(range(20, 40)))]
-    >>> both = ro.together(spring=half[0], autumn=half[1], shared=["[!b]*", "beta?"])  # all but the base
+    >>> both = ro.together(spring=half[0], autumn=half[1], shared=["[!b]*", "be*"])  # all but the base
     >>> both.parameters.free.names[:2], both.parameters.free.names[-1], both.labels[-1]
     (('alpha1', 'a1'), 'autumn.base_rz', 'c39')
     """

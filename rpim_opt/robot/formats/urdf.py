@@ -71,7 +71,7 @@ def read_urdf(path: str | Path, base: str | None = None, tip: str | None = None,
     With ``origins`` the parameters to identify are not those of the table but the origins of the file's joints, six
     numbers each, ``origin_{joint}_x`` to ``_rz``, of fixed joints at the chain's ends ``mount_{joint}_x``: the same in
     every chain that a joint is part of, so that `together` shares them. A first row that does not move stands for the
-    base link then: the table starts in that link's own frame.
+    base link then: the table starts in that link's own frame, and the file's first joint is number 2 in terms.
 
     >>> import rpim_opt as ro
     >>> arm = ro.read_urdf("arm.urdf", base="base", tip="tip")
