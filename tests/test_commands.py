@@ -769,9 +769,20 @@ def test_no_solution_has_its_own_code(monkeypatch, capsys, made) -> None:
 def test_what_no_file_can_hold_is_named(monkeypatch, capsys, tmp_path) -> None:
     problem, _ = simulated(("theta?", "ratio2"), configurations=20)
     ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), tmp_path / "result.json")
-    assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.csv")) == 2
-    assert "found ratio2" in capsys.readouterr().err
-    assert not (tmp_path / "arm.csv").exists()
+    assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.csv")) == 0
+    assert "Files cannot hold ratio2: their geometry is from a fit of its own" in capsys.readouterr().out
+    assert "It includes what geometry alone misses" in (tmp_path / "arm.csv").read_text()
+
+
+def test_one_robot_of_several_is_exported_by_its_name(monkeypatch, capsys, tmp_path) -> None:
+    problem, _ = simulated(("theta?",), configurations=20)
+    result = ro.calibrate(ro.together(left=problem, right=problem, shared=["tool_*"]), ro.tikhonov, 1.0)
+    ro.store.save_result(result, tmp_path / "result.json")
+    files = ("export", str(tmp_path), "--mdh", str(tmp_path / "arm.toml"))
+    assert run(monkeypatch, *files) == 2
+    assert "robot: found '', accepted: left, right" in capsys.readouterr().err
+    assert run(monkeypatch, *files, "--robot", "right") == 0
+    assert np.array_equal(ro.read_robot(tmp_path / "arm.toml").mdh, result.robots["right"].mdh)
 
 
 # --- JSON, completion, help --------------------------------------------------------------------------------

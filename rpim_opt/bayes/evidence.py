@@ -401,7 +401,8 @@ class Evidence:
         v, before, rounds = size2.copy(), np.inf, 0
         while True:
             v[heavy] = local
-            z, C, logdet = _posterior(H, h, own / v)
+            C, logdet = _inverse(*_factored(H, own / v))  # of M = H + diag(own / v)
+            z = C @ h
             z_heavy, C_heavy = z[heavy], C[np.ix_(heavy, heavy)]
             weighed = np.minimum(tails * t2 + z_heavy**2 + C_heavy.diagonal(), (tails + 1) * widest)
             change = np.log(weighed / ((tails + 1) * local))
@@ -504,12 +505,6 @@ def _inverse(factor: Array, d: Array) -> tuple[Array, float]:
     C.flat[:: len(d) + 1] /= 2
     C *= d[:, None] * d
     return C, logdet
-
-
-def _posterior(H: Array, h: Array, precision: Array) -> tuple[Array, Array, float]:
-    """Return z = M^-1 h, M^-1 and ln|M| of M = H + diag(precision)."""
-    C, logdet = _inverse(*_factored(H, precision))
-    return C @ h, C, logdet
 
 
 def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Array, float]:

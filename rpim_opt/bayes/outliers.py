@@ -60,16 +60,12 @@ def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
 
     None for rows without length and angle; what is known of a distance counts as its length.
     """
-    found: list[tuple[float | None, str]] = [(None, "length")] * len(problem.labels)
-    most = np.zeros(len(found))
-    for dimension in ("length", "stated length", "angle", "stated angle"):
-        errors = problem.errors(x, dimension)
-        known = errors[np.isfinite(errors)]
-        ratio = np.nan_to_num(errors) / max(float(np.median(known)) if len(known) else 0.0, FINEST)
-        for i in np.flatnonzero(ratio > most):
-            found[i] = float(errors[i]), dimension.rpartition(" ")[2]
-        most = np.maximum(most, ratio)
-    return found
+    dimensions = ("length", "stated length", "angle", "stated angle")
+    errors = np.array([problem.errors(x, dimension) for dimension in dimensions])
+    medians = [np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0 for each in errors]
+    largest = np.nan_to_num(errors / np.maximum(medians, FINEST)[:, None]).argmax(axis=0)
+    sizes = [float(e) if np.isfinite(e) else None for e in errors[largest, np.arange(errors.shape[1])]]
+    return [(size, dimensions[k].rpartition(" ")[2]) for size, k in zip(sizes, largest, strict=True)]
 
 
 def error_ratios(problem: CalibrationProblem, x: Array) -> Array:

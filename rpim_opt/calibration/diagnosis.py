@@ -16,7 +16,6 @@ from rpim_opt.convex.robust_loss import RARE, outlying
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.noise import in_unit
 
 SLACK = 0.1  # share of a measured joint range by which values may exceed it: its extremes are drawn by chance
 SLACK_LEAST = np.radians(1.0)  # what they may exceed it by in any case [rad; for prismatic joints 17 mm]
@@ -29,11 +28,6 @@ class Flag(NamedTuple):
     sigmas: float
     error: float | None
     dimension: str
-
-    @property
-    def size(self) -> str:
-        """The error with its unit."""
-        return in_unit(self.error, self.dimension)
 
 
 class ActiveBound(NamedTuple):

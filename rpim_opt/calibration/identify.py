@@ -16,7 +16,7 @@ from rpim_opt.basics.exceptions import pick
 from rpim_opt.basics.text import counted, joined
 from rpim_opt.basics.threads import one_blas_thread
 from rpim_opt.bayes.empirical_bayes import estimate, with_extensions
-from rpim_opt.bayes.hyperparameters import Estimator, Learned, require_finite
+from rpim_opt.bayes.hyperparameters import Estimator, require_finite
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Statement
 from rpim_opt.calibration.certificate import DECREASE
@@ -25,7 +25,6 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.convex.select import weight_of
-from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.multi_robot import require_affordable
 from rpim_opt.problem.problem import CalibrationProblem
@@ -165,7 +164,9 @@ def calibrate(
     excluded = None
     if weight is None:
         estimated = estimate(problem, estimator, model, start)
-        excluded = _excluded(problem, estimated.learned)
+        left_out = [row.label for row in estimated.learned.left_out]
+        if left_out and isinstance(problem, CalibrationProblem):  # in memory
+            excluded = problem.data.take(np.flatnonzero(np.isin(problem.labels, left_out)))
         problem, weight, start, learned = estimated.problem, 1.0, estimated.x, estimated.learned
         formulation = estimated.stated.penalized(formulation)
     else:
@@ -201,13 +202,6 @@ def _wide_zeros(mapping: JointMapping) -> Prior:
     estimated = (mapping.zero % (np.pi / 2) != 0) & (np.array(mapping.joint_types) == "revolute")
     names = [f"theta{i + 1}" for i in np.flatnonzero(estimated)]
     return Prior(statements=tuple(Statement((name,), ("angle",), ((1 / ZERO,),), (0.0,), whole=True) for name in names))
-
-
-def _excluded(problem: Source, learned: Learned) -> Dataset | None:
-    """Return the rows in memory that were excluded as outliers."""
-    if not learned.left_out or not isinstance(problem, CalibrationProblem):
-        return None
-    return problem.data.take(np.flatnonzero(np.isin(problem.labels, [row.label for row in learned.left_out])))
 
 
 def ending(ended: Ended, most: int) -> str:

@@ -22,7 +22,7 @@ from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import against_gravity
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.noise import UNITS, Repeatability
+from rpim_opt.problem.noise import UNITS, Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 
@@ -363,8 +363,7 @@ def autocorrelation(q: Array, errors: Array, kinds: np.ndarray) -> Autocorrelati
 
 
 def _size(found: LackOfFit, value: float) -> str:
-    unit, si = UNITS[found.dimension]
-    return f"{value / si:.3g} {unit}"
+    return in_unit(value, found.dimension)
 
 
 def _limit(found: LackOfFit) -> str:

@@ -95,7 +95,7 @@ def influence(result: Outcome) -> Influence:
     >>> [found.label[k] for k in np.argsort(-found.cook)[:3]]  # blunders
     ['c43', 'c14', 'c1']
     """
-    if not result.linear_penalty:
+    if not result.program.linear_penalty:
         raise result.no_covariance("k_fold leaves configurations out of any formulation")
     free = result.problem.parameters.free
     model, first_label = _equations(result)

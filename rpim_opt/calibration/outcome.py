@@ -44,6 +44,7 @@ from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import Record
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.linear import LinearModel
+from rpim_opt.problem.noise import in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames
 from rpim_opt.problem.registration.global_start import JointMapping
@@ -353,11 +354,6 @@ class Outcome:
         """Whether blocks were solved with squares in the place of another loss."""
         return self.program.formulation is not self.formulation and self.formulation.loss not in INVARIANT
 
-    @property
-    def linear_penalty(self) -> bool:
-        """Whether there is no penalty or a quadratic one, so that the estimate is linear in the data."""
-        return self.program.linear_penalty
-
     @cached_property
     def squares(self) -> LinearModel:
         """The equations whose squares the fit amounts to, multiplied by a factor."""
@@ -377,7 +373,7 @@ class Outcome:
 
         InputError for a penalty that is no squared norm, or a loss that no squared one stands for.
         """
-        if not self.linear_penalty:
+        if not self.program.linear_penalty:
             raise self.no_covariance("`forward` and monte_carlo serve any")
         form = ridge(self.squares, self.program.penalty_form)
         moves = self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
@@ -390,7 +386,7 @@ class Outcome:
     def _undefined(self) -> str:
         """The reason why there is no covariance; empty where there is one."""
         of = f"of formulation '{self.formulation.name}'"
-        if not self.linear_penalty:
+        if not self.program.linear_penalty:
             return f"the penalty {of} is not quadratic; only a normal prior has a posterior covariance"
         if self.known_covariance is None:
             return f"the loss {of} rests on a few equations and has no quadratic model"
@@ -478,10 +474,10 @@ class Outcome:
         (5, 0)
         """
         flags = diagnosis.flagged(self.problem, self.x)
-        problem = self.problem
-        if not flags or self.squared_loss or not self.linear_penalty or not isinstance(problem, CalibrationProblem):
+        problem, program = self.problem, self.program
+        if not flags or self.squared_loss or not program.linear_penalty or not isinstance(problem, CalibrationProblem):
             return flags
-        model, free = self.program.model, problem.parameters.free
+        model, free = program.model, problem.parameters.free
         if len(model.b) != len(problem.owners):  # reduced to a QR factor
             return flags
         number = dict(zip(problem.labels, problem.data.configuration, strict=True))
@@ -490,7 +486,7 @@ class Outcome:
             weight = self.penalty_weight / self.squares.factor
         except InputError:  # a loss with own variables has no quadratic model by which a row could be contradicted
             return flags
-        sure = contradicted(model, self.program.penalty_form, weight, default_widths(free) / free.scale, groups)
+        sure = contradicted(model, program.penalty_form, weight, default_widths(free) / free.scale, groups)
         return tuple(flag for flag, certain in zip(flags, sure, strict=True) if certain)
 
     @cached_property
@@ -524,7 +520,8 @@ class Outcome:
         Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
         """
         rest = self.stated.without({flag.label for flag in self.single})
-        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {f.size}" for f in self.single}
+        said = "outlier, {0.sigmas:.0f} standard deviations, {1}"
+        reasons = {f.label: said.format(f, in_unit(f.error, f.dimension)) for f in self.single}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.calibrate_again(rest), record=record)
 

@@ -19,7 +19,7 @@ from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.diagnosis import NOTICED, SLIGHT, decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
-from rpim_opt.problem.noise import UNITS
+from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.row_functions import measured_torques
@@ -411,9 +411,8 @@ def _beside_a_good_fit(
 def _large_residuals(result: Outcome, residuals: Mapping[str, tuple[float, float]]) -> Iterator[str]:
     """Say which residuals are beyond the stated noise, and which transmission errors beyond those of gears."""
     for dimension, (size, ratio) in residuals.items():
-        unit, si = UNITS[dimension]
         if ratio > NOISY:
-            yield f"residual RMS {three_digits(size / si)} {unit}, {three_digits(ratio)} times the measurement noise"
+            yield f"residual RMS {in_unit(size, dimension)}, {three_digits(ratio)} times the measurement noise"
     if result.learned is None or result.learned.curves is None:
         return
     size, ratio = result.learned.curves.size.value, result.noise_test().ratio
@@ -434,8 +433,7 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
     share[parameters.of_frames[parameters.identified]] = 0.0
     worst = int(np.argmax(share))
     if share[worst] > 1:
-        unit = "mm" if free.dimensions[worst] == "length" else "mrad"
-        yield f"{free.names[worst]} deviates by {three_digits(1e3 * result.x[worst])} {unit}"
+        yield f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}"
 
 
 def _held_base(result: Outcome, problem: CalibrationProblem) -> list[str]:

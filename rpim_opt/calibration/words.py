@@ -16,7 +16,7 @@ from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.calibration.verdict import REPEATABILITY, Verdict, rms
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.problem.noise import UNITS
+from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.camera import camera_blocks
 from rpim_opt.robot.extensions import EXPECTED
@@ -167,7 +167,7 @@ def _outlying(result: Outcome, advised: bool) -> list[str]:
     if not flagged:
         return []
     together = result.clustered
-    named = [f"{f.label} ({f.sigmas:.0f} standard deviations, residual {f.size})" for f in flagged]
+    named = [f"{f.label} ({f.sigmas:.0f} standard deviations, {in_unit(f.error, f.dimension)})" for f in flagged]
     lines = [f"Outliers: {listed(named, MOST_ROWS)}."]
     if together:
         lines.append(

@@ -172,7 +172,7 @@ sum_of_norms = Formulation("sum of norms", loss=SUM, penalty=SQUARES, loss_over=
 >>> import rpim_opt as ro
 >>> instance = ro.load("paper_arm", variant="misprints")  # 27 points, two of them misprinted
 >>> result = ro.calibrate(instance.problem, ro.sum_of_norms, weight=ro.reml)
->>> [f"{flag.label}: {flag.size}" for flag in result.flagged[:2]]
+>>> [f"{flag.label}: {1e3 * flag.error:.0f} mm" for flag in result.flagged[:2]]
 ['T8-6: 38 mm', 'T8-7: 15 mm']
 """
 minimax = Formulation("minimax", loss=LARGEST, penalty=SQUARES, loss_over="configuration")

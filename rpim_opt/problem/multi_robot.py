@@ -19,7 +19,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import equation_numbers
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import shared_bases
-from rpim_opt.robot.parameters import Parameters, concatenated, frame_of, known_patterns, of_session, session_prefix
+from rpim_opt.robot.parameters import concatenated, frame_of, known_patterns, of_session, session_prefix
 
 NAME = re.compile(r"(?!tool$|base$)[A-Za-z]\w*")
 MOST_PARAMETERS = 2000  # parameters up to which sessions are identified
@@ -105,25 +105,21 @@ def _common(
         wanting = [key for key in parts if any(fits(name, pattern) for pattern in patterns.get(key, ()))]
         having = [key for key in wanting if name in parts[key].parameters.names]
         for key in having[1:]:
-            _require_alike(name, having[0], parts[having[0]].parameters, key, parts[key].parameters)
-            common[having[0]].add(name)
+            first, where = having[0], f"together, shared '{name}'"
+            p, other = parts[first].parameters, parts[key].parameters
+            i, k = p.names.index(name), other.names.index(name)
+            for what in ("dimensions", "scale", "tolerance", "identified"):
+                mine, theirs = getattr(p, what)[i], getattr(other, what)[k]
+                if mine != theirs:
+                    found = f"{what.removesuffix('s')} {mine} in '{first}' and {theirs} in '{key}'"
+                    raise InputError(where, found, "the same in all")
+            apart = abs(p.nominal[i] - other.nominal[k])
+            if apart > FAR * p.scale[i]:
+                found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} scales"
+                raise InputError(where, found, "one nominal value in all")
+            common[first].add(name)
             common[key].add(name)
     return common
-
-
-def _require_alike(name: str, first: str, p: Parameters, second: str, other: Parameters) -> None:
-    """Refuse a shared parameter that two problems state differently."""
-    i, k = p.names.index(name), other.names.index(name)
-    where = f"together, shared '{name}'"
-    for what in ("dimensions", "scale", "tolerance", "identified"):
-        mine, theirs = getattr(p, what)[i], getattr(other, what)[k]
-        if mine != theirs:
-            found = f"{what.removesuffix('s')} {mine} in '{first}' and {theirs} in '{second}'"
-            raise InputError(where, found, "the same in all")
-    apart = abs(p.nominal[i] - other.nominal[k])
-    if apart > FAR * p.scale[i]:
-        found = f"nominal values {apart:g} apart in '{first}' and '{second}', more than {FAR:g} scales"
-        raise InputError(where, found, "one nominal value in all")
 
 
 def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
 
 UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
@@ -17,7 +18,7 @@ UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
 def in_unit(error: float | None, dimension: str) -> str:
     """Return an error [SI] with its unit; an empty text for None."""
     unit, si = UNITS[dimension]
-    return "" if error is None else f"{error / si:.3g} {unit}"
+    return "" if error is None else f"{three_digits(error / si)} {unit}"
 
 
 @dataclass(frozen=True, eq=False)

@@ -255,9 +255,8 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
         drawn.append(figure(draw, title, f"{view.capitalize()}.{frame}", height))
     yield "figures", drawn
     units = joint_columns(map_.region.problem.robot.joint_dimensions)
-    ranges = []
-    for (name, si), ends in zip(units.items(), map_.region.limits, strict=True):
-        ranges.append([*name.split("_"), *(f"{end / si:.2f}" for end in ends)])
+    known = zip(units.items(), map_.region.limits, strict=True)
+    ranges = [[*name.split("_"), *(f"{end / si:.2f}" for end in ends)] for (name, si), ends in known]
     joints = Table("Joint ranges of the region", ["joint", "unit", "from", "to"], ranges)
     yield "beside", [("table", _budget(map_, result)), ("table", joints)]
 
@@ -387,7 +386,8 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
 def _flagged(result: Calibration) -> Block:
     flagged = result.flagged
     status = "flagged, in the data"
-    rows = [[flag.label, f"{flag.sigmas:.1f}", flag.size, status] for flag in flagged[:MOST_FLAGGED]]
+    worst = flagged[:MOST_FLAGGED]
+    rows = [[flag.label, f"{flag.sigmas:.1f}", in_unit(flag.error, flag.dimension), status] for flag in worst]
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]
@@ -408,9 +408,8 @@ def _convergence(result: Calibration) -> Iterator[Block]:
         f"violation {c.violation:.2g} (in prior standard deviations)."
     )
     yield "text", [result.message, text]
-    rows = []
-    for k, it in enumerate(result.history, start=1):
-        rows.append([str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"])
+    history = enumerate(result.history, start=1)
+    rows = [[str(k), f"{it.objective:.8g}", f"{it.step:.2e}", f"{it.weight:.4g}"] for k, it in history]
     yield "table", Table("Iterations", ["iteration", "objective", "step [prior standard deviations]", "weight"], rows)
 
 

@@ -18,7 +18,7 @@ from scipy.special import ndtr, stdtrit
 from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import csv_text, frame_of
-from rpim_opt.basics.text import counted, html_table, listed, markdown, progress_bar, table
+from rpim_opt.basics.text import counted, html_table, listed, markdown, progress_bar, table, three_digits
 from rpim_opt.report.plot import logarithmic
 from rpim_opt.store.instances import Instance
 from rpim_opt.study import studies
@@ -28,7 +28,6 @@ from rpim_opt.study.methods import (
     OK,
     UNDELIVERED,
     USUAL,
-    WITH_FIGURES,
     Row,
     methods_of,
     metrics_of,
@@ -115,7 +114,11 @@ def compare(
     ways = splits_of(splits)
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
-    numbered = _seeds(seeds)
+    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):  # how many
+        if seeds > MOST_DRAWS:
+            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
+        seeds = range(max(int(seeds), 0))
+    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
@@ -158,15 +161,6 @@ def compare(
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
 
 
-def _seeds(stated: int | Iterable[int]) -> list[int]:
-    """Return seeds that are stated one by one, or by how many there are."""
-    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
-        if stated > MOST_DRAWS:
-            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
-        stated = range(max(int(stated), 0))
-    return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
-
-
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:
     """Return numbers of a kind, ``int`` or ``float``, each once."""
     values = list(stated) if isinstance(stated, Iterable) else [stated]
@@ -182,10 +176,10 @@ class Comparison:
     """Replicates of methods on problems, one row each.
 
     ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
-    and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not delivered`` by its figures, ``impossible``,
-    ``failed``) with its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the
-    ``metrics``. ``drawn`` are problems that every seed draws anew, ``asked`` the grid in words, ``made`` script,
-    package, versions and time.
+    and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not delivered``, ``impossible``, ``failed``) with
+    its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``.
+    ``drawn`` are problems that every seed draws anew, ``asked`` the grid in words, ``made`` script, package, versions
+    and time.
 
     >>> import rpim_opt as ro
     >>> def arms(seed):
@@ -253,7 +247,7 @@ class Comparison:
         medians = []
         for each in summary.standings:
             by_problem = [[v for pair, v in of[each.method].items() if pair[0] == name] for name in self.problems]
-            medians.append([each.method, *(number(float(np.median(v))) if v else "-" for v in by_problem)])
+            medians.append([each.method, *(three_digits(float(np.median(v))) if v else "-" for v in by_problem)])
         text = "\n\n".join([
             f"{summary.metric} of the held-out rows; * 95 % interval excludes 1",
             markdown(summary.header, summary.cells()),
@@ -287,7 +281,7 @@ class Comparison:
 
     @property
     def _has_figures(self) -> bool:
-        return any(row["status"] in WITH_FIGURES for row in self.rows)
+        return any(row["status"] in (OK, UNDELIVERED) for row in self.rows)
 
 
 # --- the ranking of methods ------------------------------------------------------------------------------------------
@@ -297,19 +291,18 @@ class Comparison:
 class Standing:
     """Metrics of a method, and its ratio to the reference on the same replicates.
 
-    Of its ``replicates`` some are ``missing`` (without a figure) or ``undelivered`` (their figures count); ``median``
-    and ``worst`` are of its figures. ``ratio`` is the geometric mean of its figures over those of the reference, every
-    problem counting the same (None without pairs), ``low`` and ``high`` the ends of its 95 % interval (None where there
-    is too little to say). On ``wins``, ``ties`` and ``losses`` replicates it is better than the reference, as good
-    within 1 %, or worse; one without a figure loses against one with.
+    Of its ``replicates`` some are ``missing`` (without a figure); ``median`` and ``worst`` are of its figures.
+    ``ratio`` is the geometric mean of its figures over those of the reference, every problem counting the same (None
+    without pairs), ``low`` and ``high`` the ends of its 95 % interval (None where there is too little to say). On
+    ``wins``, ``ties`` and ``losses`` replicates it is better than the reference, as good within 1 %, or worse; one
+    without a figure loses against one with.
     """
 
     method: str
     replicates: int
     missing: int
-    undelivered: int
-    median: float | None
-    worst: float | None
+    median: float
+    worst: float
     ratio: float | None
     low: float | None
     high: float | None
@@ -361,12 +354,14 @@ class Summary:
         for each in self.standings:
             interval = ""
             if each.low is not None and each.high is not None:
-                interval = f"{number(each.low)} to {number(each.high)}{' *' if each.different else ''}"
-            against = [number(each.ratio), interval, f"{each.wins}/{each.ties}/{each.losses}"]
+                interval = f"{three_digits(each.low)} to {three_digits(each.high)}{' *' if each.different else ''}"
+            ratio = "" if each.ratio is None else three_digits(each.ratio)
+            against = [ratio, interval, f"{each.wins}/{each.ties}/{each.losses}"]
             if each.method == self.reference:
                 against = ["1", "reference", ""]
             missing = f"{each.missing} of {each.replicates}"
-            rows.append([each.method, number(each.median), number(each.worst), *against, missing][: len(self.header)])
+            known = map(three_digits, (each.median, each.worst))
+            rows.append([each.method, *known, *against, missing][: len(self.header)])
         return rows
 
     def __str__(self) -> str:
@@ -375,16 +370,6 @@ class Summary:
 
     def _repr_html_(self) -> str:
         return html_table(self.header, self.cells(), self.notes)
-
-
-def number(value: float | None) -> str:
-    """Return a number with three digits; an empty text for None."""
-    if value is None:
-        return ""
-    if 1e-3 <= abs(value) < 1e4:
-        power = int(f"{value:e}".partition("e")[2])
-        return f"{value:.{max(2 - power, 0)}f}"
-    return f"{value:.3g}"
 
 
 def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[str]) -> Summary:
@@ -410,9 +395,8 @@ def summarize(rows: Rows, metric: str, against: str | None, drawn: AbstractSet[s
         wins = sum(log < -TIE for log in logs.values())
         losses = sum(log > TIE for log in logs.values())
         paired = {pair: logs[pair] for pair in own if pair in other}
-        undelivered = sum(row["status"] == UNDELIVERED for row in mine)
         standing = Standing(
-            method, len(mine), len(mine) - len(own), undelivered, float(np.median(list(own.values()))),
+            method, len(mine), len(mine) - len(own), float(np.median(list(own.values()))),
             max(own.values()), *interval(paired, drawn), wins, len(logs) - wins - losses, losses,
         )  # fmt: skip
         known.append(standing)

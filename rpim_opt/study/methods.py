@@ -43,8 +43,7 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 }
 """Methods without convex programming; ``nominal`` fits base and tools alone."""
 OK = "ok"
-UNDELIVERED = "not delivered"
-WITH_FIGURES = (OK, UNDELIVERED)  # statuses of replicates that have figures
+UNDELIVERED = "not delivered"  # but with figures
 Thing = TypeVar("Thing")
 Problem = Instance | Callable[[int], Any]
 """A problem, or a function of a seed with another problem for every seed."""

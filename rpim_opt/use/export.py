@@ -22,7 +22,7 @@ from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
 from rpim_opt.bayes.model_selection import CONDITIONS
 from rpim_opt.bayes.prior_terms import prior_penalty
-from rpim_opt.calibration.acceptance import Workspace, accept, inconclusive, measured_workspace
+from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import transmission_errors
@@ -40,7 +40,6 @@ from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, ref
 from rpim_opt.use.compensation import tool_uncertainty
 
 ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's
-CURVES = "transmission errors of joints, which model 'auto' adds where the data support them; without --corrections"
 CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
@@ -81,10 +80,7 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
         joint_map[i] *= 1 + of[f"ratio{i + 1}"]
     extras = [name for name, value in beyond_geometry(result, robot).items() if value]
     if extras:
-        accepted = (
-            "MDH parameters, base and tool: files support nothing else. `export_files` fits the geometry without model "
-            "extensions, `compensate` uses all parameters"
-        )
+        accepted = "MDH parameters, base and tool: `export_files` fits these alone, `compensate` uses all parameters"
         raise InputError("the calibration", listed(extras, 6), accepted)
     prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
     if prefix + "x" not in of:
@@ -121,7 +117,7 @@ def export_files(
     marker: str | None = None,
     robot: str = "",
     despite_verdict: bool = False,
-    **frames: Any,
+    **frames: str | bool | None,
 ) -> Exported:
     """Export the identified robot to files of other tools; all requested files are written, or none.
 
@@ -132,8 +128,12 @@ def export_files(
     a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
     numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
     ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
-    ``marker`` is the reflector, ``robot`` which of several (`together`), ``frames`` are ``root``, ``tip`` and
-    ``tip_measured`` of `export_urdf`.
+    ``marker`` is the reflector, ``robot`` which of several (`together`).
+
+    ``root`` and ``tip``, links of the URDF between which the robot is, are by default those that it was read between.
+    The tip link stays where the file has it behind the last joint, unless ``tip_measured``: the reflector is its
+    origin, which goes to its identified place. Where origins were identified, those of all chains are written, and ends
+    of one are refused.
 
     A robot that is neither accepted nor rejected, or no more certain than the nominal one errs, is written with the
     note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
@@ -149,11 +149,9 @@ def export_files(
         )
         corrections = None
     note, remarks, undecided = _judged(whole, result, despite_verdict)
-    note = " ".join(filter(None, [note, whole.caution]))
     which: dict[str, Any] = {"marker": marker, "robot": robot}
-    frames |= {**which, "despite_verdict": True}  # it was asked
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
-        (urdf, lambda source, target: export_urdf(result, source, target, **frames)),
+        (urdf, partial(_write_urdf, result, marker, robot, **frames)),
         (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, **which).robot, target)),
         (ur_calibration, partial(export_ur_calibration, result, robot=robot)),
         (camera_info, partial(export_camera, result)),
@@ -178,9 +176,7 @@ def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: st
     if sources and out is None:
         raise InputError("--out", "nothing", f"where to write the corrected {sources[0][0].name}")
     if out is not None and not sources:
-        raise InputError(
-            "--out", f"{out} without a file to correct", "--urdf, --ur-calibration, ...; --mdh names its own"
-        )
+        raise InputError("--out", f"{out} without a file to correct", "--urdf, ...; --mdh and others name their own")
     place = Path(out or "")
     writers: list[Writer] = []
     for source, write in sources:
@@ -202,37 +198,28 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
         doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
         undecided = bool(doubt) and verdict.delivered
         remarks += [accepted.summary] if accepted.verdict == "accepted" else []
-    note = verdict.require(despite_verdict) or doubt
+    note = " ".join(filter(None, [verdict.require(despite_verdict) or doubt, whole.caution]))
     if alone is whole or found is None:
         return note, remarks, undecided
-    limit = found.requirement.limit if accepted else np.inf
-    less, above = _of_geometry(alone, found, limit)
-    other = "Other points and the orientation of the flange may be less certain: `compensate --tool` states their"
-    return " ".join(filter(None, [note, less])), [*remarks, f"{other} uncertainty."], undecided or above
-
-
-def _of_geometry(alone: Calibration, found: Workspace, limit: float) -> tuple[str, bool]:
-    """Return the uncertainty of geometry alone as sentences, and whether it is above the limit [m]."""
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
     bound, required = float((found.expanded + stays).max()), found.requirement
-    text = (
-        f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at most "
-        f"{1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes what geometry alone misses, at "
-        f"most {1e3 * stays.max():.3f} mm there."
+    note += (
+        f" Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at "
+        f"most {1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes what geometry alone "
+        f"misses, at most {1e3 * stays.max():.3f} mm there."
     )
-    above = bound > limit
-    if above:
-        text += f" It is above the limit of {1e3 * limit:g} mm; only that of the whole model is within it."
-    return text, above
+    if accepted and bound > required.limit:
+        undecided = True
+        note += f" It is above the limit of {1e3 * required.limit:g} mm; only that of the whole model is within it."
+    remarks.append("Other points and the flange's orientation may be less certain: `compensate --tool` says how much.")
+    return note.strip(), remarks, undecided
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
-    """Return the calibration without what no description of a robot holds, and a sentence on the loss of accuracy.
+    """Return the calibration without what is `beyond_geometry`, but for origins, and a sentence on the accuracy lost.
 
-    That are model extensions, selected by evidence or identified as stated, and terms of a user's own
-    (`beyond_geometry`), but for the origins of a URDF. The geometry of the whole model is not the best one without
-    them: the same rows are calibrated once more with the same settings, also those that only they explain. A
-    calibration in which they are zero is returned as it is.
+    The geometry of the whole model is not the best one without extensions and terms of a user's own: the same rows are
+    calibrated once more, also those that only they explain. Returned as it is where they are zero.
     """
     beyond = {
         name: value
@@ -251,7 +238,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         return problem.with_parameters(replace(p, nominal=nominal, identified=np.isin(p.names, free) & ~zero))
 
     penalty = result.formulation.penalty
-    if getattr(penalty, "maker", "") != prior_penalty.__name__:
+    if penalty is None or getattr(penalty, "maker", "") != prior_penalty.__name__:
         stated = bare(result.stated)
         if result.learned is not None:
             stated = stated.without({row.label for row in result.learned.left_out})
@@ -296,7 +283,8 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     """Write four rows a period of the finest harmonic, with standard deviations; say how large the errors are."""
     curves = transmission_errors(result)
     if not curves:
-        raise InputError("the calibration", "no transmission error", CURVES)
+        accepted = "transmission errors of joints, which model 'auto' adds where the data support them"
+        raise InputError("the calibration", "no transmission error", accepted)
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
     for curve in curves:
         rows = zip(np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard, strict=True)
@@ -310,56 +298,36 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     ]
 
 
-def export_urdf(
+def export_urdf(result: Calibration, source: str | Path, target: str | Path, **options: Any) -> list[str]:
+    """Write a URDF alone, with the options of `export_files`; return its notes."""
+    return export_files(result, target, urdf=source, **options).notes
+
+
+def _write_urdf(
     result: Calibration,
-    source: str | Path,
-    target: str | Path,
+    marker: str | None,
+    robot: str,
+    source: Path,
+    target: Path,
     root: str | None = None,
     tip: str | None = None,
-    marker: str | None = None,
     tip_measured: bool = False,
-    despite_verdict: bool = False,
-    robot: str = "",
 ) -> list[str]:
-    """Write a URDF with the identified origins, and base and tool if they belong to the file.
+    """Write the identified origins, and base and tool if they belong to the file; say where root and reflector are.
 
-    An identified base that lies near the file's root is the same frame, known better, and is written; elsewhere it is
-    the instrument's own. The tip link stays where the file has it behind the last joint, unless ``tip_measured``: the
-    reflector (``marker`` of several) is the tip link's origin, which goes to its identified place. Returned are
-    sentences on the places of root and reflector in the frames of the instrument and of the tip link.
-
-    ``source`` is the original, ``root`` and ``tip`` are its links between which the robot is, as for `read_urdf`, by
-    default those that the robot was read between; ``robot`` and ``despite_verdict`` as for `export_files`. InputError
-    for several reflectors of which none is named as the tip, and for ends of one chain where origins were identified:
-    those of all chains are written.
-
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> arm = ro.read_urdf("arm.urdf")
-    >>> parameters = ro.robot.model_parameters(arm.robot, arm.base, {"": arm.tool}).identify(["d1"])
-    >>> data = ro.Dataset.of(np.linspace(-1, 1, 8)[:, None], np.zeros((8, 3)), 1e-4)
-    >>> empty = ro.CalibrationProblem(arm.robot, parameters, data)
-    >>> longer = empty.on(ro.Dataset.of(data.q, empty.modelled(np.array([0.001]))[0], 1e-4))
-    >>> ro.use.export_urdf(ro.calibrate(longer, weight=0.0), "arm.urdf", "identified.urdf")
-    []
-    >>> (ro.read_urdf("identified.urdf").robot.mdh - arm.robot.mdh)[0, 3].round(6)  # [m]
-    np.float64(0.001)
+    An identified base near the file's root is the same frame, known better, and is written.
     """
-    note = result.verdict.require(despite_verdict)
     of = {own_name(name): x for name, x in zip(result.problem.parameters.free.names, result.x, strict=True)}
     if any(name.startswith(OF_JOINTS) for name in of):
-        options = {"root": root, "tip": tip, "tip_measured": tip_measured, "marker": marker, "robot": robot}
-        stated = [name for name, value in options.items() if value]
+        ends = {"root": root, "tip": tip, "tip_measured": tip_measured, "marker": marker, "robot": robot}
+        stated = [name for name, value in ends.items() if value]
         if stated:
-            raise InputError(
-                "export of origins",
-                joined(stated),
-                "none of these: all origins are written; mount_* in identify moves a tip link",
-            )
-        return write_all([(Path(target), partial(_write_tree, result, of, source))], note)
+            accepted = "none of these: all origins are written; mount_* in identify moves a tip link"
+            raise InputError("export of origins", joined(stated), accepted)
+        return _write_tree(result, of, source, target)
     arm = identified(result, marker, robot)
-    ends = remembered_ends(source, result.problem.arms[robot])
-    own = read_urdf(source, root or ends[0], tip or ends[1])
+    read = remembered_ends(source, result.problem.arms[robot])
+    own = read_urdf(source, root or read[0], tip or read[1])
     root, tip = remembered_ends(source, own.robot)
     p = result.problem.parameters.of_robot(robot)
     known = reflectors(p.names)
@@ -388,12 +356,8 @@ def export_urdf(
         there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
         notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
     notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker, robot)
-
-    def write(path: Path) -> list[str]:
-        write_urdf(source, arm.robot, path, root, tip, base, tool)
-        return notes
-
-    return write_all([(Path(target), write)], note)
+    write_urdf(source, arm.robot, target, root, tip, base, tool)
+    return notes
 
 
 def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None, robot: str) -> list[str]:
@@ -421,7 +385,7 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
 def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path, target: Path) -> list[str]:
     """Write the origins of the joints of all chains, from deviations by the joints' own names."""
     p = result.problem.parameters
-    moved = [name for name, x in zip(p.free.names, result.x, strict=True) if x]
+    moved = np.array(p.free.names)[result.x != 0].tolist()
     others = [name for name in moved if not own_name(name).startswith(OF_JOINTS)]
     foreign = [name for name in others if of_joint(name) or name in p.terms]
     if foreign:

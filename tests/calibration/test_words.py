@@ -54,7 +54,6 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
         active_bounds=held,
         shadow_prices=(ShadowPrice("a2 by 0.5 mm", "mm", 0.0, 2.0, 0.1, 0.2, 9.0),) * count,
         squared_loss=squared_loss,
-        linear_penalty=False,
         problem=RESULT.problem,
         record=RESULT.record,
         x=np.zeros(len(FREE)),
@@ -67,7 +66,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
 def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     assert flagged(0) == ["Done."]
     eight = flagged(8)[0]
-    assert eight.startswith("Outliers: r0 (10 standard deviations, residual 1.23 mm), ")
+    assert eight.startswith("Outliers: r0 (10 standard deviations, 1.23 mm), ")
     assert "r7 (17 standard deviations" in eight
     assert "more" not in eight
     eleven = flagged(11)

@@ -399,5 +399,5 @@ def test_a_simulated_folder_bends_by_gravity_without_a_column_of_torques(tmp_pat
 
 def test_a_urdf_does_not_hold_what_bends(tmp_path: Path) -> None:
     result, *_ = calibrated(arm())
-    with pytest.raises(ro.InputError, match=r"compliance2.*files support nothing else"):
+    with pytest.raises(ro.InputError, match=r"compliance2.*`export_files` fits these alone"):
         ro.use.identified(result)
