@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import linecache
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.text import shortened
 from rpim_opt.basics.units import UNITS, display
 from rpim_opt.convex.arguments import Arguments, arguments_of, every_movement, places, problem_of, whole
 from rpim_opt.convex.expressions import cp
@@ -73,17 +75,27 @@ class Ready:
         """The maker's name and its arguments, as a file holds them."""
         return [self.maker, *self.arguments]
 
+    @property
+    def name(self) -> str:
+        """Its name in errors and reports: the call that makes it."""
+        return f"{self.maker}({', '.join(map(repr, self.arguments))})"
+
 
 def name_of(function: Any, k: int) -> str:
-    """Return the user's name of a constraint function."""
-    if isinstance(function, Parsed):
-        return function.name
-    call = getattr(function, "stated", None)
-    if call:
-        maker, *arguments = call
-        return f"{maker}({', '.join(repr(a) for a in arguments)})"
-    name = function.name if isinstance(function, Box) else getattr(function, "__name__", "<lambda>")
-    return f"constraint {k + 1}" if name == "<lambda>" else name
+    """Return the user's name of a constraint function: of a lambda what it returns, as its file or notebook has it."""
+    name = getattr(function, "name", getattr(function, "__name__", "<lambda>"))
+    if name != "<lambda>":
+        return str(name)
+    code = getattr(function, "__code__", None)
+    known = [place for place in (code.co_positions() if code else ()) if None not in place]
+    places = [place for place in known if place[::2] < place[1::2]]  # from line and byte to line and byte
+    lines = linecache.getlines(code.co_filename) if code and places else []
+    if not lines:
+        return f"constraint {k + 1}"
+    (first, start), (last, end) = min(place[::2] for place in places), max(place[1::2] for place in places)
+    text = "".join(lines[first - 1 : last]).encode()[start:]
+    behind = len(lines[last - 1].encode()) - end
+    return shortened(" ".join(text[: len(text) - behind].decode().split()))
 
 
 def as_text(deviation: float, dimension: str) -> str:

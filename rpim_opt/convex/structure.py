@@ -20,7 +20,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.convex.arguments import arguments_of
-from rpim_opt.convex.constraints import Box, Ready
+from rpim_opt.convex.constraints import Box, Ready, name_of
 from rpim_opt.convex.expressions import (
     NORM2,
     SQUARES,
@@ -92,8 +92,7 @@ class Expressions:
         known = arguments_of(z, parameters)
         live = []
         for k, constraint in enumerate(formulation.constraints):
-            name = getattr(constraint, "name", getattr(constraint, "__name__", "<lambda>"))
-            of = f"{where}, {f'constraint {k + 1}' if name == '<lambda>' else name}"
+            of = f"{where}, {name_of(constraint, k)}"
             live.append(listed(called(constraint, of, z, known), of))
         composed = {"penalty": self.penalty_of_z} if instead and self.penalty is not None else {}
         if seen is not r:  # norms are convex and nonnegative, as absolute values are

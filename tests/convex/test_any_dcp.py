@@ -124,7 +124,7 @@ REFUSED: dict[str, tuple[dict[str, Any], str]] = {
     "a constraint by name": ({"constraints": ("box",)}, "constraints: found 'box', accepted: functions"),
     "a bound that is NaN": (
         {"constraints": lambda z, p: z <= np.nan},
-        r"constraint 1: found a constant that .*\(NaN\)",
+        r"z <= np.nan: found a constant that .*\(NaN\)",
     ),
     "a factor that is NaN": ({"penalty": lambda z: np.nan * SQUARES(z)}, r"penalty: found a constant that .*\(NaN\)"),
 }

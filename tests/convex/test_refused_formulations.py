@@ -73,11 +73,11 @@ def test_what_cannot_be_meant_is_named(what: str) -> None:
 def test_the_innermost_part_that_breaks_the_rules_is_named() -> None:
     with pytest.raises(ro.InputError, match="convexity CVXPY cannot verify") as error:
         posed(constraints=lambda z, p: 1 + cp.sqrt(cp.sum_squares(z)) <= 2).solve(1.0)
-    assert "1 +" not in str(error.value)
+    assert "1 +" not in error.value.accepted
 
 
 def test_a_strict_inequality_is_refused_by_the_name_of_its_constraint() -> None:
-    with pytest.raises(ro.InputError, match=r"constraint 1: found Strict inequalities are not allowed, accepted"):
+    with pytest.raises(ro.InputError, match=r"'own', z < 2: found Strict inequalities are not allowed, accepted"):
         posed(constraints=lambda z, p: z < 2).solve(1.0)
 
 

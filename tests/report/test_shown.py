@@ -100,10 +100,14 @@ def test_frames_hold_what_the_tables_say() -> None:
         (ro.Formulation("mine", penalty=lambda z: cp.sum(cp.sqrt(cp.abs(z)))), "penalty", "abs(z) convex"),
         (
             ro.Formulation("mine", constraints=(ro.in_ball(2.0, "*"), lambda z, p: cp.norm(z) >= 1)),
-            "constraint 2",
+            "cp.norm(z) >= 1",
             "convex <= concave",
         ),
-        (ro.Formulation("mine", constraints=(lambda z, p: cp.exp(z[0]) == 1,)), "constraint 1", "affine == affine"),
+        (
+            ro.Formulation("mine", constraints=(lambda z, p: cp.exp(z[0]) == 1,)),
+            "cp.exp(z[0]) == 1",
+            "affine == affine",
+        ),
         (
             ro.Formulation("mine", loss=lambda v: -cp.sum(v), loss_over="configuration"),
             "loss",
