@@ -37,6 +37,7 @@ FIRST_ACCURACY = 0.01  # relative accuracy of the first solve: its linearization
 FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
 NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
 NOTHING_PROMISED = 3  # iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest
+CIRCLE = 20  # iterations that lower the objective by no more than its accuracy, after which the loop is at rest
 DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objective
 SAME_POSITIONS = 1e-4  # what a round may change, relative to 1 + |z|: the error of predicted positions is its square
 ROUNDS, LEAST_SHARE = 20, 1 / 8  # rounds at most; least share of the way to its solution at which the next linearizes
@@ -221,6 +222,11 @@ class State:
         """Return a length relative to that of the solution."""
         return length / (1 + float(np.linalg.norm(self.z)))
 
+    def circles(self, accuracy: float) -> bool:
+        """Whether the last iterations have not lowered the objective, though each step promises to."""
+        passed = [each.objective for each in self.history if each.weight == self.choice.weight]
+        return len(passed) > CIRCLE and min(passed[-CIRCLE:]) >= min(passed[:-CIRCLE]) - accuracy
+
 
 @dataclass(frozen=True, eq=False)
 class Loop:
@@ -339,7 +345,8 @@ class Loop:
             # a short step of a damped program says nothing: ask for the full one, unless that has failed here
             return _rested(state) if state.rejected else replace(state, damping=0.0)
         state = replace(state, idle=state.idle + 1 if nothing else 0)
-        if choice.settled and (promised <= best or state.idle >= NOTHING_PROMISED):
+        at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.circles(accuracy)
+        if choice.settled and at_rest:
             return replace(state, outcome="rest")
         waiting = choice.settled and not choice.final and not choice.weights
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
