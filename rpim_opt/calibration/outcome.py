@@ -520,8 +520,8 @@ class Outcome:
         Rows that are `clustered` stay: without them the robot would be extrapolated where the model fails.
         """
         rest = self.stated.without({flag.label for flag in self.single})
-        said = "outlier, {0.sigmas:.0f} standard deviations, {1}"
-        reasons = {f.label: said.format(f, in_unit(f.error, f.dimension)) for f in self.single}
+        size = {f.label: in_unit(f.error, f.dimension) for f in self.single}
+        reasons = {f.label: f"outlier, {f.sigmas:.0f} standard deviations, {size[f.label]}" for f in self.single}
         record = replace(self.record, excluded={**self.record.excluded, **reasons}, digest="")
         return replace(self.calibrate_again(rest), record=record)
 

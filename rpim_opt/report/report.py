@@ -386,8 +386,7 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
 def _flagged(result: Calibration) -> Block:
     flagged = result.flagged
     status = "flagged, in the data"
-    worst = flagged[:MOST_FLAGGED]
-    rows = [[flag.label, f"{flag.sigmas:.1f}", in_unit(flag.error, flag.dimension), status] for flag in worst]
+    rows = [[f.label, f"{f.sigmas:.1f}", in_unit(f.error, f.dimension), status] for f in flagged[:MOST_FLAGGED]]
     if len(flagged) > MOST_FLAGGED:
         rows.append([f"and {len(flagged) - MOST_FLAGGED} more", "", "", f"{status}; result.json names them"])
     rows += [[label, "", "", f"excluded: {reason}"] for label, reason in result.record.excluded.items()]

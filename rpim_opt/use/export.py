@@ -221,12 +221,10 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     The geometry of the whole model is not the best one without extensions and terms of a user's own: the same rows are
     calibrated once more, also those that only they explain. Returned as it is where they are zero.
     """
-    beyond = {
-        name: value
-        for robot in result.robots
-        for name, value in beyond_geometry(result, robot).items()
-        if not own_name(name).startswith(OF_JOINTS)
-    }
+    beyond: dict[str, float] = {}
+    for robot in result.robots:
+        own = beyond_geometry(result, robot)
+        beyond |= {name: own[name] for name in own if not own_name(name).startswith(OF_JOINTS)}
     if not any(beyond.values()):
         return result, []
     free = result.problem.parameters.free.names
@@ -237,12 +235,21 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         nominal = np.where(zero, 0.0, p.nominal)
         return problem.with_parameters(replace(p, nominal=nominal, identified=np.isin(p.names, free) & ~zero))
 
-    penalty = result.formulation.penalty
+    learned, penalty = result.learned, result.formulation.penalty
+    selected, added, left_out = (
+        ((), (), ()) if learned is None else (learned.extensions, learned.added, learned.left_out)
+    )
+    lost = [each for each in selected if each not in CONDITIONS]
+    lost += [name for name, value in beyond.items() if value and name not in added]
     if penalty is None or getattr(penalty, "maker", "") != prior_penalty.__name__:
-        stated = bare(result.stated)
-        if result.learned is not None:
-            stated = stated.without({row.label for row in result.learned.left_out})
-        alone = result.calibrate_again(stated, model="geometry")
+        stated = bare(result.stated).without({row.label for row in left_out})
+        try:
+            alone = result.calibrate_again(stated, model="geometry")
+        except (InputError, ValueError) as error:  # of functions of a user's own
+            found = f"no fit without {listed(lost, 6)}, which files cannot hold: {str(error).rstrip('.')}"
+            raise InputError(
+                f"formulation '{result.formulation.name}'", found, "functions that need none of it"
+            ) from error
         if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.learned.left_out:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
@@ -254,10 +261,6 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     data = result.record.validation
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
-    learned = result.learned
-    selected, added = ([], ()) if learned is None else (learned.extensions, learned.added)
-    lost = [each for each in selected if each not in CONDITIONS]
-    lost += [name for name, value in beyond.items() if value and name not in added]
     sentence = (
         f"Files cannot hold {listed(lost, 6)}: their geometry is from a fit of its own to the same measurements, with "
         f"{left:.3f} mm RMS on the {where} rows ({whole:.3f} mm with the whole model)."
@@ -267,10 +270,9 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
 
 def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
     """Write a DH table; say in which convention."""
-    robot = arm.robot
-    write_robot(robot, target, dh)
+    write_robot(arm.robot, target, dh)
     convention = CONVENTIONS[dh.lower()]
-    alpha, a = robot.mdh[0, :2]
+    alpha, a = arm.robot.mdh[0, :2]
     base, inside = arm.base, ""
     if convention == "standard" and (alpha or a):
         base = frame_numbers(numeric_frame(base) @ numeric_link(alpha, a))

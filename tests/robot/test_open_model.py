@@ -8,6 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import casadi as ca
+import cvxpy as cp
 import numpy as np
 import pytest
 
@@ -356,6 +357,23 @@ def test_files_hold_the_geometry_of_a_calibration_without_a_users_term(
     alone, (said,) = ro.use.geometry_alone(ro.calibrate(stated, weight=weight))
     assert "Files cannot hold own2: " in said
     assert np.abs(alone.robot.mdh - rigid.robot.mdh).max() < 1e-9
+
+
+@pytest.mark.parametrize("weight", [None, 1.0])
+def test_functions_that_need_a_users_term_fit_no_geometry_without_it(weight: float | None, tmp_path: Path) -> None:
+    _, own = both("ecc2_cos")
+    own = measured(own, noise=SIGMA, own2=3e-4)
+    D = np.eye(len(own.parameters.free))
+    for functions in (
+        {"penalty": lambda z: cp.sum_squares(D @ z)},
+        {"penalty": cp.sum_squares, "constraints": (lambda z, p: p.x["own2"] <= 1e-3,)},
+    ):
+        found = ro.calibrate(own, ro.Formulation("mine", **functions), weight)
+        with pytest.raises(
+            ro.InputError, match="formulation 'mine': found no fit without own2, own3, own4, which files"
+        ):
+            ro.use.export_files(found, mdh=tmp_path / "arm.toml")
+    assert not (tmp_path / "arm.toml").exists()
 
 
 def test_commands_are_corrected_for_links_and_a_tool_under_any_payload() -> None:
