@@ -361,6 +361,33 @@ class Evidence:
         """Return the marginal likelihood of a model with a subset of the columns (p,)."""
         return replace(self, data=replace(self.data, X=self.data.X[:, keep]), prior=self.prior.of(keep))
 
+    def overdispersion(self, point: Point, q: Array) -> Array:
+        """Return by which factors k >= 1 (joints,) the covariance C is too small, with joint values q (m, joints).
+
+        What a model lacks repeats from row to row, so that C, which takes it for chance, is too small; inside the
+        measured ranges the noise covers it. Equations in either half of a joint's range predict those in the other one
+        with errors e of covariance I + k X C X', C as that half alone leaves it; k has the largest product of both
+        likelihoods. It is 1 where all joints together show no more.
+        """
+        X = np.vstack([part.X.reshape(-1, len(point.v)) for part in point.parts])
+        y = np.concatenate([part.y.reshape(-1, 1) for part in point.parts])
+        own, rows = np.where(self.prior.replaced, 0.0, 1 / point.v), self.prior.rows
+        q = q[np.concatenate([stack.index.ravel() for stack in self.data.stacks])]
+        lower = (q <= np.median(q, axis=0)).T
+        value = np.zeros((len(lower), len(FACTORS)))
+        for joint in np.flatnonzero(~lower.all(axis=1)):  # of those that moved
+            for half in (lower[joint], ~lower[joint]):
+                inside, beyond = X[half], X[~half]
+                L, d = _factored(inside.T @ inside + rows.T @ rows, own)
+                Y = _half_solved(L, d, beyond.T)
+                mean = _half_solved(L, d, inside.T @ y[half] + rows.T @ self.prior.values[:, None])
+                spread, V = np.linalg.eigh(Y @ Y.T)
+                informative = spread > 1e-6
+                along = (V.T @ (Y @ (y[~half] - Y.T @ mean)))[informative, 0]
+                variances = 1 + FACTORS[:, None] * spread[informative]
+                value[joint] += np.sum(np.log(variances) + along**2 / spread[informative] / variances, axis=1)
+        return np.where(np.argmin(value.sum(axis=0)), FACTORS[np.argmin(value, axis=1)], 1.0)
+
     # --- local variances ----------------------------------------------------------------------------------------
 
     @cached_property
@@ -541,7 +568,7 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
     return change / (1 - np.minimum(M.diagonal() / (weighed * v), STEEPEST))
 
 
-# --- what tails add to covariances ------------------------------------------------------------------------------
+# --- what tails and ranges of joints add to covariances ---------------------------------------------------------
 
 
 def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, tails: float) -> Array:
@@ -574,30 +601,7 @@ def tail_widening(z: Array, C: Array, v: Array, heavy: np.ndarray, size: Array, 
     return np.asarray(np.linalg.solve(L, (C[:, heavy] * B).T).T, dtype=float)
 
 
-# --- what ranges of joints add to covariances -------------------------------------------------------------------
-
-
-def extrapolation(point: Point, prior: Hierarchy, halves: Sequence[np.ndarray]) -> Array:
-    """Return D (p, p), where D D' widens the covariance C for what the model lacks outside of the measured ranges.
-
-    What a model lacks repeats from row to row, so that C, which takes it for chance, is too small; inside the measured
-    ranges the noise covers it. Each of some halves (m,) of the equations predicts the other one with errors e of
-    covariance I + k X C X', C as that half alone leaves it; the factor k on C >= 1, one for all halves, has the largest
-    product of their likelihoods: D D' = (k - 1) C.
-    """
-    X = np.vstack([part.X.reshape(-1, len(point.v)) for part in point.parts])
-    y = np.concatenate([part.y.ravel() for part in point.parts])[:, None]
-    own = np.where(prior.replaced, 0.0, 1 / point.v)
-    value = np.zeros(len(FACTORS))
-    for half in halves:
-        inside, beyond = X[half], X[~half]
-        L, d = _factored(inside.T @ inside + prior.rows.T @ prior.rows, own)
-        Y = _half_solved(L, d, beyond.T)
-        mean = _half_solved(L, d, inside.T @ y[half] + prior.rows.T @ prior.values[:, None])
-        spread, V = np.linalg.eigh(Y @ Y.T)
-        informative = spread > 1e-6
-        along = (V.T @ (Y @ (y[~half] - Y.T @ mean)))[informative, 0]
-        variances = 1 + FACTORS[:, None] * spread[informative]
-        value += np.sum(np.log(variances) + along**2 / spread[informative] / variances, axis=1)
-    L, d = _factored(point.C, np.zeros(len(own)))
-    return np.sqrt(FACTORS[np.argmin(value)] - 1) * L / d[:, None]
+def widening(C: Array, factor: float) -> Array:
+    """Return D (p, p), D D' = (factor - 1) C."""
+    L, d = _factored(C, np.zeros(len(C)))
+    return np.sqrt(factor - 1) * L / d[:, None]

@@ -18,8 +18,8 @@ from rpim_opt.bayes.evidence import (
     Linearized,
     Point,
     Spectrum,
-    extrapolation,
     tail_widening,
+    widening,
 )
 from rpim_opt.bayes.prior import SESSIONS, Prior
 from rpim_opt.bayes.prior_terms import ScaledPrior
@@ -337,7 +337,10 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
     if m < n:
         rest = f"at least {n - m} parameter combinations are determined by the prior alone."
         notes.append(f"{m} equations for {n} parameters: {rest}")
-    widening = tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)
+    drift = [point.slopes @ root, tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)]
+    if prior.spectrum is None:  # curves have a prior of their own; a prediction may leave the range of any joint
+        factors = evidence.overdispersion(point, fit.problem.joint_values[fit.problem.owners])
+        drift.append(widening(point.C, factors.max()))
     return Learned(
         sizes=dict(zip(prior.names, values[:sizes], strict=True)),
         noise=dict(zip(evidence.noise, values[noise:], strict=True)),
@@ -346,19 +349,8 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         freedom=float(max(2 / max(growth @ covariance @ growth, 1e-3), 3.0)),
         covariance=covariance[np.ix_(plain, plain)],
         stated=fit.problem.parameters.free.scale,
-        drift=fit.unit[:, None] * np.column_stack([point.slopes @ root, widening, *_beyond(fit)]),
+        drift=fit.unit[:, None] * np.column_stack(drift),
         notes=tuple(notes),
         curves=None if prior.spectrum is None else Transmitted(*values[sizes:noise], gain=gain),
         **more,
     )
-
-
-def _beyond(fit: Fit) -> list[Array]:
-    """Return what the model lacks as halves of the joints' ranges tell (p, p); curves have a prior of their own."""
-    if fit.evidence.prior.spectrum is not None:
-        return []
-    order = np.concatenate([stack.index.ravel() for stack in fit.evidence.data.stacks])
-    q = fit.problem.joint_values[fit.problem.owners[order]]
-    lower = (q <= np.median(q, axis=0)).T
-    halves = [half for below in lower for half in (below, ~below) if half.any() and not half.all()]
-    return [extrapolation(fit.point, fit.evidence.prior, halves)]

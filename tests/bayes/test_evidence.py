@@ -18,7 +18,7 @@ from rpim_opt.bayes.evidence import (
     Hierarchy,
     Linearized,
     Spectrum,
-    extrapolation,
+    widening,
 )
 from rpim_opt.bayes.hyperparameters import Estimator
 from rpim_opt.bayes.prior import Prior
@@ -363,8 +363,9 @@ def test_what_halves_miss_of_each_other_widens_the_covariance() -> None:
     for lack in (0.0, 1.5):
         y = X @ rng.normal(size=p) + lack * half * X[:, 0] + rng.normal(size=m)
         data = Linearized(X, y, [Stack(np.arange(m)[:, None], one, every, ~every, np.zeros((m, 1, 0)))])
-        point = Evidence(data, prior, ()).at(np.zeros(0))
-        D = extrapolation(point, prior, [half, ~half])
+        evidence = Evidence(data, prior, ())
+        point = evidence.at(np.zeros(0))
+        factors = evidence.overdispersion(point, np.column_stack([np.arange(m), np.zeros(m)]))
         value = np.zeros(len(FACTORS))
         for inside in (half, ~half):
             C = np.linalg.inv(X[inside].T @ X[inside] + np.eye(p))
@@ -374,4 +375,6 @@ def test_what_halves_miss_of_each_other_widens_the_covariance() -> None:
                 value[i] += np.linalg.slogdet(V)[1] + error @ np.linalg.solve(V, error)
         factor = FACTORS[np.argmin(value)]
         assert (factor > 2) == (lack > 0)
+        assert factors.tolist() == [factor, 1]  # a joint that did not move tells nothing
+        D = widening(point.C, factor)
         np.testing.assert_allclose(D @ D.T, (factor - 1) * point.C, rtol=1e-6, atol=1e-12)

@@ -11,6 +11,7 @@ import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
 from rpim_opt.bayes.outliers import clustered, error_ratios, outlier_candidates, resistant_fit, unexplained
+from rpim_opt.data.dataset import Dataset
 
 POSITION = ro.load("position").problem
 
@@ -302,6 +303,20 @@ def test_gravity_is_found_where_it_bends_and_nowhere_else() -> None:
         assert plain.learned is not None
         assert plain.learned.trials == ()
         assert heavy.errors().mean() < 0.7 * plain.errors().mean()
+
+
+def test_what_repeats_from_row_to_row_is_no_extension() -> None:
+    """A smooth error that no extension describes makes rows alike: gains of -2 ln L then count for less."""
+    arm = ro.study.simulated_arm(17, 50, 3e-5).problem
+    q = arm.data.q
+    rng = np.random.default_rng([17, 7])
+    bend = 1e-3 * np.sin(0.3 * q @ rng.normal(size=(q.shape[1], 3)) + rng.uniform(0, 2 * np.pi, 3))
+    learned = ro.calibrate(arm.on(Dataset.of(q, arm.data.blocks[0].y + bend, 3e-5)), model="auto").learned
+    assert learned is not None
+    assert learned.trials[0].extensions == ()
+    gain = learned.gain("first harmonic")
+    assert gain is not None
+    assert gain > 6  # as one in 300 arms whose rows are independent
 
 
 def test_a_weight_takes_the_extensions_alone() -> None:
