@@ -405,7 +405,7 @@ IN_TABLES |= {
         values(lambda y: np.concatenate([y[:12], y[13:24], y[23:]])),
         "fit the joint values of the next row",
     ),
-    "commanded degrees": (commanded, "they are the commanded values"),
+    "commanded degrees": (commanded, "these are commanded joint values"),
     "worn circles of the instrument": (values(of_worn_circles), "angles of the instrument at the origin"),
     "mirrored, and joint 1 reversed": (
         both(values(lambda y: y * [1, -1, 1]), flipped(0)),
