@@ -89,6 +89,9 @@ class Options:
 class WeightChoice:
     """The weight of an iteration, and how it was chosen.
 
+    A rule is applied at every point (`updated`) until steps are short: then its weight is settled. At rest it is
+    applied once more (`confirmed`), and the weight is final if that is the same, else the loop goes on with the other.
+
     ``rule`` is None for a number; ``weights`` are all that it chose in turn, ``selection`` the last one.
     ``settled``: the weight stays while the loop comes to rest; ``final``: for good. ``robust``: the loss is a sum over
     rows, but no square.
@@ -216,7 +219,7 @@ class State:
 
     def weighted(self, choice: WeightChoice) -> State:
         """Return the state with another weight and its objective."""
-        return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight))
+        return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight), rejected=False)
 
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""
