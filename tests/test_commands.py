@@ -152,7 +152,7 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
                "--validation", str(cell / "later.csv"), "--units", "m,rad") == 0  # fmt: skip
     said = capsys.readouterr().out
     assert re.search(r"joint_1 .* q1_rad ", said)
-    assert "Guessed: the base was registered" in said
+    assert "Guessed: the data are in the robot's base frame" in said
     assert run(monkeypatch, "inspect", "arm") == 0
     assert "Warning" not in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "arm", "--out", "arm/results") == 0
