@@ -565,7 +565,8 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
     alone, x = _without_outliers(result, ordered)
     single = [flag.label for flag in result.single]
     ratio = max(noise_ratio(alone, alone.errors(x, each), each) for each in UNITS)
-    if single and result.squared_loss and ratio <= NOISY:
+    before = max(noise_ratio(ordered, ordered.errors(result.x, each), each) for each in UNITS)
+    if single and result.squared_loss and ratio <= min(NOISY, diagnosis.MOVED**0.5 * before):
         yield (
             f"outliers ({listed(single)}): without them residuals are {three_digits(ratio)} times the measurement "
             "noise. They bias a squared loss: use formulation 'robust', or leave them out ([exclude])."

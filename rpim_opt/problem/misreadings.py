@@ -448,10 +448,10 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         return None
     chain, left = _mistakes(points, present)
     if present > WRONG and not points.seen:
-        for readings in (_factors, _orders, _other_robots):
+        for readings in ([*_factors(points), *_other_robots(points)], _orders(points)):
             if left < BETTER * present:
                 break
-            chain, left = _best(points, list(readings(points)))
+            chain, left = _best(points, list(readings))
             if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
                 changed = chain[0].change(points)
                 second, size = _best(changed, _readings(changed))

@@ -64,6 +64,7 @@ QUICK = {
         "signs of x lost",
         "the floor heaves",
         "columns a and d exchanged",
+        "another robot",
     ],
     "irb120": [
         "joint 5 shuffled",
@@ -79,9 +80,13 @@ QUICK = {
         "z shuffled",
         "deviations",
         "joint 2 creeps",
+        "worn circles of the instrument",
+        "mirrored, and joint 1 reversed",
+        "z a column of RMS",
     ],
     "iiwa7": [
         "a column in centimetres",
+        "every third row computed",
         "joint 2 from 90 degrees and joint 3 reversed",
         "tracker moved by 300 mm",
         "worn circles of the instrument",

@@ -363,7 +363,7 @@ def _judged(
     nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
     i = plainest[first]
     behind = _behind_a_mirror(points, MIRRORED * left[i])
-    if plain[i][0] <= 2:  # as few changes as a mirror and a joint
+    if plain[i][0] < 2:  # fewer changes than a mirror and a joint
         behind = [name for name in behind if name == AS_STATED]
     again: dict[str, Alternative] = {}
     for k in sorted(alike[first], key=plain.__getitem__):
