@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Estimator, ExcludedRow, Fit, Learned, Trial, learned, sampled
 from rpim_opt.bayes.model_selection import select_model
 from rpim_opt.bayes.outliers import beyond_noise, isolated, largest_errors, outlier_candidates, unexplained
@@ -22,6 +23,8 @@ ROUNDS = 6  # linearizations at which hyperparameters are estimated
 REQUIRED_GAIN = 6.0
 """By how much -2 ln L must fall for an optional prior: a likelihood ratio of twenty, which by Markov's inequality one
 arm of another kind in twenty shows at most."""
+CONTRADICTED = 28.0
+"""By how much -2 ln L must fall without a known value that the data contradict: in the same way once in a million."""
 OUTLIER_SEARCHES = 4  # how often outliers are looked for again without those that were found: they mask each other
 
 
@@ -65,6 +68,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
             estimator, whole = plain, without
             reason = f"it lowers -2 ln L by {fall:.1f}; {REQUIRED_GAIN:g} are required."
             notes = (f"The population prior is not used: {reason}",)
+    contradicted = tuple(_contradicted(every, estimator, whole, start))
     fit, trials, gain, outliers = _without_outliers(every, estimator, whole, model)
     requested = p.free.names
     if gain > 0:
@@ -84,8 +88,36 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         trials=trials,
         left_out=tuple(left_out),
         added=tuple(name for name in fit.problem.parameters.free.names if name not in requested),
+        contradicted=contradicted,
     )
     return Estimated(laid, replace(hyperparameters, notes=(*notes, *hyperparameters.notes)), fit.inside, fit.x)
+
+
+def _contradicted(every: CalibrationProblem, estimator: Estimator, whole: Fit, start: Array) -> Iterator[str]:
+    """Say which known values are off: by how much -2 ln of the data's likelihood p(y | value) falls without one.
+
+    A fit with the statement r z = v +- 1 knows p(y, value). With prior means m and variances V of a fit without it::
+
+        -2 ln p(value) = ln s + (v - r m)^2 / s,    s = 1 + r V r'
+    """
+    prior, free = estimator.prior, every.parameters.free
+    for statement in prior.statements:
+        rows, values, _ = statement.on(every.parameters)
+        if statement.whole or not len(rows):  # an earlier result; of parameters that are not identified
+            continue
+        others = tuple(each for each in prior.statements if each is not statement)
+        without = replace(estimator, prior=replace(prior, statements=others)).fit(every, start, None, ROUNDS)
+        spread = 1 + float((rows[0] * without.stated.scale) ** 2 @ without.point.v)
+        centre = float(values[0] - rows[0] @ without.stated.centre)
+        fall = whole.point.value - without.point.value - np.log(spread) - centre**2 / spread
+        if fall > CONTRADICTED:
+            own = rows[0] / free.scale
+            unit, si = display(free.dimensions[int(np.argmax(np.abs(own)))])
+            off = float(values[0] - own @ without.x) / np.abs(own).max() / si
+            yield (
+                f"the known value of {statement.where} is off by {off:+.3g} {unit}: without it -2 ln L falls by "
+                f"{fall:.0f}. Correct it, or take it out of the prior."
+            )
 
 
 def _without_outliers(

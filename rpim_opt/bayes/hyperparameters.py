@@ -92,7 +92,8 @@ class Learned(Brief):
     of the variance of a reading (Satterthwaite). D D' of ``drift`` (n, k) is what the uncertainty of hyperparameters,
     heavy tails and what the model lacks outside of the measured ranges add to the covariance [SI]. ``left_out`` are
     outliers that were excluded, the worst first, ``added`` parameters of model extensions, ``notes`` sentences on how
-    far the marginal likelihood decides, and ``curves`` the joints' transmission errors, None without them.
+    far the marginal likelihood decides, ``contradicted`` sentences on known values that the data contradict, and
+    ``curves`` the joints' transmission errors, None without them.
     """
 
     sizes: Mapping[str, Size]
@@ -107,6 +108,7 @@ class Learned(Brief):
     drift: Array
     added: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()
+    contradicted: tuple[str, ...] = ()
     curves: Transmitted | None = None
 
     def _short(self) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, listed, three_digits
+from rpim_opt.basics.units import fits
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
@@ -23,6 +24,7 @@ from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.row_functions import measured_torques
+from rpim_opt.robot.mdh import MDH
 from rpim_opt.robot.parameters import frame_of, own_name
 
 BAD = "Larger than expected"
@@ -361,8 +363,11 @@ def likely_causes(result: Outcome) -> list[str]:
     together = list(diagnosis.left_out_together(problem.labels, {row.label for row in left_out}))
     if result.mapping is not None:
         shared += result.mapping.ambiguities
-    if signs or not result.converged:
-        causes = _held_base(result, problem) or _limited_by_formulation(result, problem, kept)
+    known = [] if result.learned is None else list(result.learned.contradicted)
+    if known and (signs or noticed):
+        causes = known
+    elif signs or not result.converged:
+        causes = _held(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
         shared += together
     elif (other := _other_robot(result, problem)) is not None:
@@ -396,7 +401,7 @@ def _beside_a_good_fit(
         return causes, together
     if len(problem.arms) > 1:
         return [], together
-    limits = [*_held_base(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
+    limits = [*_held(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
     if limits:
         return [], [*(f"{BAD}: residuals; {text}" for text in limits), *together]
     alone, x = _without_outliers(result, ordered, again=noticed)
@@ -436,21 +441,28 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
         yield f"{free.names[worst]} deviates by {in_unit(result.x[worst], free.dimensions[worst])}"
 
 
-def _held_base(result: Outcome, problem: CalibrationProblem) -> list[str]:
-    """Say that a base that is not identified is elsewhere than stated."""
+def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
+    """Say that a frame, or a parameter of a joint, that is not identified is another one than stated."""
     p = problem.parameters
-    base = np.array([frame_of(name) == "base_" for name in p.names])
-    if p.identified[base].all() or len(problem.arms) > 1:
-        return []
-    freed = problem.identifying(p.identified | base)
-    located = fitted_frames(freed)[0].parameters
-    freed = freed.with_parameters(replace(located, identified=freed.parameters.identified))
-    now, then = (rms(each.errors(x)) for each, x in ((problem, result.x), (freed, ridge_deviations(freed))))
-    if then > ELSEWHERE * now:
+    groups: dict[str, list[str]] = {}
+    for name, placed, identified in zip(p.names, p.placed, p.identified, strict=True):
+        if placed or name.rstrip("0123456789") in MDH:
+            groups.setdefault(frame_of(name) + "*" if placed else name, []).extend([name] * (not identified))
+    now, best, said = rms(problem.errors(result.x)), ELSEWHERE, ""
+    for group, names in groups.items() if len(problem.arms) == 1 else ():
+        if not names:
+            continue
+        freed = problem.identifying(p.identified | [fits(name, group) for name in p.names])
+        located = fitted_frames(freed)[0].parameters
+        freed = freed.with_parameters(replace(located, identified=freed.parameters.identified))
+        then = rms(freed.errors(ridge_deviations(freed)))
+        if then < best * now:
+            best, said = then / now, group
+    if not said:
         return []
     return [
-        "the stated base is wrong, and not identified: with `base_*` in `identify` residuals are "
-        f"{three_digits(1e3 * then)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
+        f"the stated {said.removesuffix('_*')} is wrong, and not identified: with `{said}` in `identify` residuals are "
+        f"{three_digits(1e3 * best * now)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
     ]
 
 

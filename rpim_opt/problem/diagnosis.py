@@ -793,11 +793,11 @@ def _places(count: int, most: int = PLACES) -> list[int]:
 class Addition(NamedTuple):
     """Columns (m, c) that a linear model lacks, and what coefficients (c,) mean: what happened, and what to do.
 
-    Of coefficients beyond the ``largest`` a linearization says nothing.
+    Of coefficients beyond the ``largest`` a linearization says nothing. None where it is no mistake.
     """
 
     columns: Array
-    said: Callable[[Array], tuple[str, str]]
+    said: Callable[[Array], tuple[str, str]] | None
     largest: float = np.inf
 
 
@@ -866,7 +866,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few;
     if ``transmission``, the slope of a joint's zero times the value of a joint, all of these times the way from the row
     before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
-    Else backlash and rows of two kinds are looked for.
+    Else backlash and rows of two kinds are looked for. Nothing is reported where gravity and eccentric gears explain
+    more, which are not in the model: a lack of fit, and no mistake.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
@@ -884,7 +885,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if kinds is not None and left <= (MOVED if kinds.consecutive else kinds.left / MOVED):
         kinds = None
     if kinds is None and best is not None and abs(best[2][0]) <= best[1].largest:
-        yield _said_of_addition(*best)
+        yield from _said_of_addition(*best)
     elif kinds is not None or transmission:
         most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
@@ -901,7 +902,7 @@ def slight_effects(problem: CalibrationProblem, x: Array) -> Iterator[str]:
     model = problem.linearize(x)
     best = _explained(model, x, _additions(problem, x, model), SLIGHT)
     if best is not None and abs(best[2][0]) <= best[1].largest:
-        yield _said_of_addition(*best)
+        yield from _said_of_addition(*best)
 
 
 def _additions(
@@ -913,9 +914,10 @@ def _additions(
         yield from _scales(problem, x, model)
 
 
-def _said_of_addition(left: float, addition: Addition, coefficients: Array) -> str:
-    what, remedy = addition.said(coefficients)
-    return f"{what} (that leaves {100 * left:.0f} % of the residuals): {remedy}."
+def _said_of_addition(left: float, addition: Addition, coefficients: Array) -> Iterator[str]:
+    if addition.said is not None:
+        what, remedy = addition.said(coefficients)
+        yield f"{what} (that leaves {100 * left:.0f} % of the residuals): {remedy}."
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
@@ -934,15 +936,19 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     parts["reflector"] = ([tool_prefix(m) + c for m in markers for c in FRAME], "was the reflector exchanged")
     for i, name in enumerate(_zeros(problem.robot), start=1):
         parts[f"zero of joint {i}"] = ([name], "did the joint slip, or was it remastered")
-    bends = np.char.startswith(p.names, "compliance")
-    parts["payload"] = (np.array(p.names)[bends].tolist(), "did the load at the flange change")
-    whole = problem.identifying(p.identified | bends)  # a payload shows in them, identified or not
+    every = np.array(p.names)
+    bends, eccentric = np.char.startswith(every, "compliance"), np.char.startswith(every, "ecc_")
+    parts["payload"] = (every[bends].tolist(), "did the load at the flange change")
+    whole = problem.identifying(p.identified | bends | eccentric)  # a payload shows in them, identified or not
     there = np.zeros(len(whole.parameters.free))
     there[p.identified[whole.parameters.identified]] = x
     A = whole.linearize(there).A
-    for what, (names, cause) in parts.items():
-        yield from _changes(whole, there, A, names, what, cause)
+    for what, (changed, cause) in parts.items():
+        yield from _changes(whole, there, A, changed, what, cause)
     free = whole.parameters.free
+    lacking = np.isin(free.names, every[(bends | eccentric) & ~p.identified])
+    if lacking.any():
+        yield Addition(A[:, lacking], None)
     nominal = whole.parameters.nominal[whole.parameters.identified]
     of_arm = (np.array(free.dimensions) == "length") & ~free.of_frames
     elapsed = problem.owners / max(len(problem.data) - 1, 1)

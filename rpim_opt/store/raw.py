@@ -207,7 +207,8 @@ def in_time_order(found: Understanding) -> Understanding:
     """Return labelled rows in the order of the first column of dates, or of times since 1970, if there is one."""
     columns = {"label": [str(i + 1) for i in range(found.count)], **found.columns}
     unused = [each.column for table in found.tables for each in table.meant if not each.name]
-    for name in filter(lambda column: time_column([column.lower()]), unused):
+    clocks = [column for column in unused if time_column([column.lower()])]
+    for name in clocks:
         with suppress(InputError, KeyError):  # no times, or not of all rows
             times = seconds(name, found.raw[name.lower()])
             if times.min() > SINCE_1970:
@@ -216,7 +217,9 @@ def in_time_order(found: Understanding) -> Understanding:
                 tables = _with_meaning(found.tables, [name.lower()], meaning="order of the rows", why="times")
                 notes = (*found.notes, f"rows are in the order of '{name}'.")
                 return replace(found, columns=columns, raw=raw, tables=tables, notes=notes)
-    return replace(found, columns=columns)
+    why = "neither dates (2026-05-31T12:00:00, 31.05.2026 12:00:00) nor times since 1970"
+    tables = _with_meaning(found.tables, [name.lower() for name in clocks], why=why)
+    return replace(found, columns=columns, tables=tables)
 
 
 def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: str) -> tuple[Understood, ...]:

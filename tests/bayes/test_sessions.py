@@ -12,6 +12,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import compared
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem.blocks import PartitionedProblem
@@ -274,6 +275,19 @@ def test_names_that_cannot_be_are_refused(problem: ro.CalibrationProblem, column
     table |= {f"{axis}_m": data.blocks[0].y[:, k] for k, axis in enumerate("xyz")}
     with pytest.raises(ro.InputError, match=said):
         ro.read_data({**table, "session": column}, problem.robot, {"position_mm": 0.03})
+
+
+def test_few_sessions_are_what_a_doubtful_result_lacks() -> None:
+    """Offsets as large as the nominal robot's errors, and no more configurations would help."""
+    problem = ro.study.simulated_arm(1, 40).problem
+    day = np.arange(40) % 2
+    y = problem.data.blocks[0].y + 0.01 * np.random.default_rng(3).normal(size=(2, 3))[day]
+    data = ro.Dataset.of(problem.data.q, y, NOISE, session=[f"day {each}" for each in day])
+    result = ro.calibrate(told(problem, 1, data), model="auto")
+    said = inconclusive(result, measured_workspace(result))
+    assert said.startswith("Inconclusive: the median U over the region")
+    assert "Missing: one registration for all sessions, to the same reference points" in said
+    assert "Measure more configurations" not in said
 
 
 def test_session_parameters_have_scales_of_their_own(problem: ro.CalibrationProblem) -> None:

@@ -462,9 +462,7 @@ LONGER = dict.fromkeys(("every third row with other zeros", "every third row com
 """Rows of tables that are told by two calibrations, each with all parameters: 40 of a seventh joint are too few."""
 MISTAKES: dict[str, tuple[Wrong, str]] = {
     name: (
-        lambda robot, change=change, count=LONGER.get(name, COUNT): calibrated(
-            change(simulated_arm(robot, count=count))
-        ),
+        lambda robot, change=change, name=name: calibrated(change(simulated_arm(robot, count=LONGER.get(name, COUNT)))),
         expected,
     )
     for name, (change, expected) in IN_TABLES.items()

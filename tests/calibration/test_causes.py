@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
+from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.verdict import _in_table_order
 from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together, part_way
@@ -508,6 +509,64 @@ def test_a_base_that_is_held_elsewhere_is_named() -> None:
     found = ro.calibrate(held.identifying(p.identified & ~base))
     assert not found.verdict.delivered
     assert any("the stated base is wrong, and not identified" in reason for reason in found.verdict.reasons)
+
+
+@pytest.mark.parametrize(
+    ("off", "said"),
+    [
+        ({"a2": 0.005}, "the stated a2 is wrong, and not identified: with `a2` in `identify`"),
+        ({"tool_x": 0.005, "tool_y": 0.0, "tool_z": 0.0}, "the stated tool is wrong, and not identified"),
+    ],
+    ids=["a link", "the reflector"],
+)
+def test_what_is_not_identified_and_wrong_is_named(off: dict[str, float], said: str) -> None:
+    """Half a centimetre is more than gravity does, which would be proposed."""
+    problem = simulated_arm("ur5e", count=60)
+    p = problem.parameters
+    nominal = p.nominal + np.array([off.get(name, 0.0) for name in p.names])
+    robot = replace(problem.robot, mdh=nominal[: problem.robot.mdh.size].reshape(-1, 5))
+    wrong = replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
+    held = wrong.identifying(p.identified & ~np.isin(p.names, list(off)))
+    for model in ("geometry", "auto"):
+        assert said in likely_causes(ro.calibrate(held, model=model))[1]
+
+
+@pytest.mark.usefixtures("undrawn")
+@pytest.mark.parametrize("model", ["geometry", "auto"])
+@pytest.mark.parametrize(("value", "off"), [("a2 = nominal + 5", "+5.24"), ("d5 = nominal + 2", "+1.34")])
+def test_a_known_value_that_is_wrong_is_named_first(monkeypatch, capsys, tmp_path, model, value, off) -> None:
+    """Gravity, backlash or the weight would be named for it; a right one is not named."""
+    made(monkeypatch, tmp_path, simulated_arm("ur5e", count=60))
+    cell = tmp_path / "cell"
+    file = cell / "problem.toml"
+    plain = file.read_text()
+    file.write_text(f'{plain}\n[prior]\nknown = ["{value} +- 0.05 mm"]\n')
+    capsys.readouterr()
+    assert run(monkeypatch, "calibrate", str(cell), "--model", model) == 1
+    likely = re.findall("Likely: (.*)", capsys.readouterr().out)
+    assert likely[0].startswith(f"the known value of prior '{value} +- 0.05 mm' is off by {off} mm")
+    file.write_text(f'{plain}\n[prior]\nknown = ["{value.partition(" ")[0]} = nominal - 0.3 +- 0.4 mm"]\n')
+    assert run(monkeypatch, "calibrate", str(cell), "--model", model) == 0
+    assert "known value" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("robot", "seed"), [("irb120", 1), ("iiwa7", 2), ("kr6_r900", 3)])
+def test_gravity_that_is_not_modelled_is_no_coupling(robot: str, seed: int) -> None:
+    """Nor a payload that changed, nor a gear ratio: the lack of fit says what the model lacks."""
+    problem = simulated_arm(robot, seed, 60)
+    p = problem.parameters
+    bends = np.char.startswith(p.names, "compliance") | np.char.startswith(p.names, "ecc_")
+    whole = problem.identifying(p.identified | bends)
+    free = whole.parameters.free
+    rng = np.random.default_rng(seed + 100)
+    truth = rng.normal(size=len(free)) * free.scale
+    compliance = np.char.startswith(free.names, "compliance")
+    truth[compliance] = np.abs(truth[compliance])
+    y = whole.modelled(truth)[0]
+    result = ro.calibrate(values(lambda _: y + mistakes.NOISE * rng.normal(size=y.shape))(problem))
+    assert result.verdict.delivered
+    assert not likely_causes(result)
+    assert {"gravity", "first harmonic"} & set(lack_of_fit(result).missing)
 
 
 def test_misread_orientations_are_named() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from time import process_time
 
@@ -496,6 +497,26 @@ def test_columns_of_other_names_join_two_files(monkeypatch, capsys, tmp_path, ar
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints]) == 2
     assert "columns 'ID' and 'Point Name' for label" in capsys.readouterr().err
     assert new(monkeypatch, arm, tmp_path / "cell", [points, joints], "--key", "Point Name") == 0
+
+
+@pytest.mark.parametrize(
+    ("name", "cell"),
+    [
+        ("Date / Time", "31.05.2026 12:{:02d}"),
+        ("Timestamp UTC", "2026-05-31T12:{:02d}:00Z"),
+        ("Time (UTC)", "2026/05/31 12:{:02d}:00"),
+    ],
+)
+def test_dates_are_the_order_of_the_rows(monkeypatch, capsys, tmp_path, arm, name, cell) -> None:
+    """A column that is called a time, and is none that can be read, is not used, with the reason."""
+    rows = [[*row, cell.format(COUNT - i)] for i, row in enumerate(ROWS)]
+    (tmp_path / "raw.csv").write_text(text([[*HEAD, name]], rows))
+    assert new(monkeypatch, arm, tmp_path / "cell", tmp_path / "raw.csv") == 0
+    assert f"rows are in the order of '{name}'." in capsys.readouterr().out
+    assert list(ro.load(tmp_path / "cell").problem.data.label) == LABELS[::-1]
+    (tmp_path / "raw.csv").write_text(text([[*HEAD, name]], [[*row, "12:00:00 PM"] for row in ROWS]))
+    assert new(monkeypatch, arm, tmp_path / "other", tmp_path / "raw.csv") == 0
+    assert re.search(rf"{re.escape(name)} +not used +neither dates \(2026-", capsys.readouterr().out)
 
 
 @pytest.mark.parametrize("key", ["", "Target", "Punkt"])

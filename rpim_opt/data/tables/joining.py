@@ -23,8 +23,12 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.understanding import Understood, counts_rows, row_stems
 from rpim_opt.robot.mdh import Robot
 
-TIME = re.compile(r"[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|zeit|zeitstempel|date|datum|t)", re.IGNORECASE)
-GERMAN = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})[ T]\s*")
+TIME = re.compile(
+    r"[%#]?(?:.*[._/ ])?(?:time ?stamp|date ?time|time|stamp|(?:uhr)?zeit|zeitstempel|date|datum|t)"
+    r"(?:\W*(?:utc|gmt|local)\W*)?",
+    re.IGNORECASE,
+)
+GERMAN = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})[ T]*")
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
            "nsec": 1e-9, "nsecs": 1e-9}  # fmt: skip
@@ -363,7 +367,8 @@ def seconds(name: str, cells: Sequence[Any]) -> Array:
     if dates:
         for i, text in enumerate(texts):
             with suppress(ValueError):
-                date = datetime.fromisoformat(GERMAN.sub(r"\3-\2-\1 ", text).replace(",", "."))
+                iso = GERMAN.sub(r"\3-\2-\1 ", text).strip().replace("/", "-")
+                date = datetime.fromisoformat(iso.replace(",", "."))
                 times[i] = date.replace(tzinfo=date.tzinfo or UTC).timestamp()
     for i in np.flatnonzero(np.isnan(times)).tolist():
         accepted = "numbers, or dates as 2026-05-31T12:00:00 or 31.05.2026 12:00:00"
