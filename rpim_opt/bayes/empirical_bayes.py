@@ -115,8 +115,8 @@ def _contradicted(every: CalibrationProblem, estimator: Estimator, whole: Fit, s
             unit, si = display(free.dimensions[int(np.argmax(np.abs(own)))])
             off = float(values[0] - own @ without.x) / np.abs(own).max() / si
             yield (
-                f"the known value of {statement.where} is off by {off:+.3g} {unit}: without it -2 ln L falls by "
-                f"{fall:.0f}. Correct it, or take it out of the prior."
+                f"The data contradict {statement.where}, by {off:+.3g} {unit}: without it -2 ln L falls by {fall:.0f}. "
+                "Correct it, or take it out of the prior."
             )
 
 

@@ -205,23 +205,15 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     nominal = rms(errors)
     if found is None or not (of_positions(result) and result.verdict.delivered and found.typical > nominal):
         return ""
+    advice = (
+        "Measure more configurations (rpim-opt design --augment), with larger wrist rotations, or state what is known "
+        'of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
+    )
+    if any(map(of_session, result.problem.parameters.free.names)):
+        advice = _missing(result, nominal, found.largest, 0.0)
     return (
         f"Inconclusive: the median U over the region, {1e3 * found.typical:.3f} mm, is above the error of the "
-        f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. "
-    ) + (
-        _missing_registration(result, found.largest)
-        or "Measure more configurations (rpim-opt design --augment), with larger wrist rotations, or state what is "
-        'known of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
-    )
-
-
-def _missing_registration(result: Calibration, bound: float) -> str:
-    """Say that a bound [m] is that of session offsets; empty without sessions."""
-    if not any(of_session(name) for name in result.problem.parameters.free.names):
-        return ""
-    return (
-        "Missing: one registration for all sessions, to the same reference points. The bound of "
-        f"{1e3 * bound:.3f} mm includes session offsets, which more configurations do not reduce."
+        f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. {advice}"
     )
 
 
@@ -378,8 +370,11 @@ def _missing(result: Calibration, limit: float, bound: float, repeatability: flo
             f"Missing: a tighter bound on repeatability, which may contribute {1e3 * repeatability:.3f} mm. Approach "
             "some poses repeatedly (`rpim-opt iso9283`)."
         )
-    if sessions := _missing_registration(result, bound):
-        return sessions
+    if any(map(of_session, result.problem.parameters.free.names)):
+        return (
+            "Missing: one registration for all sessions, to the same reference points. The bound of "
+            f"{1e3 * bound:.3f} mm includes session offsets, which more configurations do not reduce."
+        )
     kinds = {b.measurement.name: b.measurement for part in result.problem.rows() for b in part.data.blocks}
     if not any(kind.registers for kind in kinds.values()):
         return (

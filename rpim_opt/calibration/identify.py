@@ -44,7 +44,6 @@ MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["
 LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
 FAR = 1000.0  # deviations in prior standard deviations beyond which a fit without a penalty is called divergent
 DIVERGES = "poorly identifiable combinations diverge without a penalty"
-CONTRADICTED = 3.0  # standard deviations from a known value from which on the data contradict it
 ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the data
 
 
@@ -177,7 +176,7 @@ def calibrate(
     ended = minimize(problem, formulation, weight, start, options)
     choice = ended.state.choice
     notes += [mapping.sentence] if mapping else []
-    message = " ".join([ending(ended, max_iterations), *notes, *_contradicted(prior or Prior(), problem, ended.x)])
+    message = " ".join([ending(ended, max_iterations), *notes])
     LOGGER.info(message)
     return Calibration(
         problem=problem,
@@ -261,19 +260,6 @@ def _displaced_frames(stated: Source, registered: Source) -> list[str]:
         f"Deviations refer to registered frames, far from the stated ones: {joined(far)}. The flange frame is "
         "that of the DH table after the last joint; that of a data sheet may be rotated."
     ]
-
-
-def _contradicted(prior: Prior, problem: Source, x: Array) -> list[str]:
-    """Say which known combinations the identified deviations x (n,) [SI] are far from."""
-    lines = []
-    for statement in prior.statements:
-        rows, values, _ = statement.on(problem.parameters)
-        apart = np.abs(rows @ (x / problem.parameters.free.scale) - values).max(initial=0.0)
-        if not statement.whole and apart > CONTRADICTED:
-            lines.append(
-                f"The data contradict {statement.where}: the identified value is {apart:.0f} standard deviations away."
-            )
-    return lines
 
 
 def mapped_as(

@@ -334,14 +334,12 @@ def likely_causes(result: Outcome) -> list[str]:
     A fit is bad if it did not converge, leaves residuals of `NOISY` times the instrument's stated noise in rows that it
     does not downweight, or deviates by many scales. Then the table is read in other ways (`better_reading`), and rows
     without value, exchanged rows, rounded joints and a base that moved are looked for. Where residuals are beyond the
-    noise at all, something systematic is looked for in them, and in excluded rows what they have in common. A
-    calibration of data in blocks says nothing.
+    noise at all, something systematic is looked for in them, and in excluded rows what they have in common. Known
+    values that the data contradict come first, and are all that is said of data in blocks.
 
     >>> from dataclasses import replace
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
-    >>> ro.calibration.likely_causes(ro.calibrate(problem, ro.tikhonov, weight=1.0))
-    []
     >>> block = problem.data.blocks[0]
     >>> wrong = replace(block, q=block.q[:, :, [0, 2, 1, 3, 4, 5]])
     >>> result = ro.calibrate(problem.on(replace(problem.data, blocks=(wrong,))), ro.tikhonov, weight=1.0)
@@ -349,8 +347,9 @@ def likely_causes(result: Outcome) -> list[str]:
     >>> causes[1].partition(" with ")[2]
     'joints 2 and 3 exchanged: exchange the names of the columns q2 and q3.'
     """
+    known = [] if result.learned is None else list(result.learned.contradicted)
     if not result.problem.keeps_rows:
-        return []
+        return known
     problem = cast(CalibrationProblem, result.problem)
     kept = kept_rows(result)
     residuals = residual_rms(result, kept)
@@ -363,9 +362,8 @@ def likely_causes(result: Outcome) -> list[str]:
     together = list(diagnosis.left_out_together(problem.labels, {row.label for row in left_out}))
     if result.mapping is not None:
         shared += result.mapping.ambiguities
-    known = [] if result.learned is None else list(result.learned.contradicted)
-    if known and (signs or noticed):
-        causes = known
+    if known:
+        causes, shared = [], [*known, *shared]
     elif signs or not result.converged:
         causes = _held(result, problem) or _limited_by_formulation(result, problem, kept)
         causes = causes or [*_explanations(result, problem, ordered), *diagnosis.computed_columns(problem)]
@@ -409,7 +407,7 @@ def _beside_a_good_fit(
     if causes:
         return causes, together
     slight = diagnosis.roundings(problem, rms(problem.errors(result.x)[kept]), (1 - SLIGHT) ** -0.5)
-    effects = first(slight, diagnosis.slight_effects(alone, x))
+    effects = first(slight, diagnosis.shown_by_residuals(alone, x, slight=True))
     return [], [*(f"{SLIGHTLY}: {text}" for text in effects), *together]
 
 
@@ -443,26 +441,25 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
 
 def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
     """Say that a frame, or a parameter of a joint, that is not identified is another one than stated."""
+    if len(problem.arms) > 1:
+        return []
     p = problem.parameters
-    groups: dict[str, list[str]] = {}
-    for name, placed, identified in zip(p.names, p.placed, p.identified, strict=True):
-        if placed or name.rstrip("0123456789") in MDH:
-            groups.setdefault(frame_of(name) + "*" if placed else name, []).extend([name] * (not identified))
-    now, best, said = rms(problem.errors(result.x)), ELSEWHERE, ""
-    for group, names in groups.items() if len(problem.arms) == 1 else ():
-        if not names:
-            continue
+    held = ~p.identified & (p.placed | np.isin([name.rstrip("0123456789") for name in p.names], MDH))
+    groups = [name if frame_of(name) == "_" else f"{frame_of(name)}*" for name in np.array(p.names)[held].tolist()]
+    now = rms(problem.errors(result.x))
+    best, said = ELSEWHERE * min(now, rms(problem.errors(ridge_deviations(problem)))), ""  # whatever limits the result
+    for group in dict.fromkeys(groups):
         freed = problem.identifying(p.identified | [fits(name, group) for name in p.names])
         located = fitted_frames(freed)[0].parameters
         freed = freed.with_parameters(replace(located, identified=freed.parameters.identified))
         then = rms(freed.errors(ridge_deviations(freed)))
-        if then < best * now:
-            best, said = then / now, group
+        if then < best:
+            best, said = then, group
     if not said:
         return []
     return [
         f"the stated {said.removesuffix('_*')} is wrong, and not identified: with `{said}` in `identify` residuals are "
-        f"{three_digits(1e3 * best * now)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
+        f"{three_digits(1e3 * best)} mm instead of {three_digits(1e3 * now)} mm (RMS)."
     ]
 
 

@@ -441,33 +441,25 @@ class Rounding(NamedTuple):
 
 def rounded(problem: CalibrationProblem, error: float) -> Iterator[str]:
     """Report rounding of joint or measured values that explains the RMS error [m] of a fit, or what it excludes."""
-    every = list(_roundings(problem))
-    yield from first(_alike(every, error, ALIKE[1]), _commanded(every, error))
-
-
-def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
-    """Report rounding of joint or measured values, if the RMS error [m] of a fit is less than so many times its own."""
-    yield from _alike(_roundings(problem), error, most)
-
-
-def _alike(every: Iterable[Rounding], error: float, most: float) -> Iterator[str]:
-    for each in every:
-        if each.least * each.made < error < most * each.made:
-            yield (
-                f"{each.what}: that alone contributes {three_digits(1e3 * each.made)} mm, the residual RMS is "
-                f"{three_digits(1e3 * error)} mm: {each.remedy}."
-            )
-
-
-def _commanded(every: Iterable[Rounding], error: float) -> Iterator[str]:
-    """Report joint values that are all multiples of a step to which they are not rounded, as errors are smaller."""
-    steps = [each for each in every if each.step and each.made > ALIKE[1] * error]
+    alike = list(roundings(problem, error, ALIKE[1]))
+    yield from alike
+    steps = [each for each in _roundings(problem) if each.step and each.made > ALIKE[1] * error and not alike]
     for each in steps[-1:]:
         yield (
             f"joint values are multiples of {each.step}, but errors of {three_digits(1e3 * error)} mm are smaller than "
             f"rounding would cause ({three_digits(1e3 * each.made)} mm): these are commanded joint values. Log the "
             "measured ones."
         )
+
+
+def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterator[str]:
+    """Report rounding of joint or measured values, if the RMS error [m] of a fit is less than so many times its own."""
+    for each in _roundings(problem):
+        if each.least * each.made < error < most * each.made:
+            yield (
+                f"{each.what}: that alone contributes {three_digits(1e3 * each.made)} mm, the residual RMS is "
+                f"{three_digits(1e3 * error)} mm: {each.remedy}."
+            )
 
 
 def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
@@ -860,19 +852,25 @@ def shown_by_fit(problem: CalibrationProblem) -> Iterator[str]:
         yield from shown_by_residuals(alone, x, transmission=False)
 
 
-def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: bool = True) -> Iterator[str]:
+def shown_by_residuals(
+    problem: CalibrationProblem, x: Array, *, transmission: bool = True, slight: bool = False
+) -> Iterator[str]:
     """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
     Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few;
     if ``transmission``, the slope of a joint's zero times the value of a joint, all of these times the way from the row
     before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
     Else backlash and rows of two kinds are looked for. Nothing is reported where gravity and eccentric gears explain
-    more, which are not in the model: a lack of fit, and no mistake.
+    more, which are not in the model: a lack of fit, and no mistake. Of ``slight`` residuals, no larger than they may
+    be, the addition is reported if errors would be a sixth smaller without it, and nothing else is looked for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
     model = problem.linearize(x)
-    best = _explained(model, x, _additions(problem, x, model, transmission))
+    best = _explained(model, x, _additions(problem, x, model, transmission), SLIGHT if slight else MOVED)
+    if slight:
+        yield from _said_of_addition(best)
+        return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
     changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, least=3)
@@ -885,24 +883,11 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, transmission: b
     if kinds is not None and left <= (MOVED if kinds.consecutive else kinds.left / MOVED):
         kinds = None
     if kinds is None and best is not None and abs(best[2][0]) <= best[1].largest:
-        yield from _said_of_addition(*best)
+        yield from _said_of_addition(best)
     elif kinds is not None or transmission:
         most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
         yield from first(two_positions(problem, x, most), said)
-
-
-def slight_effects(problem: CalibrationProblem, x: Array) -> Iterator[str]:
-    """Report what one addition explains of residuals at x (n,) that are no larger than they may be.
-
-    It is reported if errors would be a sixth smaller without it.
-    """
-    if len(problem.owners) > MOST_EQUATIONS:
-        return
-    model = problem.linearize(x)
-    best = _explained(model, x, _additions(problem, x, model), SLIGHT)
-    if best is not None and abs(best[2][0]) <= best[1].largest:
-        yield from _said_of_addition(*best)
 
 
 def _additions(
@@ -914,10 +899,11 @@ def _additions(
         yield from _scales(problem, x, model)
 
 
-def _said_of_addition(left: float, addition: Addition, coefficients: Array) -> Iterator[str]:
-    if addition.said is not None:
-        what, remedy = addition.said(coefficients)
-        yield f"{what} (that leaves {100 * left:.0f} % of the residuals): {remedy}."
+def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:
+    """Say what an addition means and which part of the residuals it leaves, unless it is too large or no mistake."""
+    if best is not None and best[1].said is not None and abs(best[2][0]) <= best[1].largest:
+        what, remedy = best[1].said(best[2])
+        yield f"{what} (that leaves {100 * best[0]:.0f} % of the residuals): {remedy}."
 
 
 def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:

@@ -374,10 +374,12 @@ def _factors(points: Points) -> Iterator[Misreading]:
 def _orders(points: Points) -> Iterator[Misreading]:
     """Yield all orders of up to six turning joints; of more, those with one elsewhere, as ABB's seventh is third."""
     robot = points.robot
-    joints = tuple(range(robot.dof))
+    joints = list(range(robot.dof))
     if len(set(robot.joint_dimensions)) > 1:
         return
-    orders = permutations(joints) if robot.dof <= 6 else map(partial(_elsewhere, joints), permutations(joints, 2))
+    orders = permutations(joints)
+    if robot.dof > 6:
+        orders = (tuple(np.insert(np.delete(joints, i), place, i).tolist()) for i, place in permutations(joints, 2))
     for columns in orders:  # the columns that hold joints 1, 2, ...
         names = ", ".join(f"q{columns.index(i) + 1}" for i in range(robot.dof))
 
@@ -385,13 +387,6 @@ def _orders(points: Points) -> Iterator[Misreading]:
             return replace(points, q=points.q[..., columns])
 
         yield Misreading(f"joints in the order {names}", f"name the columns {names}", change)
-
-
-def _elsewhere(joints: tuple[int, ...], move: tuple[int, int]) -> tuple[int, ...]:
-    """Return the order of joints in which one is moved to another place."""
-    joint, place = move
-    others = [each for each in joints if each != joint]
-    return (*others[:place], joint, *others[place:])
 
 
 def _other_robots(points: Points) -> Iterator[Misreading]:
@@ -448,10 +443,10 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
         return None
     chain, left = _mistakes(points, present)
     if present > WRONG and not points.seen:
-        for readings in ([*_factors(points), *_other_robots(points)], _orders(points)):
+        for further in ((_factors, _other_robots), (_orders,)):
             if left < BETTER * present:
                 break
-            chain, left = _best(points, list(readings))
+            chain, left = _best(points, [each for readings in further for each in readings(points)])
             if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
                 changed = chain[0].change(points)
                 second, size = _best(changed, _readings(changed))

@@ -275,8 +275,8 @@ def test_priors_together_say_both_or_contradict() -> None:
 
 def test_a_known_value_that_the_data_contradict_is_named() -> None:
     for text, apart in (("tool_x = nominal + 8 +- 0.5 mm", True), ("tool_x = nominal - 1 +- 0.5 mm", False)):
-        message = ro.calibrate(ro.load("position").problem, prior=Prior.known(text)).message
-        assert (f"The data contradict prior '{text}': the identified value is " in message) == apart
+        causes = ro.calibrate(ro.load("position").problem, prior=Prior.known(text)).causes
+        assert (f"The data contradict prior '{text}', by " in "".join(causes)) == apart
 
 
 def test_a_known_value_counts_without_penalty_and_weight() -> None:

@@ -543,11 +543,12 @@ def test_a_known_value_that_is_wrong_is_named_first(monkeypatch, capsys, tmp_pat
     file.write_text(f'{plain}\n[prior]\nknown = ["{value} +- 0.05 mm"]\n')
     capsys.readouterr()
     assert run(monkeypatch, "calibrate", str(cell), "--model", model) == 1
-    likely = re.findall("Likely: (.*)", capsys.readouterr().out)
-    assert likely[0].startswith(f"the known value of prior '{value} +- 0.05 mm' is off by {off} mm")
+    said = capsys.readouterr().out
+    assert f"The data contradict prior '{value} +- 0.05 mm', by {off} mm" in said
+    assert "Likely" not in said
     file.write_text(f'{plain}\n[prior]\nknown = ["{value.partition(" ")[0]} = nominal - 0.3 +- 0.4 mm"]\n')
     assert run(monkeypatch, "calibrate", str(cell), "--model", model) == 0
-    assert "known value" not in capsys.readouterr().out
+    assert "contradict" not in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(("robot", "seed"), [("irb120", 1), ("iiwa7", 2), ("kr6_r900", 3)])

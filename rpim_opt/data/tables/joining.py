@@ -23,11 +23,8 @@ from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables.understanding import Understood, counts_rows, row_stems
 from rpim_opt.robot.mdh import Robot
 
-TIME = re.compile(
-    r"[%#]?(?:.*[._/ ])?(?:time ?stamp|date ?time|time|stamp|(?:uhr)?zeit|zeitstempel|date|datum|t)"
-    r"(?:\W*(?:utc|gmt|local)\W*)?",
-    re.IGNORECASE,
-)
+TIME = re.compile(r"(?i)[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|(uhr)?zeit|zeitstempel|date|datum|t)"
+                  r"(\W*(utc|gmt|local)\W*)?")  # fmt: skip
 GERMAN = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})[ T]*")
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
