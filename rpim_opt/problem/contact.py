@@ -215,41 +215,39 @@ class Touches:
             growth = np.einsum("ki,kin->n", away, jacobian[every]) / len(every) / spread**2
             slopes[every] += left[every][:, :, None] * growth
         for tie in self.ties:
-            first, second = (where[end] for end in tie.ends)
-            apart = second.centre - first.centre
-            if tie.kind == "known_square":
-                off: Array | float = -np.arcsin(np.clip(first.normal @ second.normal, -1, 1))
-            elif tie.kind == "known_parallel":
-                off = -first.across @ second.normal * np.copysign(1.0, first.normal @ second.normal)
-            else:
-                off = tie.value - float(abs(first.normal @ apart) if first.planar else np.linalg.norm(apart))
-            left[tie.equations] = off
-            slopes[tie.equations] = sum(G @ jacobian[index.ravel()] for index, G in self.through(tie, where))
+            left[tie.equations], through = self.through(tie, where)
+            slopes[tie.equations] = sum(G @ jacobian[index.ravel()] for index, G in through)
         return left, slopes
 
-    def through(self, tie: Tie, where: Features) -> list[tuple[np.ndarray, Array]]:
-        """Return the equations (K, 3) of a tie's two features, and its slopes (e, 3K) by their touches' positions."""
+    def through(self, tie: Tie, where: Features) -> tuple[Array | float, list[tuple[np.ndarray, Array]]]:
+        """Return a tie's residual (e,), and slopes (e, 3K) by its two features' touches with their equations (K, 3)."""
         first, second = (where[end] for end in tie.ends)
         rows = [self.rows[end] for end in tie.ends]
         eyes = [np.eye(index.size).reshape(*index.shape, -1) for index in rows]
         one, other = first.moved(eyes[0]), second.moved(eyes[1])
         apart = second.centre - first.centre
-        same = np.copysign(1.0, first.normal @ second.normal)
+        cosine = first.normal @ second.normal
+        same = np.copysign(1.0, cosine)
+        off: Array | float
         if tie.kind == "known_square":
-            sine = np.sqrt(max(1 - (first.normal @ second.normal) ** 2, 1e-12))
+            off = -np.arcsin(np.clip(cosine, -1, 1))
+            sine = np.sqrt(max(1 - cosine**2, 1e-12))
             slopes = [second.normal @ one.normal / sine, first.normal @ other.normal / sine]
         elif tie.kind == "known_parallel":
+            off = -first.across @ second.normal * same
             turned = -first.across @ one.normal
             if one.across is not None:
                 turned = same * np.einsum("aic,i->ac", one.across, second.normal)
             slopes = [turned, same * first.across @ other.normal]
         elif first.planar:
+            off = tie.value - float(abs(first.normal @ apart))
             way = np.copysign(1.0, first.normal @ apart)
             slopes = [way * (apart @ one.normal - first.normal @ one.centre), way * first.normal @ other.centre]
         else:
+            off = tie.value - float(np.linalg.norm(apart))
             u = apart / max(float(np.linalg.norm(apart)), 1e-300)
             slopes = [-u @ one.centre, u @ other.centre]
-        return [(index, np.atleast_2d(G)) for index, G in zip(rows, slopes, strict=True)]
+        return off, [(index, np.atleast_2d(G)) for index, G in zip(rows, slopes, strict=True)]
 
     def kept(self, where: Features) -> np.ndarray:
         """Return which equations (m,) remain: all but those of touches, and those in whose places contrasts stand."""
@@ -273,7 +271,7 @@ class Touches:
         for thing, index in zip(where, self.rows, strict=True):
             transform[thing.kept(index).ravel()[:, None], index.ravel()] = np.kron(thing.aside.T, thing.shown)
         for tie in self.ties:
-            for index, G in self.through(tie, where):
+            for index, G in self.through(tie, where)[1]:
                 transform[tie.equations[:, None], index.ravel()] = G
         return transform.tocsr()[self.kept(where)]
 
@@ -327,7 +325,7 @@ def of_rows(touches: Touches, data: Dataset, each: Sequence[Array], where: Featu
             left[index[:, 0]] = own
     ties = {}
     for tie in touches.ties:
-        parts = [(G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, where)]
+        parts = [(G.reshape(-1, *index.shape), touch[index[:, 0]]) for index, G in touches.through(tie, where)[1]]
         ties[tie.equations[0]] = sum(np.einsum("aki,kij,bkj->ab", G, V, G) for G, V in parts)
     covariances = []
     for block, V, first in zip(data.blocks, each, numbers, strict=True):
