@@ -33,7 +33,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RpimError
-from rpim_opt.basics.files import write_bytes, write_json, write_text
+from rpim_opt.basics.files import write_files, write_json, write_text
 from rpim_opt.basics.text import markdown
 from rpim_opt.study import Metric, Report
 
@@ -195,7 +195,7 @@ def run(tool: str, situation: str, seed: int, quick: bool, anew: bool = False) -
             found = _answered(program, script, folder, settings, true)
             text = json.dumps(found).encode()
             kept.parent.mkdir(exist_ok=True)
-            write_bytes(kept, hashlib.sha256(text).hexdigest().encode() + b"\n" + text)
+            write_files({kept: hashlib.sha256(text).hexdigest().encode() + b"\n" + text})
         return found
 
 

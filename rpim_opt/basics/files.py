@@ -145,11 +145,6 @@ def write_text(path: Path, text: str) -> None:
     write_files({path: text.encode("utf-8")})
 
 
-def write_bytes(path: Path, data: bytes) -> None:
-    """Write bytes atomically: ``path`` holds either all of them or its previous content."""
-    write_files({path: data})
-
-
 def write_files(contents: Mapping[Path, bytes]) -> None:
     """Write several files, once the bytes of all are on the disk: all of them, or none.
 

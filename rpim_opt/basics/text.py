@@ -106,7 +106,6 @@ class Brief:
         raise NotImplementedError
 
     def __repr__(self) -> str:
-        """Return one line."""
         return f"<{type(self).__name__} {self._short()}>"
 
 

@@ -47,7 +47,6 @@ class Design(Brief):
         return f"{counted(len(self.chosen), 'configuration')} chosen"
 
     def __str__(self) -> str:
-        """Return the choice in a sentence."""
         names = {"D": "det^(1/n)", "A": "mean variance", "V": "predicted variance"}
         count = f"{len(self.chosen)} of {len(self.weights)} configurations"
         what = f"{count}, {self.criterion}-optimal ({names[self.criterion]})"
@@ -290,7 +289,6 @@ class Observability(Brief):
         return f"{self.rank} of {len(self.names)} combinations identifiable, condition {self.condition:.3g}"
 
     def __str__(self) -> str:
-        """Return what configurations can show, in lines."""
         indices = ", ".join(f"{name} {value:.3g}" for name, value in self.indices.items())
         weak = f"; {self.weak} of them the prior determines more precisely than the data" if self.weak else ""
         raw = f", {self.raw_condition:.3g} in mm and rad" if np.isfinite(self.raw_condition) else ""

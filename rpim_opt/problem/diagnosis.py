@@ -130,7 +130,6 @@ class Inspection(Tabled):
         return [*(f"Warning: {text}" for text in self.warnings), *(f"Proposal: {text}" for text in self.proposals)]
 
     def __str__(self) -> str:
-        """Return everything as a person reads it."""
         joints = []
         for r in self._frame_rows():
             figures = [f"{value:.2f}" for value in (r["from"], r["to"], r["to"] - r["from"])]

@@ -77,7 +77,6 @@ class RobotModel(Tabled):
         return f"of {names}: {self.sample().data._short()}, {counted(len(self.parameters.free), 'parameter')}"
 
     def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return the identified parameters."""
         return self.parameters.free._frame_rows()
 
     @property

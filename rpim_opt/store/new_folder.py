@@ -232,7 +232,7 @@ def _write_whole(folder: Path, contents: Mapping[str, bytes], arm: RobotSetup, s
         made = Path(stack.enter_context(files.scratch_folder(folder)), folder.name)
         files.write_files({made / name: content for name, content in contents.items()})
         if chains:
-            files.write_bytes(made / ROBOT_OF_CHAINS, files.read_bytes(source))
+            files.write_files({made / ROBOT_OF_CHAINS: files.read_bytes(source)})
         elif source.suffix == ".toml":
             files.write_text(made / "robot.toml", files.read_text(source))  # with its comments
         else:

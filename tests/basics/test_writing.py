@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from rpim_opt.basics import files
-from rpim_opt.basics.files import write_bytes, write_files, write_text
+from rpim_opt.basics.files import write_files, write_text
 
 OLD = b"old content"
 NEW = b"new content, and more of it"
@@ -36,7 +36,7 @@ def mask():
 @pytest.mark.parametrize("wanted", [0o022, 0o077, 0o002])
 def test_a_new_file_has_the_mode_that_the_umask_leaves(tmp_path: Path, mask, wanted: int) -> None:
     mask(wanted)
-    write_bytes(tmp_path / "deep" / "new", NEW)
+    write_files({tmp_path / "deep" / "new": NEW})
     assert mode(tmp_path / "deep" / "new") == 0o666 & ~wanted
     assert mode(tmp_path / "deep") == 0o777 & ~wanted
 
@@ -46,7 +46,7 @@ def test_a_file_keeps_its_mode(tmp_path: Path, wanted: int) -> None:
     path = tmp_path / "file"
     path.write_bytes(OLD)
     path.chmod(wanted)
-    write_bytes(path, NEW)
+    write_files({path: NEW})
     assert mode(path) == wanted
     assert path.read_bytes() == NEW
 
@@ -56,7 +56,7 @@ def test_a_write_protected_file_is_left_alone(tmp_path: Path, monkeypatch) -> No
     path.write_bytes(OLD)
     monkeypatch.setattr(os, "access", lambda *_: False)  # the superuser may write everything
     with pytest.raises(PermissionError, match="write-protected"):
-        write_bytes(path, NEW)
+        write_files({path: NEW})
     assert path.read_bytes() == OLD
     assert names(tmp_path) == ["file"]
 
@@ -69,7 +69,7 @@ def test_a_link_stays_one_and_its_target_is_written(tmp_path: Path, there: bool)
         target.write_bytes(OLD)
     link = tmp_path / "link"
     link.symlink_to(target)
-    write_bytes(link, NEW)
+    write_files({link: NEW})
     assert link.is_symlink()
     assert target.read_bytes() == NEW
     assert names(tmp_path) == ["elsewhere", "link"]
@@ -144,7 +144,7 @@ def test_the_bytes_are_on_the_disk_before_the_name_is_theirs(tmp_path: Path, mon
     replace = Path.replace
     monkeypatch.setattr(os, "fsync", lambda handle: order.append(os.readlink(f"/proc/self/fd/{handle}")))
     monkeypatch.setattr(Path, "replace", lambda self, target: (order.append("replace"), replace(self, target))[1])
-    write_bytes(tmp_path / "file", NEW)
+    write_files({tmp_path / "file": NEW})
     assert len(order) == 2
     assert order[0].endswith("/file")
     assert order[1] == "replace"
@@ -153,10 +153,10 @@ def test_the_bytes_are_on_the_disk_before_the_name_is_theirs(tmp_path: Path, mon
 WRITER = """
 import sys
 from pathlib import Path
-from rpim_opt.basics.files import write_bytes
+from rpim_opt.basics.files import write_files
 
 for _ in range(150):
-    write_bytes(Path(sys.argv[1]), sys.argv[2].encode() * 5000)
+    write_files({Path(sys.argv[1]): sys.argv[2].encode() * 5000})
 """
 
 

@@ -87,8 +87,9 @@ def test_a_few_rows_are_too_few_and_many_are_taken_evenly() -> None:
     enough = points_of(few[1])
     assert enough is not None
     assert enough.row.tolist() == list(range(FEWEST_ROWS))
-    some = points_of(problem, most=14)
-    assert some is not None
+    every = points_of(problem)
+    assert every is not None
+    some = every.evenly(14)
     assert some.row.tolist() == [3 * k for k in range(14)]
     assert some.y == pytest.approx(problem.data.blocks[0].y[::3])
 

@@ -79,22 +79,16 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     stated = {"torque": torque, "payload": columns.get(("payload", "")), "approach": approach}
     noise = covariances(columns, declared, kind, y, label)
     further = {name: columns[name, ""] for name in further_columns(robot, kind) if (name, "") in columns}
-    naming = _naming_column(table, kind)
-    point = texts(table[naming], naming) if naming else ()
+    naming = [column for column in kind.names if column in table]
+    if kind.touching and len(naming) != 1:
+        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: the touched point"
+        raise InputError("the header", ", ".join(table), accepted)
+    point = texts(table[naming[0]], naming[0]) if naming else ()
     session = texts(table.get("session", ()), "session")
     whole = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
     blocks = _by_markers(whole.blocks[0], table, kind, label)
     data = Dataset(blocks, label, _configurations(table, q.reshape(N, -1)))
     return data.grouped_by_points() if kind.touching else data
-
-
-def _naming_column(table: Columns, kind: Measurement) -> str:
-    """Return the column that names the points that were touched, or that a camera sees; empty without one."""
-    naming = [column for column in kind.names if column in table]
-    if kind.touching and len(naming) != 1:
-        accepted = f"{' or '.join(f'a column {column}' for column in kind.names)}: the touched point"
-        raise InputError("the header", ", ".join(table), accepted)
-    return naming[0] if naming else ""
 
 
 def _configurations(table: Columns, joints: Array) -> np.ndarray:

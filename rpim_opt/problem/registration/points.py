@@ -68,7 +68,7 @@ class Points:
 
 
 @lru_cache(maxsize=2)  # poses of a camera's views take seconds
-def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | None:
+def points_of(problem: CalibrationProblem) -> Points | None:
     """Return the measured points of positions, poses and a camera's views; None for few, and of several robots."""
     p = problem.parameters
     own = dict(zip(p.names, p.nominal.tolist(), strict=True))
@@ -95,7 +95,7 @@ def points_of(problem: CalibrationProblem, most: int = MOST_ROWS) -> Points | No
         tools=tools, turns=turns, row=np.array([number[data.label[i]] for block in blocks for i in block.row]),
         seen=data is not problem.data, names=tuple(markers),
     )  # fmt: skip
-    return whole.take(np.argsort(whole.row, kind="stable")).evenly(most)
+    return whole.take(np.argsort(whole.row, kind="stable")).evenly(MOST_ROWS)
 
 
 def lengths_of(problem: CalibrationProblem) -> Points | None:

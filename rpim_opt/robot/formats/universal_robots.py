@@ -13,7 +13,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, of_file
-from rpim_opt.basics.files import read_bytes, write_bytes
+from rpim_opt.basics.files import read_bytes, write_files
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
     Chain,
@@ -124,7 +124,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
         for name, values in new.items()
         if not np.array_equal(values, old[name])
     }
-    write_bytes(Path(target), spliced(data, edits))
+    write_files({Path(target): spliced(data, edits)})
 
 
 def _deltas(data: bytes) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
@@ -196,7 +196,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
         texts = origin_numbers(T, old, size)
         numbers = [number for text in texts for number in (text.split() if text else [None] * 3)]
         edits |= {places[name, key]: n for key, n in zip(SIX, numbers, strict=True) if n is not None}
-    write_bytes(Path(target), spliced(data, edits))
+    write_files({Path(target): spliced(data, edits)})
 
 
 def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, int]]]:

@@ -22,7 +22,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices, of_file
-from rpim_opt.basics.files import read_bytes, write_bytes
+from rpim_opt.basics.files import read_bytes, write_files
 from rpim_opt.basics.units import LARGEST, numeral
 from rpim_opt.robot.chain import (
     MOUNT,
@@ -172,7 +172,7 @@ def write_urdf(
             found = f"{what} that moves link '{step.end if at_tip else step.start}'"
             accepted = f"a link held by a fixed joint, since joint '{step.joint.name}' cannot express it"
             raise InputError("robot", found, f"{accepted}, or no such correction")
-    write_bytes(Path(target), spliced(urdf.data, edits))
+    write_files({Path(target): spliced(urdf.data, edits)})
 
 
 @of_file
@@ -190,7 +190,7 @@ def write_origins(source: str | Path, deviations: Mapping[str, Array], target: s
             raise InputError(f"parameters {prefix}*", "no such joint", choices(prefix, known))
         T = numeric_frame(six) @ known[prefix].origin
         edits |= known[prefix].origin_edits(urdf.data, T, max(float(np.abs(T).max()), 1.0))
-    write_bytes(Path(target), spliced(urdf.data, edits))
+    write_files({Path(target): spliced(urdf.data, edits)})
 
 
 # The way between two links
