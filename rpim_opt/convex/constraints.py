@@ -196,7 +196,8 @@ def at_nominal(*patterns: str) -> Box:
     >>> dict(zip(result.problem.parameters.free.names, result.x.tolist()))["alpha3"]
     0.0
     """
-    return Box("at nominal", Ready("at_nominal", _at_nominal, patterns))
+    limits = Ready("at_nominal", _at_nominal, patterns)
+    return Box(limits.name, limits)
 
 
 def _at_nominal(parameters: Parameters, *patterns: str) -> tuple[Array, Array]:
@@ -217,7 +218,8 @@ def signed(sign: int, *patterns: str) -> Box:
     """
     if sign not in (1, -1):
         raise InputError("signed", f"sign {sign}", "+1 or -1")
-    return Box("signed", Ready("signed", _signed, (sign, *patterns)))
+    limits = Ready("signed", _signed, (sign, *patterns))
+    return Box(limits.name, limits)
 
 
 def _signed(parameters: Parameters, sign: int, *patterns: str) -> tuple[Array, Array]:

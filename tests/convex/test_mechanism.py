@@ -326,7 +326,7 @@ def test_neither_does_a_dask_cluster(formulation: str, monkeypatch: pytest.Monke
                     assert found is None
                     assert whole is None or rule in ("leave_one_out", "k_fold", "two_step"), rule
                     continue
-                searched = rule == "corner" and not whole.linear_penalty  # ends at an interval of 1 %
+                searched = rule == "corner" and not whole.program.linear_penalty  # ends at an interval of 1 %
                 searched |= rule == "l_curve" and formulation == "bounded"  # curvature jumps where a bound gets active
                 assert found.weight == pytest.approx(whole.weight, rel=0.01 if searched else 1e-4), rule
                 if searched:
