@@ -132,14 +132,12 @@ class Program(Brief):
 
     def on_squares(self, model: LinearModel) -> Program:
         """Return the same penalty and constraints with the squares of other equations as the loss."""
-        return self._on(self.structure.on_squares, model)
+        return self._part(self.structure.on_squares, model)
 
-    def _on(self, changed: Callable[[], Structure], model: LinearModel | None = None) -> Program:
+    def _part(self, structure: Structure, model: LinearModel) -> Program:
         """Return the program of a part of the formulation, with warm starts of its own."""
-        if changed.__name__ not in self._warm.parts:
-            self._warm.parts[changed.__name__] = WarmStart(changed())
-        warm = self._warm.parts[changed.__name__]
-        return Program(warm.structure.formulation, model or self.model, warm.structure, warm)
+        warm = self._warm.parts.setdefault(structure, WarmStart(structure))
+        return Program(structure.formulation, model, structure, warm)
 
     def beginning(self, z: Array) -> Program:
         """Return the same program with z (n,) as the start of its next solution."""
@@ -368,7 +366,7 @@ class Program(Brief):
         if solver or settings or verbose:
             estimate = self._by_cvxpy(weight, damping, solver or cp.CLARABEL, settings or {}, verbose)
         elif weight == 0 and not self.linear_penalty:  # what multiplies zero is no part of the program
-            alone = self._on(self.structure.without_penalty).solve(damping=damping, accuracy=accuracy)
+            alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping, accuracy=accuracy)
             estimate = replace(alone, penalty=self.value(alone.z, 0.0)[1])
         elif damping is None and self.closed_form:
             form, z = self.penalty_form, self.ridge.minima(np.array([weight]))[0]

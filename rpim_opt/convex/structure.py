@@ -187,8 +187,9 @@ class Structure:
         seen, r = self.expressions.loss.variable, self.expressions.r
         return stated if seen is r else substituted(stated, {id(seen): norms(r, self.groups)})
 
+    @cached_property
     def on_squares(self) -> Structure:
-        """Return the same penalty and constraints with the sum of squares of the equations as the loss."""
+        """The same penalty and constraints with the sum of squares of the equations as the loss."""
         made = self._changed("loss_form", "loss")
         if made._called is not None:
             own = made._called
@@ -200,8 +201,9 @@ class Structure:
         made.equations = self.n + 1
         return made
 
+    @cached_property
     def without_penalty(self) -> Structure:
-        """Return the same loss and constraints without the penalty."""
+        """The same loss and constraints without the penalty."""
         made = self._changed("penalty_form", "canonical")
         if made._called is not None:
             own = made._called
@@ -213,7 +215,7 @@ class Structure:
     def _changed(self, *properties: str) -> Structure:
         """Return a copy for another formulation, whose functions that stay are not called again."""
         made = copy.copy(self)
-        for name in (*properties, "joint", "inner", "_over_own"):
+        for name in (*properties, "joint", "inner", "_over_own", "on_squares", "without_penalty"):
             vars(made).pop(name, None)
         made._called = copy.copy(self._called)
         return made

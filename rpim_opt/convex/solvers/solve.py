@@ -45,7 +45,7 @@ class WarmStart:
     part: tuple[np.ndarray, ReducedProgram] | None = None
     small: dict[Any, ReducedProgram] = field(default_factory=dict)
     kink: float = -1.0
-    parts: dict[str, WarmStart] = field(default_factory=dict)
+    parts: dict[Structure, WarmStart] = field(default_factory=dict)
     lock: Any = field(default_factory=threading.RLock)
 
     @property
