@@ -680,7 +680,7 @@ def on_working_set(
             for _ in range(3):
                 x = x - Z @ (V.T @ (V @ slope / values**2))
                 slope = Z.T @ gradient(x)
-            rounding = 1e-9 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
+            rounding = 1e-14 * largest * max(np.abs(squares.R @ x[at]).max(), np.abs(squares.y).max())
             pull = 2 * squares.R.T @ squares.y - squares.g
             allowed = max(1e-9 * weight * np.abs(p.q).max(initial=0.0), 1e-14 * np.abs(pull).max(initial=0.0), rounding)
             if not np.abs(slope - V.T @ (V @ slope)).max(initial=0.0) <= allowed:
