@@ -64,8 +64,8 @@ def largest_errors(problem: Source, x: Array) -> list[tuple[float | None, str]]:
     errors = np.array([problem.errors(x, dimension) for dimension in dimensions])
     medians = [np.median(each[np.isfinite(each)]) if np.isfinite(each).any() else 1.0 for each in errors]
     largest = np.nan_to_num(errors / np.maximum(medians, FINEST)[:, None]).argmax(axis=0)
-    sizes = [float(e) if np.isfinite(e) else None for e in errors[largest, np.arange(errors.shape[1])]]
-    return [(size, dimensions[k].rpartition(" ")[2]) for size, k in zip(sizes, largest, strict=True)]
+    values = [float(e) if np.isfinite(e) else None for e in errors[largest, np.arange(errors.shape[1])]]
+    return [(value, dimensions[k].rpartition(" ")[2]) for value, k in zip(values, largest, strict=True)]
 
 
 def error_ratios(problem: CalibrationProblem, x: Array) -> Array:

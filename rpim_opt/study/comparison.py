@@ -114,11 +114,7 @@ def compare(
     ways = splits_of(splits)
     sizes = [None] if counts is None else _numbers("counts", counts, "whole numbers, 1 or more", 1, int)
     factors = _numbers("noise", noise, "factors of 1 or more on the noise that was measured", 1, float)
-    if isinstance(seeds, int | np.integer) and not isinstance(seeds, bool):  # how many
-        if seeds > MOST_DRAWS:
-            raise InputError("seeds", f"{seeds}", f"at most {MOST_DRAWS} draws")
-        seeds = range(max(int(seeds), 0))
-    numbered = _numbers("seeds", seeds, "whole numbers, 0 or more", 0, int)
+    numbered = _seeds(seeds)
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
@@ -159,6 +155,15 @@ def compare(
     }
     settings = {name: ", ".join(values) for name, values in axes.items() if values}
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
+
+
+def _seeds(stated: int | Iterable[int]) -> list[int]:
+    """Return seeds that are stated one by one, or by how many there are."""
+    if isinstance(stated, int | np.integer) and not isinstance(stated, bool):
+        if stated > MOST_DRAWS:
+            raise InputError("seeds", f"{stated}", f"at most {MOST_DRAWS} draws")
+        stated = range(max(int(stated), 0))
+    return _numbers("seeds", stated, "whole numbers, 0 or more", 0, int)
 
 
 def _numbers(where: str, stated: Any, accepted: str, least: float, kind: type) -> list[Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -16,7 +17,7 @@ from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import EXCEL
 from rpim_opt.basics.units import display, joint_columns, split_unit
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
 from rpim_opt.data.measurements.contact import KNOWN
 from rpim_opt.data.measurements.measurement import Measurement
@@ -128,18 +129,12 @@ def read_measurements(
         raise InputError("measurement", "several", choices("", types))
     calibrated = pick(types, measurement or next(iter(types)), "measurement")
     understanding = _understood(result, source, calibrated, options or TableOptions())
+    kind = _measured_in(understanding, calibrated)
     columns = understanding.columns
-    kind, stems = calibrated, {split_unit(name)[0] for name in columns}
-    if not any(stems >= set(form) for form in (kind.columns, *(form for form, _ in kind.forms))):
-        kind = next((part for part in kind.parts if stems >= set(part.columns)), kind)  # poses, validated by positions
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
-    own = [block.covariance for block in blocks if block.measurement is calibrated]
-    variance = np.mean([np.einsum("nii->ni", covariance).mean(axis=0) for covariance in own], axis=0)
-    sigma = dict(zip(calibrated.components, np.sqrt(variance).tolist(), strict=True))
-    units = {name: display(dimension) for name, dimension in kind.components.items()}
-    noise = {f"{name}_{unit}": sigma[name] / si for name, (unit, si) in units.items()}
+    noise = _typical_noise([block for block in blocks if block.measurement is calibrated], kind)
     data = rows_of(understanding, columns, RobotSetup(robot, np.zeros(6), np.zeros(6)), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
@@ -147,6 +142,22 @@ def read_measurements(
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
     return Measured(data, left_out, (*notes, *understanding.notes), clock)
+
+
+def _measured_in(understanding: Understanding, calibrated: Measurement) -> Measurement:
+    """Return the type that columns show: the calibrated one, or a part: poses may be validated by positions."""
+    stems = {split_unit(name)[0] for name in understanding.columns}
+    if any(stems >= set(form) for form in (calibrated.columns, *(form for form, _ in calibrated.forms))):
+        return calibrated
+    return next((part for part in calibrated.parts if stems >= set(part.columns)), calibrated)
+
+
+def _typical_noise(blocks: Sequence[Block], kind: Measurement) -> dict[str, float]:
+    """Return the typical standard deviations in blocks that measure a type's components, as ``[noise]`` has them."""
+    variance = np.mean([np.einsum("nii->ni", block.covariance).mean(axis=0) for block in blocks], axis=0)
+    sigma = dict(zip(blocks[0].measurement.components, np.sqrt(variance).tolist(), strict=True))
+    units = {name: display(dimension) for name, dimension in kind.components.items()}
+    return {f"{name}_{unit}": sigma[name] / si for name, (unit, si) in units.items()}
 
 
 def _understood(

@@ -244,5 +244,6 @@ def test_at_weight_zero_constraints_move_what_the_data_do_not_identify(loss: str
     free = ro.Formulation("free", **LOSSES_ALONE[loss])
     bound = ro.Formulation("bound", constraints=(stated,), **LOSSES_ALONE[loss])
     least, estimate = (ro.convex.pose(each, model).solve(0.0) for each in (free, bound))
-    assert estimate.objective <= least.objective * (1 + 1e-5)  # the unidentified one meets it, at no cost
+    # the unidentified direction meets it at no cost; of L1 an interior point ends within 4e-6, where data are 1e8 flat
+    assert estimate.objective <= least.objective * (1 + 1e-5)
     assert relation @ estimate.z == pytest.approx(5.0, abs=1e-6)
