@@ -44,6 +44,7 @@ RIDGE = 1e-13  # added to the scaled information matrix against rounding in unob
 PRECISIONS = np.linspace(-14.0, 8.0, 200)
 """Logarithms of the precisions, times a squared scale, of the normals that nearly all of a t_3 is a mixture of."""
 MOST_WIDENED = 100.0  # bound on the factor of tails on a local variance, where data contradict them
+SHOWN = 6.0  # fall of -2 ln L, a likelihood ratio of twenty, from which such a factor is not chance
 FACTORS = np.geomspace(1.0, 30.0, 100)  # on the covariance of deviations, compared for what the model lacks
 
 
@@ -367,7 +368,7 @@ class Evidence:
         What a model lacks repeats from row to row, so that C, which takes it for chance, is too small; inside the
         measured ranges the noise covers it. Equations in either half of a joint's range predict those in the other one
         with errors e of covariance I + k X C X', C as that half alone leaves it; k has the largest product of both
-        likelihoods. It is 1 where all joints together show no more.
+        likelihoods. It is 1 where the likelihood of all joints together does not rise by a factor of twenty with one k.
         """
         X = np.vstack([part.X.reshape(-1, len(point.v)) for part in point.parts])
         y = np.concatenate([part.y.reshape(-1, 1) for part in point.parts])
@@ -386,7 +387,9 @@ class Evidence:
                 along = (V.T @ (Y @ (y[~half] - Y.T @ mean)))[informative, 0]
                 variances = 1 + FACTORS[:, None] * spread[informative]
                 value[joint] += np.sum(np.log(variances) + along**2 / spread[informative] / variances, axis=1)
-        return np.where(np.argmin(value.sum(axis=0)), FACTORS[np.argmin(value, axis=1)], 1.0)
+        together = value.sum(axis=0)
+        shown = together[0] - together.min() > SHOWN
+        return FACTORS[np.argmin(value, axis=1)] if shown else np.ones(len(lower))
 
     # --- local variances ----------------------------------------------------------------------------------------
 
