@@ -36,8 +36,9 @@ ROUNDING = 1e-9  # relative rise of an objective at a step that is rounding
 FIRST_ACCURACY = 0.01  # relative accuracy of the first solve: its linearization is no better
 FEW_ITERATIONS = 10  # iterations that are too few to begin with a weight that no rule was asked for
 NEAR_FIRST = 0.01  # share of the solution that the next step at the first weight may be when the rule is asked
-NOTHING_PROMISED = 3  # iterations in a row that promise nothing beyond the accuracy, after which the loop is at rest
-CIRCLE = 20  # iterations that lower the objective by no more than its accuracy, after which the loop is at rest
+STALLED, STALLED_MOST = 2, 20
+"""Evaluations in a row that do not lower the objective beyond its accuracy, after which the loop is at rest: where the
+next step promises nothing, and whatever that promises."""
 DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objective
 SAME_POSITIONS = 1e-4  # what a round may change, relative to 1 + |z|: the error of predicted positions is its square
 ROUNDS, LEAST_SHARE = 20, 1 / 8  # rounds at most; least share of the way to its solution at which the next linearizes
@@ -198,10 +199,10 @@ def weight_choice(weight: float | str | Selector, penalized: bool) -> WeightChoi
 class State:
     """State of the loop: the program linearized at z (n,) [scales], the weight, and the nonlinear objective.
 
-    ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2; ``idle``
-    counts iterations in a row that promised nothing, and ``rejected`` says whether the full step from z was one that
-    raised the objective. ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``), and
-    ``floor`` is what vanishing objectives are compared with.
+    ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2.
+    ``stalled`` counts the evaluations since the objective was last lowered beyond its accuracy, to ``lowest``.
+    ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``), ``floor`` is what vanishing objectives are compared
+    with.
     """
 
     z: Array
@@ -213,22 +214,18 @@ class State:
     damping: float = 0.0
     history: tuple[Iteration, ...] = ()
     evaluations: int = 1
-    idle: int = 0
-    rejected: bool = False
+    stalled: int = 0
+    lowest: float = np.inf
     outcome: str = ""
 
     def weighted(self, choice: WeightChoice) -> State:
         """Return the state with another weight and its objective."""
-        return replace(self, choice=choice, merit=self.program.objective(self.z, choice.weight), rejected=False)
+        merit = self.program.objective(self.z, choice.weight)
+        return replace(self, choice=choice, merit=merit, stalled=0, lowest=merit)
 
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""
         return length / (1 + float(np.linalg.norm(self.z)))
-
-    def circles(self, accuracy: float) -> bool:
-        """Whether the last iterations have not lowered the objective, though each step promises to."""
-        passed = [each.objective for each in self.history if each.weight == self.choice.weight]
-        return len(passed) > CIRCLE and min(passed[-CIRCLE:]) >= min(passed[:-CIRCLE]) - accuracy
 
 
 @dataclass(frozen=True, eq=False)
@@ -297,7 +294,8 @@ class Loop:
         choice = replace(choice, robust=self.reweigh is not None or program.separable)
         objective = program.objective(z, choice.weight)
         floor = VANISHING * abs(objective) if np.isfinite(objective) else 0.0
-        return State(z, program, choice, objective, np.linalg.norm(program.model.A, axis=0), floor)
+        size = np.linalg.norm(program.model.A, axis=0)
+        return State(z, program, choice, objective, size, floor, lowest=objective)
 
     # --- the weight ------------------------------------------------------------------------------------------
 
@@ -318,7 +316,7 @@ class Loop:
         choice = state.choice.confirmed(self._judged(state))
         if choice.weight == state.choice.weight:
             return replace(state, choice=choice)
-        return replace(state.weighted(choice), idle=0, outcome="")
+        return replace(state.weighted(choice), outcome="")
 
     def answered(self, state: State) -> State:
         """Apply a rule that was not applied yet."""
@@ -344,17 +342,15 @@ class Loop:
         choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, promised <= accuracy
-        if state.damping > 0 and (short or nothing):
-            # a short step of a damped program says nothing: ask for the full one, unless that has failed here
-            return _rested(state) if state.rejected else replace(state, damping=0.0)
-        state = replace(state, idle=state.idle + 1 if nothing else 0)
-        at_rest = promised <= best or state.idle >= NOTHING_PROMISED or state.circles(accuracy)
+        if state.damping > 0 and (short or nothing) and state.stalled < STALLED_MOST:
+            return replace(state, damping=0.0)  # a short step of a damped program says nothing: ask for the full one
+        at_rest = promised <= best or state.stalled >= (STALLED if nothing else STALLED_MOST)
         if choice.settled and at_rest:
             return replace(state, outcome="rest")
         waiting = choice.settled and not choice.final and not choice.weights
         if waiting and state.damping == 0 and length <= NEAR_FIRST:  # where the weight that it began with leads
-            return self.answered(replace(state, idle=0))
-        return self._stepped(state, solution, promised, short, nothing)
+            return self.answered(state)
+        return self._stepped(state, solution, promised, short, accuracy)
 
     def _predicted(self, state: State) -> tuple[Array, float]:
         """Return the minimum (n,) of the convex program, and by how much the objective falls there if that holds."""
@@ -368,21 +364,23 @@ class Loop:
             promised = state.merit - state.program.objective(solution, state.choice.weight)
         return solution, promised
 
-    def _stepped(self, state: State, solution: Array, promised: float, short: bool, nothing: bool) -> State:
-        """Step to a minimum if the nonlinear objective falls, else damp; ``nothing``: no fall is promised."""
+    def _stepped(self, state: State, solution: Array, promised: float, short: bool, accuracy: float) -> State:
+        """Step to a minimum if the nonlinear objective falls, else damp; one below ``accuracy`` promises nothing."""
         z = self._accelerated(state, solution)
         candidate = state.program.on(self.linearized(z, state.z))
         after = candidate.objective(z, state.choice.weight)
         rounding = ROUNDING * abs(state.merit) + state.floor
-        fall, gain = state.merit - after, 1.0
+        fall, gain, nothing = state.merit - after, 1.0, promised <= accuracy
         if promised > 0 and not (nothing and abs(fall) <= rounding):  # else rounding would damp
             gain = fall / promised
         effect = float(np.sum((state.size * (z - state.z)) ** 2))
         damping = damped(state.damping, gain, promised, effect)
-        state = replace(state, evaluations=state.evaluations + 1)
+        state = replace(state, evaluations=state.evaluations + 1, stalled=state.stalled + 1)
+        if after < state.lowest - accuracy:
+            state = replace(state, stalled=0, lowest=after)
         if after <= state.merit + rounding:
             return replace(self._accepted(state, candidate, z, after, short), damping=damping)
-        state = replace(state, damping=damping, rejected=state.rejected or state.damping == 0)
+        state = replace(state, damping=damping)
         if short or nothing:
             return _rested(state)
         if damping > DAMPING_MOST or not np.isfinite(damping):
@@ -434,7 +432,6 @@ class Loop:
             merit=after,
             history=(*state.history, passed),
             size=np.maximum(state.size, np.linalg.norm(candidate.model.A, axis=0)),
-            rejected=False,
             outcome="rest" if state.choice.settled and short else "",
         )
         return replace(there, choice=state.choice.after(there.relative(length)))
@@ -522,7 +519,7 @@ def _rested(state: State) -> State:
     """Return the state where no step lowers the objective: the end, or a choice of the weight."""
     if state.choice.settled:
         return replace(state, outcome="rest")
-    return replace(state, choice=state.choice.after(0.0), rejected=False)
+    return replace(state, choice=state.choice.after(0.0))
 
 
 def damped(damping: float, gain: float, promised: float, effect: float) -> float:

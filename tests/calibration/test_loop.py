@@ -68,25 +68,25 @@ def test_a_rule_is_asked_next_to_where_the_first_weight_leads(away: float, dampi
     length = np.linalg.norm(there.solve(1.0).z - z) / (1 + np.linalg.norm(z))
     assert (length < 0.01) == (away < 0.01)
     choice = replace(weight_choice(answering(5.0), True), robust=True, weight=1.0, settled=True)
-    before = state(formulation=ro.robust, z=z, program=there, choice=choice, damping=damping, idle=2)
+    before = state(formulation=ro.robust, z=z, program=there, choice=choice, damping=damping, stalled=2)
     before = replace(before, merit=there.objective(z, 1.0))
     after = loop(formulation=ro.robust).advanced(before)
     assert after.choice.weights == ((5.0,) if asks else ())
     if asks:
         assert np.array_equal(after.z, z)
-        assert (after.choice.weight, after.outcome, after.idle) == (5.0, "", 0)
+        assert (after.choice.weight, after.outcome, after.stalled) == (5.0, "", 0)
         assert after.merit == pytest.approx(there.objective(z, 5.0), rel=1e-12)
 
 
 def test_at_rest_a_weight_is_asked_for_once_more() -> None:
     def resting(*weights: float, outcome: str = "rest") -> State:
         choice = weight_choice(answering(2.0, *weights), True).updated(state().program).after(0.0)
-        return state(choice=choice, z=np.ones(N), merit=-1.0, outcome=outcome, idle=2)
+        return state(choice=choice, z=np.ones(N), merit=-1.0, outcome=outcome, stalled=2)
 
     same = loop().confirmed(resting(2.0))
-    assert (same.outcome, same.merit, same.choice.final, same.idle) == ("rest", -1.0, True, 2)
+    assert (same.outcome, same.merit, same.choice.final, same.stalled) == ("rest", -1.0, True, 2)
     other = loop().confirmed(resting(5.0))
-    assert (other.outcome, other.choice.weight, other.choice.settled, other.idle) == ("", 5.0, False, 0)
+    assert (other.outcome, other.choice.weight, other.choice.settled, other.stalled) == ("", 5.0, False, 0)
     assert other.merit == pytest.approx(other.program.objective(other.z, 5.0), rel=1e-12)
     for outcome in ("", "stuck"):
         going = resting(outcome=outcome)
@@ -175,7 +175,7 @@ def test_a_first_step_counts_and_lowers_the_objective() -> None:
     after = loop().advanced(before)
     assert after.evaluations == before.evaluations + 1
     assert after.merit < before.merit
-    assert after.idle == 0
+    assert after.stalled == 0
     assert len(after.history) == 1
     assert after.damping == 0.0
 
@@ -195,7 +195,7 @@ def test_at_its_minimum_a_damped_state_asks_for_the_full_step_and_then_rests() -
     assert end.z == pytest.approx(z, abs=1e-7)
 
 
-def test_three_idle_passes_are_enough_and_two_are_not() -> None:
+def test_a_stalled_loop_rests_at_a_step_that_promises_nothing_and_later_at_any() -> None:
     """Near a lasso's minimum: less is promised than an interior point's accuracy, and more than its best."""
     before = state(formulation=ro.lasso, weight=20.0)
     program = before.program
@@ -203,15 +203,20 @@ def test_three_idle_passes_are_enough_and_two_are_not() -> None:
     best = program.objective(z, 20.0)
     i = int(np.argmax(np.abs(z)))
     z[i] += np.sqrt(1e-9 * best) / before.size[i]
-    there = replace(before, z=z, merit=program.objective(z, 20.0))
+    merit = program.objective(z, 20.0)
+    there = replace(before, z=z, merit=merit, lowest=merit)
     assert 1e-10 * best < there.merit - best < 0.5e-8 * best
     at = loop(formulation=ro.lasso, tolerance=0.0)
-    third = at.advanced(replace(there, idle=2))
+    third = at.advanced(replace(there, stalled=2))
     assert (third.outcome, third.evaluations) == ("rest", there.evaluations)
-    second = at.advanced(replace(there, idle=1))
-    assert (second.outcome, second.evaluations, second.idle) == ("", there.evaluations + 1, 2)
-    assert at.advanced(replace(there, merit=best, idle=0)).outcome == "rest"
-    assert at.advanced(replace(there, merit=best * (1 + 1e-7), idle=2)).idle == 0
+    second = at.advanced(replace(there, stalled=1))
+    assert (second.outcome, second.evaluations) == ("", there.evaluations + 1)
+    assert at.advanced(replace(there, merit=best, stalled=0)).outcome == "rest"
+    promising = replace(there, merit=best * (1 + 1e-7), lowest=best * (1 + 1e-7))
+    assert at.advanced(replace(promising, stalled=2)).stalled == 0
+    assert at.advanced(replace(promising, stalled=20)).outcome == "rest"
+    assert at.advanced(replace(there, damping=1e9, stalled=19)).damping == 0.0
+    assert at.advanced(replace(there, damping=1e9, stalled=20)).outcome == "rest"
 
 
 # --- what is said ------------------------------------------------------------------------------------------
