@@ -9,6 +9,8 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
+TINY = float(np.finfo(float).tiny)  # divisors are no smaller
+
 
 def statistics(errors: Array, unit: Literal["mm", "mrad"] = "mm") -> dict[str, Any]:
     """Return mean, RMS, 95th percentile, maximum [mm or mrad] and count of errors [m or rad]; None if all are NaN."""

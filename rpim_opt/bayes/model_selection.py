@@ -239,8 +239,9 @@ class Comparison(Models):
     def plain(self) -> Candidate:
         """The result's own model, without extensions."""
         evidence = self.columns.restricted(self.members(()))
-        starts = evidence.starts()
-        if self.result.learned is not None:
+        if self.result.learned is None:
+            starts = evidence.starts()
+        else:
             noise = {name: np.log(size.value) for name, size in self.result.learned.noise.items() if name in CENTRES}
             starts = [np.array([noise.get(n, c) for n, c in zip(evidence.names, evidence.centre, strict=True)])]
         point = evidence.optima(starts)[0]

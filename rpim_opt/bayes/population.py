@@ -9,7 +9,8 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.units import UNITS, accepted_units
-from rpim_opt.bayes.prior_terms import FAR, Result, default_widths, marginal
+from rpim_opt.bayes.prior_terms import Result, default_widths, marginal
+from rpim_opt.convex.constraints import FAR
 from rpim_opt.problem.linear import reduced_rows
 
 PRIOR_ROBOTS = 3.0  # degrees of freedom of the hyperprior of the parameters' variances: as many robots it counts for

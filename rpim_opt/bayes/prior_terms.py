@@ -12,7 +12,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.units import display
-from rpim_opt.convex.constraints import Ready, matching
+from rpim_opt.convex.constraints import FAR, Ready, matching
 from rpim_opt.convex.expressions import SQUARES, cp, named
 from rpim_opt.convex.formulation import NAMED, Formulation
 from rpim_opt.convex.quadratic import Quadratic
@@ -21,7 +21,6 @@ from rpim_opt.robot.parameters import Parameters, is_joint_offset
 
 FIXED = -1  # the group of a parameter whose prior scale is not estimated: of frames, but for the base, and of curves
 JOINT_OFFSET, FRAMES = 3.0, 10.0  # factors on the scales of joint offsets, which are set at assembly, and of frames
-FAR = 100.0  # prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong
 
 
 def default_widths(parameters: Parameters, joint_offset: float = JOINT_OFFSET, frames: float = FRAMES) -> Array:
@@ -95,8 +94,8 @@ class ScaledPrior:
         keep = np.where(self.replaced, 0.0, 1 / self.scale)
         groups = None
         if formulation.penalty is not None and formulation.penalty_over is not None:
-            groups = [listed(np.asarray(D, dtype=float)) for D in formulation.penalty_over(self.parameters)]
-        parts = (keep.tolist(), self.centre.tolist(), listed(self.rows), self.values.tolist(), groups)
+            groups = [nested(np.asarray(D, dtype=float)) for D in formulation.penalty_over(self.parameters)]
+        parts = (keep.tolist(), self.centre.tolist(), nested(self.rows), self.values.tolist(), groups)
         return replace(formulation, penalty=prior_penalty(formulation.penalty, *parts), penalty_over=None)
 
 
@@ -259,7 +258,7 @@ def marginal(rows: Array, values: Array, kept: np.ndarray) -> tuple[Array, Array
     return left, right
 
 
-def listed(matrix: Array) -> tuple[tuple[float, ...], ...]:
+def nested(matrix: Array) -> tuple[tuple[float, ...], ...]:
     """Return a matrix (k, p) as nested tuples, which compare by content."""
     return tuple(tuple(row) for row in matrix.tolist())
 
@@ -299,7 +298,7 @@ def posterior(result: Result, inflate: float, without: Sequence[str], noise: flo
     return Statement(
         names=tuple(free.names[i] for i in chosen),
         dimensions=tuple(free.dimensions[i] for i in chosen),
-        rows=listed(rows),
+        rows=nested(rows),
         values=tuple((rows @ result.x[chosen]).tolist()),
         reference=tuple(free.nominal[chosen].tolist()),
         whole=True,

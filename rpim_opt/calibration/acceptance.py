@@ -28,8 +28,7 @@ from rpim_opt.calibration.held_out import (
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import Verdict as Delivery
-from rpim_opt.calibration.verdict import refuse_misread, rms
+from rpim_opt.calibration.verdict import Verdict, refuse_misread, rms
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Requirement
@@ -38,7 +37,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
 
-Verdict = Literal["accepted", "rejected", "inconclusive"]
+Conclusion = Literal["accepted", "rejected", "inconclusive"]
 MOST = 3  # joints or rows that a reason names
 STATED = 1e9  # degrees of freedom of an uncertainty that is stated
 WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
@@ -236,7 +235,7 @@ class Acceptance:
     """
 
     requirement: Requirement
-    verdict: Verdict
+    verdict: Conclusion
     reasons: tuple[str, ...]
     workspace: Workspace | None = None
     repeatability: float | None = None
@@ -253,9 +252,9 @@ class Acceptance:
         """Verdict and reasons as one text."""
         return " ".join(["Acceptance of the calibration, whole model:", self.sentences()[0], *self.reasons])
 
-    def on(self, calibration: Delivery) -> Delivery:
+    def on(self, calibration: Verdict) -> Verdict:
         """Return the verdict on a calibration, not delivered where the test rejects its robot."""
-        return Delivery(calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
+        return Verdict(calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
 
     def sentences(self) -> list[str]:
         """Return the verdict, its reasons and its grounds, sentence by sentence."""
@@ -341,7 +340,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:
         reasons = (*against, *lacking, f"No bound. {result.no_intervals or error}")
-        word: Verdict = "rejected" if against else "inconclusive"
+        word: Conclusion = "rejected" if against else "inconclusive"
         return Acceptance(requirement, word, reasons, held_out=held_out, caution=caution)
     repeatability, least = repeatability_bounds(result, region, mapped.q[-1], requirement.confidence)
     against += missed
@@ -354,7 +353,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
         )
     if not mapped.largest <= limit:
         lacking.append(_missing(result, limit, mapped.largest, repeatability))
-    verdict: Verdict = "accepted"
+    verdict: Conclusion = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "inconclusive"
     reasons = tuple(against or lacking)

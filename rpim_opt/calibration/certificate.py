@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import TINY, Array
 from rpim_opt.basics.exceptions import NoSolutionFound
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program, feasibility_tolerance, pose
@@ -19,7 +19,6 @@ DIRECTIONS = 2  # random directions in which the model's derivative is compared
 APART = 1e-4  # half the distance of a difference, in scales
 INEXACT = 1e-4  # relative difference from which the model's derivative is not the residual's
 RESTING = 1e-12  # step, relative to 1 + |z|, below which it is rounding, whatever it promises of an objective near zero
-TINY = 1e-300  # where numbers end that something may be divided by
 
 
 class Certificate(NamedTuple):

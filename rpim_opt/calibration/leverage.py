@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import TINY, Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled
 from rpim_opt.basics.threads import one_blas_thread
@@ -23,7 +23,6 @@ from rpim_opt.problem.workspace import bounding, moved, predicted
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
 from rpim_opt.robot.parameters import of_joint, own_name
 
-TINY = 1e-300  # divisors are no smaller
 ALONE = 1e-9  # a configuration decides a direction alone where others know less than this share of it
 UNIDENTIFIABLE = 1e-9  # standard deviations below, in scales, are rounding: the data do not see the parameter
 IMPROVED = 0.9  # a calibration whose predicted error is above this share of the nominal robot's improves nothing

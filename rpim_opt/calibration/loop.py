@@ -338,7 +338,13 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
-        solution, promised = self._predicted(state)
+        try:
+            solution, promised = self._predicted(state)
+        except NoSolutionFound:
+            if not 0 < state.damping <= DAMPING_MOST:
+                raise
+            # hardly identified directions, which damping bounds
+            return replace(state, damping=DAMPING_GROWTH * state.damping, evaluations=state.evaluations + 1)
         choice, length = state.choice, state.relative(float(np.linalg.norm(solution - state.z)))
         accuracy, best = self._accuracy(state)
         short, nothing = length <= self.options.tolerance, promised <= accuracy

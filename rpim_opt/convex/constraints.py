@@ -42,7 +42,7 @@ Constraint = Callable[[Any, Parameters], Any]
 WORKSPACE, BOX = "workspace", ("x", "y", "z")
 """The place that every robot has, all its joint ranges; and what a box is given by."""
 FAR = 100.0
-"""Prior scales by which the nominal robot may miss a statement: beyond, its unit or its meaning is wrong."""
+"""Prior scales by which a stated value may differ from nominal: beyond, its unit or its meaning is wrong."""
 
 Limits = Callable[[Parameters], tuple[Array, Array]]
 """From the identified parameters to lower and upper bounds (n,) of z."""

@@ -114,4 +114,7 @@ def advice(structure: Structure, status: str, found: Conflict | None) -> str:
         return (
             "its constraints are feasible, but not to the solver's accuracy: check their units, or loosen them slightly"
         )
-    return "the solver did not reach its accuracy: use a larger weight, or another solver (solver=..., settings=...)"
+    remedy = (
+        "add a penalty, with a weight above zero" if structure.formulation.penalty is None else "use a larger weight"
+    )
+    return f"the solver did not reach its accuracy: {remedy}, or use another solver (solver=..., settings=...)"

@@ -1,9 +1,13 @@
 """Expressions of a formulation for data of one shape, and the structure that selects the solver.
 
-What is canonicalized lives as long as its `Structure`: programs keep theirs, and `MOST_KEPT` are kept for the next
-ones, then all are forgotten. A user's functions are called whenever a program is posed (`pose`), never by `Program.on`;
-where they return what they returned before, the structure of that serves again. Warm starts and Clarabel's solvers live
-as long as the programs that `Program.on` makes of one another.
+A user's functions are called whenever a program is posed (`pose`), never by `Program.on`; where they return what they
+returned before, the structure of that serves again. Besides these a loss is called by `expressions.term` where its
+values or slopes are needed at numbers: for blocks of rows, for what a robust loss keeps, for a loss of a QR factor.
+
+CVXPY canonicalizes penalty and constraints once for a `Structure` (`canonical`), a loss once where Clarabel takes all
+of its rows (`Loss.canonical`), and some entries of a loss with kinks anew for every working set (`Loss.some`).
+Programs keep their structure, and `MOST_KEPT` are kept for the next ones, then all are forgotten. Warm starts and
+Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
 """
 
 from __future__ import annotations
@@ -50,7 +54,7 @@ INVARIANT = (SQUARES, NORM2)
 TIGHT = {"tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10}
 """Clarabel's tolerances for variables of the functions' own."""
 MOST_CANONICALIZED = 20_000
-"""Equations up to which another loss is canonicalized to see whether it is one of those."""
+"""Equations of which the loss of a QR factor is canonicalized to see whether it is one of those."""
 
 
 class Expressions:

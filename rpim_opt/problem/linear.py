@@ -31,7 +31,7 @@ class LinearModel(Brief):
     ``constrained`` says whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would
     meet them, so that how well they are met does not tell the noise. ``stands_for`` is how many equations A and b were
     reduced from by a rotation, None where they are the equations themselves, and ``offset`` what a loss that these
-    equations majorize has besides |A z - b|^2. ``factor`` is what a loss multiplied the squares by, which are in units
+    equations stand for has besides |A z - b|^2. ``factor`` is what a loss multiplied the squares by, which are in units
     of the noise with 1.
 
     >>> import numpy as np

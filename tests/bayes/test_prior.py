@@ -10,7 +10,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.bayes import Prior
-from rpim_opt.bayes.prior_terms import FIXED, Statement, listed
+from rpim_opt.bayes.prior_terms import FIXED, Statement, nested
 from rpim_opt.convex.constraint_parser import combination
 from rpim_opt.convex.quadratic import quadratic
 
@@ -29,7 +29,7 @@ def distributed(mean: dict[str, float], covariance: list[list[float]] | np.ndarr
     values = rows @ list(mean.values())
     names = tuple(key.rpartition("_")[0] for key in mean)
     dimensions = tuple("length" if key.endswith("_mm") else "angle" for key in mean)
-    statement = Statement(names, dimensions, listed(1e3 * rows), tuple(values.tolist()), whole=True, text="a result")
+    statement = Statement(names, dimensions, nested(1e3 * rows), tuple(values.tolist()), whole=True, text="a result")
     return Prior(statements=(statement,))
 
 

@@ -441,6 +441,15 @@ def test_a_fit_without_a_penalty_that_ran_away_says_so() -> None:
     assert "diverge" not in ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, 1.0).message
 
 
+def test_a_damped_program_that_no_solver_solves_is_damped_more() -> None:
+    """Far along combinations that no penalty holds: no error of a solver, but the reason."""
+    robot = ro.load("paper_arm").problem.robot
+    every = ["alpha?", "a?", "theta?", "d?", "tool_[xyz]", "base_*"]
+    problem, _ = simulated(every, configurations=20, noise=5e-5, robot=robot)
+    result = ro.calibrate(problem, ro.Formulation("absolute values", loss=cp.norm1), 0.0, max_iterations=40)
+    assert "diverge without a penalty; add one" in result.message
+
+
 def test_one_configuration_has_its_torques_in_a_row() -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
     q, torque = np.full(6, 0.1), np.ones(6)

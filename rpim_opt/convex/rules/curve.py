@@ -6,14 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import TINY, Array
 from rpim_opt.convex.program import Estimate, Program
 from rpim_opt.convex.rules.selection import Selection, choice, least_between, on_inliers, skipped, solved, weight_grid
 
 SLOWEST = 1e-200
 """Squared speed below which a curve stands still."""
-TINY = np.finfo(float).tiny
-"""Stands for a misfit or a penalty of zero, whose logarithm is asked for."""
 SHARP = 0.5
 """Part of the largest curvature from which a path with kinks has another corner."""
 GRID = 60

@@ -361,7 +361,7 @@ class Loss:
 
     def __init__(self, expression: Any, variable: Any, positive: bool, shared: Sequence[Any] = ()):
         self.expression, self.variable, self.positive, self.shared = expression, variable, positive, shared
-        self.quadratic = bool(expression.is_qpwa())  # piecewise, of what is piecewise affine
+        self.piecewise_quadratic = bool(expression.is_qpwa())
         self.entries: Any = None
         self.threshold: Any = None
         self._lock = threading.Lock()  # a variable has one value at a time

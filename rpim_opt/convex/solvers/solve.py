@@ -109,7 +109,7 @@ def _by_newton(
     # need cones, too, or begin with an unknown active set
     begun = warm.z is not None
     quick = begun or (warm.canonical.polyhedral and warm.canonical.size == len(warm.canonical.at))
-    if few and (loss.expression.is_pwl() or (loss.quadratic and not quick)):
+    if few and (loss.expression.is_pwl() or (loss.piecewise_quadratic and not quick)):
         return _all_rows(loss, rows, warm, weight, damping)
     if warm.kink < 0:
         warm.kink = loss.kink(rows)
