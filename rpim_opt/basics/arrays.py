@@ -12,6 +12,12 @@ Array = NDArray[np.float64]
 TINY = float(np.finfo(float).tiny)  # divisors are no smaller
 
 
+def rms(errors: Array) -> float:
+    """Return the root mean square of the finite errors; 0 if there are none."""
+    finite = errors[np.isfinite(errors)]
+    return float(np.sqrt(np.mean(finite**2))) if len(finite) else 0.0
+
+
 def statistics(errors: Array, unit: Literal["mm", "mrad"] = "mm") -> dict[str, Any]:
     """Return mean, RMS, 95th percentile, maximum [mm or mrad] and count of errors [m or rad]; None if all are NaN."""
     of = 1e3 * errors[np.isfinite(errors)]

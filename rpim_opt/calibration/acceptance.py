@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from scipy.special import bdtrc, fdtri
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, listed, percent
 from rpim_opt.basics.threads import one_blas_thread
@@ -28,7 +28,7 @@ from rpim_opt.calibration.held_out import (
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.result import Calibration
-from rpim_opt.calibration.verdict import Verdict, refuse_misread, rms
+from rpim_opt.calibration.verdict import Verdict, refuse_misread
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Requirement

@@ -9,7 +9,7 @@ from typing import cast
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError, NotDelivered
 from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import fits
@@ -18,7 +18,7 @@ from rpim_opt.convex.constraints import name_of
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem import diagnosis
 from rpim_opt.problem.blocks import Source
-from rpim_opt.problem.diagnosis import NOTICED, SLIGHT, decimals_of, first
+from rpim_opt.problem.diagnosis import ANGULAR, NOISY, NOTICED, REACH, SLIGHT, decimals_of, first
 from rpim_opt.problem.misreadings import Better, better_reading, sibling
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
@@ -32,12 +32,9 @@ BAD = "Larger than expected"
 SLIGHTLY = "Slight, but significant"
 """Beginning of the sentence on an effect in residuals that are no larger than instrument and robot make them."""
 REMARKS = (BAD, SLIGHTLY)  # beginnings of what is said of robots that are delivered, too
-NOISY = 3.0  # residual RMS over the stated noise above which the fit is not that of the stated instrument
 OVERSTATED = 0.05  # residual RMS over the stated noise below which the noise is not that of these data; from 20 um on
-REACH = 0.003  # residual RMS over the length of the arm that a robot's own errors stay below
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
-ANGULAR = 0.02  # residual RMS of orientations [rad] that a robot's own errors stay below
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
 """Deviation of what is machined [rad, m] that no robot exceeds; joint zeros are set at assembly, and not limited."""
 UNUSUAL_LENGTH = 0.004  # deviation of a length [m] from which on ready robots with nearly the same parameters are tried
@@ -162,22 +159,10 @@ def stated_variance(problem: Source, dimension: str) -> Array:
 
 def arm_length(problem: Source) -> float:
     """Return the length of the longest arm stretched out [m], prismatic joints as far as they were measured."""
-    longest = 0.0
-    for robot in problem.arms.values():
-        sliding = np.array(robot.joint_dimensions) == "length"
-        stroke = np.zeros(robot.dof)
-        for part in problem.rows() if sliding.any() else ():
-            for block in part.data.blocks:
-                if block.q.shape[-1] == robot.dof:
-                    stroke = np.maximum(stroke, np.abs(block.q).max(axis=(0, 1)))
-        longest = max(longest, float(np.abs(robot.mdh[:, [1, 3]]).sum() + stroke[sliding].sum()))
-    return longest
-
-
-def rms(errors: Array) -> float:
-    """Return the root mean square of the finite errors; 0 if there are none."""
-    finite = errors[np.isfinite(errors)]
-    return float(np.sqrt(np.mean(finite**2))) if len(finite) else 0.0
+    return max(
+        diagnosis.arm_length(robot, (block for part in problem.rows() for block in part.data.blocks))
+        for robot in problem.arms.values()
+    )
 
 
 def worse_than_nominal(nominal: Array, identified: Array) -> bool:

@@ -7,14 +7,14 @@ from typing import Any
 
 import numpy as np
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.hyperparameters import Learned, Size
 from rpim_opt.bayes.prior import BASE, SESSIONS
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.uncertainty import transmission_errors
-from rpim_opt.calibration.verdict import REPEATABILITY, Verdict, rms
+from rpim_opt.calibration.verdict import REPEATABILITY, Verdict
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.noise import UNITS, in_unit
 from rpim_opt.problem.problem import CalibrationProblem

@@ -6,17 +6,17 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import combinations, combinations_with_replacement, product
+from itertools import chain, combinations, combinations_with_replacement, product
 from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.special import bdtrc, fdtrc
 
-from rpim_opt.basics.arrays import Array, statistics
+from rpim_opt.basics.arrays import TINY, Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import Tabled, counted, joined, listed, table, three_digits
 from rpim_opt.basics.units import display
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
@@ -42,7 +42,9 @@ MOVED = 0.5  # an instrument has moved if that leaves less than this part of the
 SLIGHT = (5 / 6) ** 2  # what an effect that is worth a word leaves of it: errors without it are a sixth smaller
 FAR_MOVED = 0.005
 """Points that fit better than this part of their extent show an instrument's motion in the residuals alone."""
-SMALL = 0.2  # ratios and couplings [1, m] from which on a linearization says nothing of them
+NOISY = 3.0  # residual RMS over the stated noise above which the fit is not that of the stated instrument
+REACH, ANGULAR = 0.003, 0.02
+"""Residual RMS over the length of the arm, and of orientations [rad], that a robot's own errors stay below."""
 UNLIKELY = 1e-3  # probability with which outliers may agree on one joint by chance
 RARE = 1e-6  # probability with which chance may explain what is reported
 FEW = 3  # outliers from which on they may have one cause
@@ -320,6 +322,14 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
                 yield f"{both} have the same measured values in different configurations: copied?"
 
 
+def arm_length(robot: Robot, blocks: Iterable[Block]) -> float:
+    """Return the length of the arm stretched out [m], prismatic joints as far as they moved in blocks."""
+    sliding = np.array(robot.joint_dimensions) == "length"
+    moved = blocks if sliding.any() else ()
+    strokes = [np.abs(block.q[..., sliding]).max(axis=(0, 1)) for block in moved if block.q.shape[-1] == robot.dof]
+    return float(np.abs(robot.mdh[:, [1, 3]]).sum() + np.max(strokes, axis=0, initial=0.0).sum())
+
+
 def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[str]:
     """Report rows with zeros or one number for all measured coordinates, which instruments write for missing values."""
     for block in data.blocks:
@@ -333,9 +343,7 @@ def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[st
             number = f"{value / si:g} {unit}" if value else "0"
             what = f"{_rows(labels, 'has', 'have')} {number} for every measured coordinate"
             yield f"{what}: missing measurements? Exclude such rows ([exclude])."
-        arm = arms[block.robot]
-        sliding = np.array(arm.joint_dimensions) == "length"
-        reach = float(np.abs(arm.mdh[:, [1, 3]]).sum() + np.ptp(block.q[..., sliding], axis=(0, 1)).sum())
+        reach = arm_length(arms[block.robot], [block])
         away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
         labels = [data.label[i] for i in block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]]
         if labels:
@@ -765,7 +773,8 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     if not fitting:
         return
     error = fit_points(first[max(fitting)]).error
-    start = int(np.flatnonzero(error <= FAR * np.median(error)).max()) + 1
+    far = np.append(0, np.cumsum(error > FAR * np.median(error)))
+    start = int(np.argmin(2 * far - np.arange(len(far))))  # fewest rows that are on the wrong side of it
     if len(points.row) - start < FEWEST:
         return
     better = better_reading(problem.on(problem.data.take(points.row[start:])))
@@ -782,14 +791,10 @@ def _places(count: int, most: int = PLACES) -> list[int]:
 
 
 class Addition(NamedTuple):
-    """Columns (m, c) that a linear model lacks, and what coefficients (c,) mean: what happened, and what to do.
-
-    Of coefficients beyond the ``largest`` a linearization says nothing. None where it is no mistake.
-    """
+    """Columns (m, c) that a linear model lacks, and what coefficients (c,) mean: what happened, and what to do."""
 
     columns: Array
-    said: Callable[[Array], tuple[str, str]] | None
-    largest: float = np.inf
+    said: Callable[[Array], tuple[str, str]] | None  # None where it is no mistake
 
 
 def _explained(
@@ -866,41 +871,47 @@ def shown_by_residuals(
     if len(problem.owners) > MOST_EQUATIONS:
         return
     model = problem.linearize(x)
-    best = _explained(model, x, _additions(problem, x, model, transmission), SLIGHT if slight else MOVED)
+    acceptable = _acceptable_part(problem, x)
+    most = min(SLIGHT if slight else MOVED, acceptable**2)
+    additions = [_moves(problem, x), *([_gears(problem, model), _scales(problem, x, model)] if transmission else [])]
+    best = _explained(model, x, chain.from_iterable(additions), most)
     if slight:
         yield from _said_of_addition(best)
         return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
     changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, least=3)
-    several = _explained(model, x, changes)
+    several = _explained(model, x, changes, most)
     left = np.inf if best is None else best[0]
     if several is not None and several[0] < SEVERAL * left:
         best, left = several, several[0]
-    kinds = _two_kinds(problem, x)
+    kinds = _two_kinds(problem, x, min(TWO_KINDS, acceptable))
     # what changed at a row is named by itself where that is enough
     if kinds is not None and left <= (MOVED if kinds.consecutive else kinds.left / MOVED):
         kinds = None
-    if kinds is None and best is not None and abs(best[2][0]) <= best[1].largest:
+    if kinds is None and best is not None:
         yield from _said_of_addition(best)
     elif kinds is not None or transmission:
-        most = TWO_KINDS if kinds is None else min(TWO_KINDS, kinds.left / MOVED)
+        part = min(TWO_KINDS, acceptable, np.inf if kinds is None else kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
-        yield from first(two_positions(problem, x, most), said)
+        yield from first(two_positions(problem, x, part), said)
 
 
-def _additions(
-    problem: CalibrationProblem, x: Array, model: LinearModel, transmission: bool = True
-) -> Iterator[Addition]:
-    yield from _moves(problem, x)
-    if transmission:
-        yield from _gears(problem, model)
-        yield from _scales(problem, x, model)
+def _acceptable_part(problem: CalibrationProblem, x: Array) -> float:
+    """Return which part of the residuals at x (n,) a cause may leave: that of instrument and robot by themselves.
+
+    A cause that leaves more is beyond its linearization, or one of several mistakes at best.
+    """
+    norms, count = problem.with_repeatability(None).whitened_errors(x)
+    noise = NOISY * np.sqrt(count.sum() / max(float(norms @ norms), TINY))
+    largest = {"length": REACH * arm_length(problem.robot, problem.data.blocks), "angle": ANGULAR}
+    own = [most / size for each, most in largest.items() if (size := rms(problem.errors(x, each)))]
+    return max(noise, min(own, default=0.0))
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:
-    """Say what an addition means and which part of the residuals it leaves, unless it is too large or no mistake."""
-    if best is not None and best[1].said is not None and abs(best[2][0]) <= best[1].largest:
+    """Say what an addition means and which part of the residuals it leaves, unless it is no mistake."""
+    if best is not None and best[1].said is not None:
         what, remedy = best[1].said(best[2])
         yield f"{what} (that leaves {100 * best[0]:.0f} % of the residuals): {remedy}."
 
@@ -940,7 +951,7 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     grown = A @ np.where(of_arm, nominal / free.scale, 0.0) * elapsed
     warm = "did it warm up? Measure it warm, or in random order, or state temperature_C of every row (expansion)"
     what = "the arm grows from row to row, by {} from the first to the last"
-    yield Addition(grown[:, None], lambda c: (what.format(f"{100 * c[0]:.2g} %"), warm), SMALL)
+    yield Addition(grown[:, None], lambda c: (what.format(f"{100 * c[0]:.2g} %"), warm))
     base = np.flatnonzero(np.isin(free.names, SHIFTED))
     q = problem.joint_values[:, np.ptp(problem.joint_values, axis=0) > 0]
     if len(q) < 2 * FEWEST or not len(base):
@@ -1010,8 +1021,8 @@ class Kinds(NamedTuple):
     left: float
 
 
-def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
-    """Return the rows that have other parameters than the rest, where that leaves far smaller residuals; or None.
+def _two_kinds(problem: CalibrationProblem, x: Array, most: float) -> Kinds | None:
+    """Return the rows that have other parameters than the rest, where that leaves less than a part ``most``; or None.
 
     Two linear fits with the prior and the rows of each are found in turn, from random halves. Each kind of rows has
     its own parameters, and each row a degree of freedom for its choice.
@@ -1045,7 +1056,7 @@ def _two_kinds(problem: CalibrationProblem, x: Array) -> Kinds | None:
         kept = one <= np.sort(one)[N - N // OUTLYING - 1]
     left = float(np.sqrt(best / spare / (errors(kept[owners])[kept].sum() / (kept[owners].sum() - rank))))
     rows = np.flatnonzero(second == (second.sum() <= N / 2))
-    if left >= TWO_KINDS or len(rows) < FEWEST:
+    if left >= most or len(rows) < FEWEST:
         return None
     return Kinds(rows, bool(np.ptp(rows) == len(rows) - 1), left)
 
@@ -1134,7 +1145,7 @@ def _gears(problem: CalibrationProblem, model: LinearModel) -> Iterator[Addition
 
     for i, j in product(of_zero, range(q.shape[1])):
         if q[:, j].any():
-            yield Addition((of_zero[i] * q[problem.owners, j])[:, None], partial(gear, i, j), SMALL)
+            yield Addition((of_zero[i] * q[problem.owners, j])[:, None], partial(gear, i, j))
     if len(of_zero) == len(robot.mdh):
         way = np.diff(q, axis=0, prepend=q[:1])[problem.owners]
         lag = np.sum([zero * way[:, i] for i, zero in of_zero.items()], axis=0)
@@ -1163,18 +1174,14 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         radial = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         along += np.column_stack([np.sum(of_axis * y, axis=1), np.sum(of_axis * radial, axis=1)])
 
-    def scale(column: Array, what: str, remedy: str) -> Addition:
-        return Addition(column[:, None], lambda c: (what.format(f"{100 * c[0]:+.2g} %"), remedy), SMALL)
+    def off(column: Array, what: str, remedy: str) -> Addition:
+        return Addition(column[:, None], lambda c: (what.format(100 * c[0], three_digits(1e3 * c[0])), remedy))
 
-    yield scale(along[:, 0], "measured lengths are {} too long", "check the scale of the instrument")
-
-    def offset(column: Array, when: str, remedy: str) -> Addition:
-        what = f"{when}measured distances are {{}} mm too long"
-        return Addition(column[:, None], lambda c: (what.format(three_digits(1e3 * c[0])), remedy), SMALL)
-
-    yield offset(along[:, 1], "", "check the instrument's zero and the reflector's radius")
+    yield off(along[:, 0], "measured lengths are {0:+.2g} % too long", "check the scale of the instrument")
+    too_long = "measured distances are {1} mm too long"
+    yield off(along[:, 1], too_long, "check the instrument's zero and the reflector's radius")
     for when, share in _shares(problem).items():
-        yield offset(along[:, 1] * share, f"{when} ", "check the reflector and its radius in these rows")
+        yield off(along[:, 1] * share, f"{when} {too_long}", "check the reflector and its radius in these rows")
     if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
         flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
         radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
@@ -1183,17 +1190,15 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         sines = np.hstack([y[:, :2] / np.maximum(flat, 1e-9), flat / radius, y[:, [2]] / radius])
         parts = [rise, *(sines[:, [k]] * (turn if k < 2 else rise) for k in range(4))]
         circles = np.column_stack([np.sum(of_axis * each, axis=1) for each in parts])
-        said = (
-            "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of its circles)"
-        )
+        said = "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of circles)"
         of_circles = "measure in both faces, and have it checked"
-        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), of_circles), SMALL)
+        yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), of_circles))
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
-        what = (f"column {'xyz'[i]} is {{}} too long", "check its scale")
+        what = (f"column {'xyz'[i]} is {{0:+.2g}} % too long", "check its scale")
         if i != j:
-            skew = f"column {'xyz'[i]} contains {{}} of column {'xyz'[j]}"
+            skew = f"column {'xyz'[i]} contains {{0:+.2g}} % of column {'xyz'[j]}"
             what = (skew, "check whether the instrument's axes are square")
-        yield scale(of_axis[:, i] * y[:, j], *what)
+        yield off(of_axis[:, i] * y[:, j], *what)
 
 
 # What touches say

@@ -84,6 +84,7 @@ QUICK = {
         "worn circles of the instrument",
         "mirrored, and joint 1 reversed",
         "z a column of RMS",
+        "joint 2 frozen halfway",
     ],
     "iiwa7": [
         "a column in centimetres",
@@ -101,6 +102,15 @@ QUICK = {
 def test_a_mistake_is_named(robot: str, mistake: str) -> None:
     causes, named = likely(robot, mistake)
     assert named, causes
+
+
+@pytest.mark.parametrize(("robot", "mistake"), [("ur5e", "x sorted alone"), ("iiwa7", "signs of positions lost")])
+def test_what_leaves_more_than_a_robot_errs_by_is_no_cause(monkeypatch, robot: str, mistake: str) -> None:
+    """A slow drift and worn circles of the instrument left half of 400 mm and kept the coordinates from being tried."""
+    monkeypatch.setattr(mistakes, "calibrated", ro.calibrate)
+    causes, named = likely(robot, mistake)
+    assert named, causes
+    assert len(causes) == 2
 
 
 @pytest.mark.slow
