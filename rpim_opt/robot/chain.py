@@ -90,8 +90,8 @@ def describe(
 
     The base has the first axis as z and is where that axis is nearest to the chain's start; it is the identity
     where that axis is the start's z. The last MDH frame is the last joint's own, turned so that its axis is z.
-    Of ``near`` (n, 5) theta (up to half a turn) and, where axes are parallel, d are wanted instead of zero; axes count
-    as near parallel below ``parallel`` [rad]. The fourth result, G (n, 4, 4), is constant: frame of joint i = MDH
+    Of ``near`` (n, 5) theta (up to half a turn), the sign of alpha and, where axes are parallel, d are wanted; axes
+    count as near parallel below ``parallel`` [rad]. The fourth result, G (n, 4, 4), is constant: frame of joint i = MDH
     frame i before its Rot(y, beta_i), times G_i.
     """
     n = len(chain.axes)
@@ -106,7 +106,7 @@ def describe(
     base = np.eye(4) if coaxial else start @ C
     for i in range(n - 1):
         step = turns[i].T @ chain.origins[i + 1] @ turns[i + 1]
-        theta, d, beta, alpha, a = _step(np.linalg.inv(C) @ step, near[i, 2], near[i, 3], parallel)
+        theta, d, beta, alpha, a = _step(np.linalg.inv(C) @ step, *near[i, 2:4], near[i + 1, 0], parallel)
         table[i, 2:] = theta, d, beta
         table[i + 1, :2] = alpha, a
         G[i] = np.linalg.inv(C @ numeric_link(theta=theta, d=d)) @ turns[i].T
@@ -208,7 +208,9 @@ def _to_axis(axis: Array) -> Array:
     return T
 
 
-def _step(M: Array, theta0: float, d0: float, parallel: float) -> tuple[float, float, float, float, float]:
+def _step(
+    M: Array, theta0: float, d0: float, alpha0: float, parallel: float
+) -> tuple[float, float, float, float, float]:
     """Return theta, d, beta, alpha, a that reach the z axis of M, as `describe` says."""
     v = M[:3, 2]
     p = M[:3, 3]
@@ -225,7 +227,8 @@ def _step(M: Array, theta0: float, d0: float, parallel: float) -> tuple[float, f
         a, x = (a, foot / a) if a > 1e-11 else (0.0, np.array([np.cos(theta0), np.sin(theta0), 0.0]))
         x = x - (x @ v) * v  # a short a leaves x inexact
         x = x / np.linalg.norm(x)
-    if x[:2] @ [np.cos(theta0), np.sin(theta0)] < -1e-9:
+    # cos(theta - theta0) + sin(alpha) sin(alpha0): behind parallel axes theta may be anything, alpha is certain
+    if x[:2] @ [np.cos(theta0) - v[1] * np.sin(alpha0), np.sin(theta0) + v[0] * np.sin(alpha0)] < -1e-9:
         x = -x
         a = -a
     theta = np.arctan2(x[1], x[0])

@@ -512,6 +512,20 @@ def test_deltas_written_read_as_the_same_robot(tmp_path: Path, conf: str) -> Non
     assert target.read_text().count("e-") > 3  # numbers in full
 
 
+def test_deltas_are_those_nearest_to_nominal(tmp_path: Path) -> None:
+    """theta2 to theta4 added up to half a turn for a quarter of robots, and alpha4 and alpha5 with them."""
+    path, target = tmp_path / "calibration.conf", tmp_path / "new.conf"
+    path.write_text(CONF)
+    rng = np.random.default_rng(0)
+    for _ in range(12):
+        change = 1e-3 * rng.normal(size=(6, 5)) * [1, 1, 1, 1, 0]
+        change[0, :2], change[1:3, 4] = 0, 1e-3 * rng.normal(size=2)
+        ro.robot.write_ur_calibration(path, replace(UR10, mdh=UR10.mdh + change), UR10, target)
+        text = target.read_text()
+        theta, alpha = (np.array(eval(re.search(rf"delta_{n} = (\[.*\])", text)[1])) for n in ("theta", "alpha"))
+        assert np.abs([*alpha, theta[0], theta[4], theta[5], theta[1:4].sum()]).max() < 0.02
+
+
 def test_what_the_controller_cannot_hold_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "calibration.conf"
     path.write_text(CONF)
