@@ -31,7 +31,7 @@ from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import OF_JOINTS, RobotSetup, placed, same_place
 from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, write_robodk, write_robot
-from rpim_opt.robot.formats.universal_robots import write_ur_calibration, write_ur_kinematics
+from rpim_opt.robot.formats.universal_robots import read_ur_kinematics, write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.library import READY, robots
@@ -39,7 +39,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty
 
-ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's
+ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
 CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
@@ -152,7 +152,7 @@ def export_files(
     which: dict[str, Any] = {"marker": marker, "robot": robot}
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, partial(_write_urdf, result, marker, robot, **frames)),
-        (ur_kinematics, lambda source, target: write_ur_kinematics(source, identified(result, **which).robot, target)),
+        (ur_kinematics, partial(export_ur_kinematics, result, **which)),
         (ur_calibration, partial(export_ur_calibration, result, robot=robot)),
         (camera_info, partial(export_camera, result)),
     ]
@@ -358,8 +358,7 @@ def _write_urdf(
         there = f"in its frame the reflector is at {at}; where the reflector is the tip, --tip-measured moves it there"
         notes.append(f"URDF: {tip} keeps its pose from the file; {there}.")
     notes += _tip_uncertainty(result, tip or "the tip link", own.tool if tool is None else None, marker, robot)
-    write_urdf(source, arm.robot, target, root, tip, base, tool)
-    return notes
+    return notes + write_urdf(source, arm.robot, target, root, tip, base, tool)
 
 
 def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None, robot: str) -> list[str]:
@@ -399,16 +398,25 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
     return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []
 
 
+def export_ur_kinematics(
+    result: Calibration, source: str | Path, target: str | Path, marker: str | None = None, robot: str = ""
+) -> list[str]:
+    """Write a ``kinematics.yaml``."""
+    arm = identified(result, marker, robot).robot
+    arm, notes = _on_base(arm, result.problem.arms[robot], read_ur_kinematics(source).robot, Path(target))
+    return notes + write_ur_kinematics(source, arm, target)
+
+
 def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path, robot: str = "") -> list[str]:
     """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
-    arm = identified(result, robot=robot).robot
     nominal = result.problem.arms[robot]
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
+    catalogued = _catalogued(nominal)
+    arm, notes = _on_base(identified(result, robot=robot).robot, nominal, catalogued, Path(target))
     mdh = arm.mdh.copy()
     mdh[0, :2] = 0.0
-    write_ur_calibration(source, replace(arm, mdh=mdh), _catalogued(nominal), target)
-    notes = []
+    notes += write_ur_calibration(source, replace(arm, mdh=mdh), catalogued, target)
     if b"joint_checksum" in read_bytes(Path(source)):
         notes.append(
             "joint_checksum is copied from the source: its algorithm is not published, so a controller may refuse "
@@ -423,13 +431,28 @@ def _catalogued(robot: Robot) -> Robot:
     """Return the ready robot that a controller's deltas count from, whatever the calibration began with."""
 
     def lengths(mdh: Array) -> Array:  # a is negative in Base only; of parallel axes 2 to 4 the sum of offsets counts
-        return np.array([*np.abs(mdh[:, 1]), *mdh[[0, 4, 5], 3], mdh[1:4, 3].sum()])
+        return np.array([*np.abs(mdh[:, 1]), *mdh[4:, 3], mdh[1:4, 3].sum()])
 
     ready = [read_robot(READY / f"{name}.toml") for name in robots() if name.startswith("ur")]
     apart = [float(np.abs(lengths(each.mdh) - lengths(robot.mdh)).max()) for each in ready]
     if min(apart) > ANOTHER_MODEL:
         raise InputError("robot", robot.name, "one of Universal Robots' models")
     return ready[int(np.argmin(apart))]
+
+
+def _on_base(arm: Robot, nominal: Robot, of_file: Robot, file: Path) -> tuple[Robot, list[str]]:
+    """Return an identified robot with its base where a file has it on axis 1, and a sentence if that was elsewhere.
+
+    A URDF may begin with the table that the robot stands on: theta1 and d1 of the nominal robot count from there.
+    """
+    away = nominal.mdh[0, 2:4] - of_file.mdh[0, 2:4]
+    theta, d = np.where(np.abs(away) > ANOTHER_MODEL, away, 0.0)
+    if not (theta or d):
+        return arm, []
+    mdh = arm.mdh.copy()
+    mdh[0, 2:4] -= theta, d
+    apart = f"{1e3 * d:z.3f} mm along axis 1 and {np.degrees(theta):z.5f} deg about it"
+    return replace(arm, mdh=mdh), [f"{file.name}: its base is {apart} from the base of the calibration's DH table."]
 
 
 def export_camera(result: Calibration, source: str | Path, target: str | Path) -> list[str]:

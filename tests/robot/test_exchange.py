@@ -403,12 +403,30 @@ def test_other_robots_are_not_written(tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
     path.write_text(PLAIN)
     arm = ro.read_urdf(path).robot
-    for robot in (ARM, replace(arm, joint_types=("revolute", "prismatic")), replace(arm, joint_map=np.diag([1, -1]))):
+    for robot in (ARM, replace(arm, joint_types=("revolute", "prismatic"))):
         with pytest.raises(ro.InputError, match="joints of the robot"):
             ro.robot.write_urdf(path, robot, tmp_path / "new.urdf")
     other = replace(arm, mdh=arm.mdh + np.array([[0, 0, 2 * np.pi, 0, 0], [0, 0.3, 0, 0, 0]]))
     with pytest.raises(ro.InputError, match=r"a2 differs from the file by 0\.3 m,"):
         ro.robot.write_urdf(path, other, tmp_path / "new.urdf")
+
+
+def test_files_keep_their_own_joint_values(tmp_path: Path) -> None:
+    """A controller that counts joints otherwise was refused, with the cure that had been followed."""
+    path, target = tmp_path / "arm.urdf", tmp_path / "better.urdf"
+    path.write_text(random_urdf(11, "askew"))
+    arm = ro.read_urdf(path, tip="tip")
+    joint_map = np.array([[-1.0, 0.0], [1.0, 1.0]])
+    counted = replace(arm.robot, joint_map=joint_map)
+    parameters = ro.robot.model_parameters(counted, arm.base, {"": arm.tool}).identify(["a?"])
+    q = configurations(arm.robot.dof, 5)
+    problem = ro.CalibrationProblem(counted, parameters, ro.Dataset.of(q, np.zeros((8, 3)), 1e-5))
+    y = problem.modelled(1e-3 * np.arange(len(parameters.free)))[0]
+    result = ro.calibrate(problem.on(ro.Dataset.of(q, y, 1e-5)), ro.tikhonov, weight=1e-3)
+    notes = ro.use.export_urdf(result, path, target, tip="tip", despite_verdict=True)
+    assert "joint 1 is at -1 q1 and joint 2 is at +1 q1 +1 q2" in notes[-1]
+    found = urdf_kinematics(target, "tip", q @ joint_map.T)[:, :3, 3]
+    assert np.abs(found - result.problem.modelled(result.x)[0]).max() < EXACT
 
 
 def test_what_a_calibration_identified_goes_into_a_file(tmp_path: Path) -> None:
@@ -766,8 +784,8 @@ def test_four_numbers_a_joint_move_the_same(tmp_path: Path) -> None:
     table = np.loadtxt(path, delimiter=",", skiprows=1)[:, 1:]
     again = np.column_stack([np.radians(table[:, 0]), 1e-3 * table[:, 1], np.radians(table[:, 2]), 1e-3 * table[:, 3]])
     assert np.abs(again - plain.mdh[:, :4]).max() < 1e-12
-    with pytest.raises(ro.InputError, match="signs or couplings"):
-        ro.robot.write_robodk(replace(robot, joint_map=-np.eye(6)), path)
+    (note,) = ro.robot.write_robodk(replace(ARM, joint_map=np.diag([1.0, 1, -1, 1, 1, 1])), path)
+    assert "joint 3 is at -1 q3" in note
 
 
 # Problem files -------------------------------------------------------------------------------------------------------
@@ -847,3 +865,28 @@ def test_a_controllers_deltas_count_from_its_catalogue_whatever_the_calibration_
     q = configurations(6)
     written = ro.robot.read_ur_calibration(target, UR10)
     assert np.abs(reach(written, q) - ro.robot.forward_kinematics(result.robot, q)).max() < 1e-9
+
+
+@pytest.mark.parametrize("file", ["calibration.conf", "kinematics.yaml"])
+def test_a_robot_on_a_table_with_a_reversed_joint_goes_into_universal_robots_files(tmp_path: Path, file: str) -> None:
+    """A URDF whose root is the floor has d1 and theta1 of the table in it: no Universal Robot, it was said."""
+    path, target = tmp_path / file, tmp_path / f"new_{file}"
+    path.write_text(CONF if file.endswith("conf") else YAML_PLAIN)
+    nominal = UR10 if file.endswith("conf") else ro.robot.read_ur_kinematics(path).robot
+    signs, standing = np.diag([1.0, 1, 1, -1, 1, 1]), nominal.mdh.copy()
+    standing[0, 2:4] += 0.3, 0.77
+    robot = replace(nominal, mdh=standing, joint_map=signs)
+    problem, truth = simulated(("d4", "a[34]", "theta[2-6]", "base_*"), robot=robot, configurations=40, noise=1e-5)
+    result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
+    options = {"ur_calibration" if file.endswith("conf") else "ur_kinematics": path}
+    notes = ro.use.export_files(result, target, **options, despite_verdict=True).notes
+    assert any("770.000 mm along axis 1" in note for note in notes)
+    assert any("joint 4 is at -1 q4" in note for note in notes)
+    q = configurations(6)
+    if file.endswith("conf"):
+        written = reach(ro.robot.read_ur_calibration(target, UR10), q @ signs)
+    else:
+        written = yaml_kinematics(target.read_text(), q @ signs)
+    base = ro.robot.forward_kinematics(result.robot, q) @ np.linalg.inv(written)
+    assert np.abs(base - base[0]).max() < 1e-9
+    assert np.abs(base[0] - numeric_frame([0, 0, 0.77, 0, 0, 0.3])).max() < 1e-9

@@ -19,7 +19,7 @@ from rpim_opt.basics.layout import PART_OF_PI, read_table
 from rpim_opt.basics.schema import Angle, Length, Mass, Misfit, Table, validate
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.units import UNITS, accepted_units, display, split
-from rpim_opt.robot.chain import Chain, RobotSetup, describe, standard_table, without_beta
+from rpim_opt.robot.chain import Chain, RobotSetup, describe, joint_values, standard_table, without_beta
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
@@ -313,22 +313,21 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
     For RoboDK's robot parameters, a modified DH table (Craig's, "DHM") in mm and degrees; Hayati's betas are turned
     into common normals. Its API takes such a table (``SetRobotParams(robot, dhm, poseBase, poseTool)``,
     RoboDK/RoboDK-API, C#), and documents neither the columns' order nor a file: transfer the numbers by name, and
-    compare a pose. Returned is a warning where axes are so nearly parallel that rounded numbers lose the robot; refused
-    are signs or couplings of joints, and a beta after the last joint.
+    compare a pose. Returned are sentences on joint values that the table counts otherwise than the controller, and on
+    axes so nearly parallel that rounded numbers lose the robot; refused is a beta after the last joint.
     """
     table = without_beta(robot).mdh
-    if not np.array_equal(robot.joint_map, np.eye(robot.dof)):
-        found = "signs or couplings of joints, which four DH numbers a joint cannot hold"
-        raise InputError("--robodk", found, "--mdh or --urdf, which hold them", robot.name)
+    notes = joint_values(robot, np.eye(len(table)), Path(path))
     units = {c: display(MDH_DIMENSION[c]) for c in MDH[:4]}
     far = [f"d{i} = {1e3 * d:.0f} mm" for i, d in enumerate(table[:, 3], start=1) if abs(d) > FAR]
     numbers = table[:, :4] / [si for _, si in units.values()]
     rows = [[number, *map(repr, row)] for number, row in enumerate(numbers.tolist(), start=1)]
     write_text(Path(path), csv_text(["joint", *(f"{c}_{unit}" for c, (unit, _) in units.items())], rows))
     if not far:
-        return []
+        return notes
     lost = 1e3 * np.radians(1e-4) * np.abs(table[:, 3]).max()
     return [
+        *notes,
         f"{Path(path).name}: use --mdh or --urdf if you can, which have beta. Here nearly parallel axes have their "
         f"common normal far away ({', '.join(far)}): transfer all digits (angles rounded to 0.0001 degrees cause "
         f"{lost:.2g} mm of error)."

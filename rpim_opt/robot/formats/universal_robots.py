@@ -95,7 +95,7 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> RobotSetup:
 
 
 @of_file
-def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> None:
+def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, target: str | Path) -> list[str]:
     """Write a ``calibration.conf`` with an identified robot's deltas, everything else as in ``source``.
 
     The betas are turned into common normals first. Not tried on a controller, whose checks (the file has checksums of
@@ -109,7 +109,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
     data = read_bytes(path)
     old, places = _deltas(data)
     robot, nominal = _in_base(robot), _in_base(nominal)
-    require_same_arm(robot, nominal.mdh, REVOLUTE, path)
+    notes = require_same_arm(robot, nominal.mdh, REVOLUTE, path)
     if np.abs(robot.mdh[0, :2] - nominal.mdh[0, :2]).max() > 1e-12:
         raise InputError("robot", "alpha1 or a1 that deviate", "a base that includes the location of axis 1")
     if not (nominal.mdh[2:4, 1] < 0).all():
@@ -125,6 +125,7 @@ def write_ur_calibration(source: str | Path, robot: Robot, nominal: Robot, targe
         if not np.array_equal(values, old[name])
     }
     write_files({Path(target): spliced(data, edits)})
+    return notes
 
 
 def _deltas(data: bytes) -> tuple[dict[str, Array], dict[str, tuple[int, int]]]:
@@ -173,7 +174,7 @@ def read_ur_kinematics(path: str | Path) -> RobotSetup:
 
 
 @of_file
-def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> None:
+def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) -> list[str]:
     """Write a ``kinematics.yaml`` with an identified robot's origins, everything else (and the hash) as in ``source``.
 
     The driver compares the hash, that of the robot, with the controller's. ``source`` is the original, or
@@ -186,7 +187,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
     data = read_bytes(path)
     chain, places = _yaml_chain(data)
     table, base, tool, G = describe(chain)
-    require_same_arm(robot, table, REVOLUTE, path)
+    notes = require_same_arm(robot, table, REVOLUTE, path)
     origins, _ = corrected(G, robot.mdh, base, tool)
     if robot.mdh[-1, 4]:
         raise InputError("robot", "beta6, which follows the last joint", "a robot with beta6 = 0")
@@ -197,6 +198,7 @@ def write_ur_kinematics(source: str | Path, robot: Robot, target: str | Path) ->
         numbers = [number for text in texts for number in (text.split() if text else [None] * 3)]
         edits |= {places[name, key]: n for key, n in zip(SIX, numbers, strict=True) if n is not None}
     write_files({Path(target): spliced(data, edits)})
+    return notes
 
 
 def _yaml_chain(data: bytes) -> tuple[Chain, dict[tuple[str, str], tuple[int, int]]]:

@@ -133,13 +133,14 @@ def write_urdf(
     tip: str | None = None,
     base_frame: Array | None = None,
     tool_frame: Array | None = None,
-) -> None:
+) -> list[str]:
     """Write a URDF file with the origins that an identified robot has, every other byte as in the original.
 
     ``source`` is the original; its `read_urdf` with the same ``base`` and ``tip`` has to be the robot whose parameters
     were identified. ``robot`` has these (`use.identified`), ``base_frame`` and ``tool_frame`` (6,) are identified base
-    and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's. Numbers read back exactly. Refused are
-    another robot, couplings, and a tool or last beta where no fixed joint follows the last moving one.
+    and tool, x, y, z [m], roll, pitch, yaw [rad]; by default the original's. Numbers read back exactly. Returned
+    is a sentence on joint values that the file counts otherwise than the controller. Refused are another robot, and a
+    tool or last beta where no fixed joint follows the last moving one.
     """
     urdf = _read(Path(source))
     way = urdf.way(base, tip)
@@ -151,7 +152,7 @@ def write_urdf(
             old[old != 0] = new[old != 0]  # the multiplier, and zeros
             edits |= joint.edits(urdf.data, "mimic", {"multiplier": repr(float(old.sum()))})
     kinds = tuple(joint.kind for joint in way.joints)
-    require_same_arm(robot, table + way.offsets, kinds, Path(source), way.joint_map)
+    notes = require_same_arm(robot, table + way.offsets, kinds, Path(source), way.joint_map)
     T_base = T_base if base_frame is None else numeric_frame(base_frame)
     T_tool = T_tool if tool_frame is None else numeric_frame(tool_frame)
     origins, tail = corrected(G, robot.mdh - way.offsets, T_base, T_tool)
@@ -173,6 +174,7 @@ def write_urdf(
             accepted = f"a link held by a fixed joint, since joint '{step.joint.name}' cannot express it"
             raise InputError("robot", found, f"{accepted}, or no such correction")
     write_files({Path(target): spliced(urdf.data, edits)})
+    return notes
 
 
 @of_file
