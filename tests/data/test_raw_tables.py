@@ -228,6 +228,7 @@ def test_two_tables_are_joined_by_what_both_have(tmp_path: Path) -> None:
     other_names = VALUES.replace("b,", "c,").replace("a,4", "d,4")
     by_row = together(two(tmp_path, values=other_names), ARM, position, "row")
     assert list(by_row.columns["q1_deg"]) == ["1", "3"]
+    assert by_row.labels == ["a", "b"]  # names are kept
 
 
 def test_a_common_column_counts_beside_a_pair_of_other_names(tmp_path: Path) -> None:

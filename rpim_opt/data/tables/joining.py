@@ -249,8 +249,9 @@ def _row_numbers(joints: Understood, values: Understood, pair: Key | None) -> Ke
             name, other_name = pair.how.split(" = ")
             found = f"{wrong} of {count} rows whose {name} matches {other_name} in another row"
             raise InputError("--key row", found, f"no --key, to join by {pair.how}")
-    numbers = [str(i) for i in range(1, count + 1)]
-    return Key("the number of the row", (), numbers, numbers)
+    named = [_normal(side.columns.get("label", ())) for side in (joints, values)]
+    names = next((each for each in named if len({*each}) == count), [str(i) for i in range(1, count + 1)])
+    return Key("the number of the row", (), names, names)
 
 
 def _normal(cells: Sequence[Any]) -> list[str]:
