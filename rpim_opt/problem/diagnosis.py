@@ -20,7 +20,7 @@ from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
-from rpim_opt.problem.misreadings import BETTER, WRONG, better_reading, coupling, signs
+from rpim_opt.problem.misreadings import BETTER, RARE, WRONG, better_reading, coupling, signs
 from rpim_opt.problem.noise import UNITS, Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
@@ -46,7 +46,6 @@ NOISY = 3.0  # residual RMS over the stated noise above which the fit is not tha
 REACH, ANGULAR = 0.003, 0.02
 """Residual RMS over the length of the arm, and of orientations [rad], that a robot's own errors stay below."""
 UNLIKELY = 1e-3  # probability with which outliers may agree on one joint by chance
-RARE = 1e-6  # probability with which chance may explain what is reported
 FEW = 3  # outliers from which on they may have one cause
 FEWEST = 6  # rows on either side of a change, or of which copies are told
 LINEAR, EXACT = 13, 1e-5

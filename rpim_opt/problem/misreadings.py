@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+from scipy.special import fdtr
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -22,11 +23,12 @@ from rpim_opt.problem.registration.closed_forms import proper, transforms
 from rpim_opt.problem.registration.global_start import QUARTER, WRITE, JointMapping, explained, search
 from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
-from rpim_opt.robot.kinematics import forward_kinematics
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.library import READY, robots
 from rpim_opt.robot.mdh import Robot
 
 BETTER = 0.2  # another reading of the data is reported when it leaves less than this part of the position error
+RARE = 1e-6  # probability with which chance may explain what is reported
 SIBLING, SIBLING_BETTER = 0.1, 0.5
 """A ready robot whose nominal parameters differ by less [m, rad] is reported from this part of the error on."""
 FURTHER = 0.7  # a second mistake is looked for behind a reading that leaves less than this part
@@ -452,12 +454,22 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                 second, size = _best(changed, _readings(changed))
                 if size < BETTER * present:
                     chain, left = [*chain, *second], size
-    if left < BETTER * present and (left <= LEFT or points.seen):
+    if left < BETTER * present and (left <= LEFT or points.seen) and _is_no_chance(points, len(chain), left / present):
         return _told(points, chain, present, left)
     if points.seen:
         return None
     behind = _mapping_behind(points) if present > WRONG and not points.lengths else None
     return behind or _sibling(points)
+
+
+def _is_no_chance(points: Points, mistakes: int, left: float) -> bool:
+    """Whether chance makes a choice of so many mistakes leave that part of the error less than once in a million.
+
+    An F test of two fits with the same spare equations, times the number of choices: few rows fit some of them well.
+    """
+    equations = points.y.size if points.turns is None else 2 * points.y.size
+    spare = max(equations - len(FRAME) - points.tools.size - max(points.robot.dof - 2, 0), 1)
+    return bool(fdtr(spare, spare, left**2) * len(_readings(points)) ** mistakes < RARE)
 
 
 def _of_mapping(mapping: JointMapping) -> Better:

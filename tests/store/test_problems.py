@@ -230,6 +230,15 @@ def test_ten_configurations_of_real_data_beat_least_squares(name: str) -> None:
 
 
 @real
+def test_six_rows_that_a_reading_fits_by_chance_are_read_as_they_are_written() -> None:
+    """Two columns a row higher in another unit leave 2 um of 58 um: one of six million choices of three mistakes."""
+    problem = ro.load(REAL / "motoman_right").problem
+    rows = [problem.data.label.index(f"c{i}") for i in (184, 185, 186, 188, 189, 190)]
+    found = ro.problem.inspect(problem.on(problem.data.take(rows)))
+    assert not any("the data fit" in warning for warning in found.warnings)
+
+
+@real
 def test_cable_lengths_of_a_real_robot() -> None:
     instance, result = calibrated(str(REAL / "irb120_cable_robotcali"))
     assert result.converged
