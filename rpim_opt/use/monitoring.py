@@ -16,7 +16,7 @@ from rpim_opt.basics.tables import csv_text, records
 from rpim_opt.basics.text import joined, listed
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.calibration.covariance import noise_covariances
-from rpim_opt.calibration.held_out import compared, displaced
+from rpim_opt.calibration.held_out import compared
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import misread
 from rpim_opt.data.dataset import Dataset
@@ -193,7 +193,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,
         allowed=np.sqrt(sizes * fdtri(sizes, max(result.freedom, 1.0), 1 - level / count)), sums=cusum(deviate),
         limit=cusum_limit(count, level), drift=_drift(result, problem, level),
-        mistake=misread(result, data) or displaced(result, data, compared(result, data))[0],
+        mistake=misread(result, data) or recalibration.moved_or_changed(result, data, compared(result, data))[0],
     )  # fmt: skip
 
 
@@ -279,7 +279,8 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     free = problem.parameters.free
     width = recalibration.prior_widths(result, problem) / free.scale
     tried: list[tuple[float, Drift]] = []
-    for cause in recalibration.candidates(free):
+    causes = recalibration.candidates(free)
+    for cause, prior in zip(causes, recalibration.log_priors(causes), strict=True):
         index = [free.names.index(name) for name in cause.members]
         scale = float(free.scale[index[0]])
         for start, steady, course in courses:
@@ -290,7 +291,7 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
                 change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])
                 moved = recalibration.Moved(cause.name, free.dimensions[index[0]], float(change), float(std))
             drift = Drift(misfit.evidence(cause, g, G), start, steady, moved)
-            tried.append((recalibration.log_bayes_factor(g, G, width[index]), drift))
+            tried.append((prior + recalibration.log_bayes_factor(g, G, width[index]), drift))
     best = max(tried, key=lambda each: each[0])[1]  # as `update` has it: p-values favour few parameters
     least = best.cause.gain - recalibration.AS_GOOD
     others = dict.fromkeys(drift.cause.name for _, drift in tried if drift.cause.gain > least)

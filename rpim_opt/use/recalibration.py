@@ -16,7 +16,7 @@ from rpim_opt.basics.text import joined, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.calibration.held_out import compared, displaced
+from rpim_opt.calibration.held_out import compared, displaced, registered
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import refuse_misread
@@ -25,7 +25,7 @@ from rpim_opt.convex.expressions import SQUARES
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.quadratic import Quadratic, identity
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import Earlier, Record
+from rpim_opt.data.record import Earlier, HeldOut, Record
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
 from rpim_opt.problem.multi_robot import knowing_sessions
@@ -291,6 +291,37 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     )
 
 
+def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
+    """Return the sentences of `displaced`, or the change of the robot that leaves clearly less of chi-squared.
+
+    That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
+    """
+    moved = displaced(result, data, held)
+    p = result.problem.parameters
+    placed_by = {BASE + axis for axis in FRAME} <= set(p.free.names)
+    if not any(moved) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
+        return moved
+    causes, fit = _changes(result, data)
+    again, registered_fit = _changes(result, registered(result, data)[0])
+    best, *others = [cause for cause in causes if cause.kind != "reading"]
+    base = next(cause for cause in again if cause.members[0].startswith(BASE))
+    left, motion = fit.squares - best.gain, registered_fit.squares - base.gain
+    if motion - left <= AS_GOOD:
+        return moved
+    names = [best.name, *(cause.name for cause in others if cause.gain > best.gain - AS_GOOD)]
+    return (
+        f"Likely: {', or '.join(names)} changed: that leaves chi-squared {three_digits(left)} of "
+        f"{fit.equations - len(best.members)}, and a motion of the instrument or the base {three_digits(motion)} of "
+        f"{fit.equations - len(base.members)}. Recalibrate by `update`; --register would hide the change."
+    ), ""
+
+
+def _changes(result: Calibration, data: Dataset) -> tuple[tuple[Cause, ...], Fit]:
+    """Return all that may have changed before new measurements, as of `_weighed`, nothing released."""
+    problem = with_data(result, data)
+    return _weighed(result, _recalibrated(result, problem, (), 1.0, previous_deviations(result, problem)), ())
+
+
 def _moved(
     result: Calibration, updated: Calibration, released: Sequence[str], changes: Sequence[Cause]
 ) -> tuple[Moved, ...]:
@@ -490,13 +521,18 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
         change = misfit.projected(equations, np.eye(len(equations)))
         causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
         logs.append(log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
-    kinds = [cause.kind for cause in causes]  # each as likely before the readings, and so are the causes of a kind
-    share = (1 - UNCHANGED) / len(set(kinds))
-    posterior = np.array(logs) + np.log([share / kinds.count(kind) for kind in kinds])
+    posterior = np.array(logs) + log_priors(causes)
     whole = logsumexp([np.log(UNCHANGED), *posterior])
     order = np.argsort(-posterior)
     weighed = [causes[i]._replace(probability=float(np.exp(posterior[i] - whole))) for i in order]
     return tuple(weighed), misfit.fit
+
+
+def log_priors(causes: Sequence[Cause]) -> Array:
+    """Return ln of the probabilities of causes (C,) before any reading: kinds are as likely, and causes of a kind."""
+    kinds = [cause.kind for cause in causes]
+    share = (1 - UNCHANGED) / len(set(kinds))
+    return np.log([share / kinds.count(kind) for kind in kinds])
 
 
 def log_bayes_factor(g: Array, G: Array, width: Array) -> float:

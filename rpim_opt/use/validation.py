@@ -12,13 +12,14 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import compared, coverage_text, displaced, registered
+from rpim_opt.calibration.held_out import compared, coverage_text, registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import HeldOut
 from rpim_opt.problem.diagnosis import shared_rows
+from rpim_opt.use.recalibration import moved_or_changed
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
@@ -148,7 +149,7 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
     held = compared(result, data)
     touched = touch_errors(data, held.nominal, held.error)
     remarks += shared_rows(problem.data, data)
-    moved, hint = displaced(result, data, held)
+    moved, hint = moved_or_changed(result, data, held)
     remarks += [hint] if hint else []
     if not result.verdict.delivered:
         remarks.append(f"The calibration is not delivered: {' '.join(result.verdict.reasons)}")

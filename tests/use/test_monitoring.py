@@ -31,11 +31,18 @@ def calibrated(seed: int) -> tuple[ro.calibration.Calibration, np.ndarray, np.nd
     return ro.calibrate(first, ro.tikhonov, weight=1.0), truth, problem.data.q[FIRST:]
 
 
-def checked(seed: int, course: np.ndarray, name: str = "theta3") -> tuple[ro.calibration.Calibration, ro.Dataset]:
-    """Return a calibration, and checks of its arm while one parameter moves by a course (N,) [SI]."""
+def checked(
+    seed: int, course: np.ndarray, name: str = "theta3", around: float = 0.0
+) -> tuple[ro.calibration.Calibration, ro.Dataset]:
+    """Return a calibration, and checks of its arm while one parameter moves by a course (N,) [SI].
+
+    They are ``around`` one place if that is a standard deviation of joints [rad].
+    """
     result, truth, places = calibrated(seed)
     k = result.problem.parameters.free.names.index(name)
     q = places[np.arange(len(course)) % PLACES]
+    if around:
+        q = places[:1] + around * np.random.default_rng(seed).normal(size=q.shape)
     problem = result.problem.on(ro.Dataset.of(q, np.zeros((len(q), 3)), SIGMA))
     y = []
     for i, moved in enumerate(course):
@@ -81,6 +88,14 @@ def test_a_base_that_moved_is_no_link_that_grew(moved: tuple[float, ...], names:
     assert found.drift is not None
     assert sorted([found.drift.cause.name, *found.drift.others]) == sorted(names)
     assert "the instrument or the base moved" in str(found)
+
+
+def test_a_joint_that_slipped_is_no_moved_base() -> None:
+    """Though checks of one region are displaced as a whole, nearly: a joint leaves clearly less of chi-squared."""
+    result, data = checked(1, np.full(CHECKS, 1e-3), around=0.2)
+    for found in (ro.use.monitor(result, data), ro.use.validate(result, data)):
+        assert re.match(r"Likely: theta3 changed: that leaves chi-squared \d+", found.mistake)
+        assert "Use --register" not in str(found)
 
 
 def test_update_and_monitor_say_one_size_of_a_change() -> None:
