@@ -330,7 +330,7 @@ def write_robodk(robot: Robot, path: str | Path) -> list[str]:
         *notes,
         f"{Path(path).name}: use --mdh or --urdf if you can, which have beta. Here nearly parallel axes have their "
         f"common normal far away ({', '.join(far)}): transfer all digits (angles rounded to 0.0001 degrees cause "
-        f"{lost:.2g} mm of error)."
+        f"{lost:.2g} mm of error).",
     ]
 
 
