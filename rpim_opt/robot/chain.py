@@ -106,7 +106,7 @@ def describe(
     base = np.eye(4) if coaxial else start @ C
     for i in range(n - 1):
         step = turns[i].T @ chain.origins[i + 1] @ turns[i + 1]
-        theta, d, beta, alpha, a = _step(np.linalg.inv(C) @ step, *near[i, 2:4], near[i + 1, 0], parallel)
+        theta, d, beta, alpha, a = _step(np.linalg.inv(C) @ step, near[i : i + 2], parallel)
         table[i, 2:] = theta, d, beta
         table[i + 1, :2] = alpha, a
         G[i] = np.linalg.inv(C @ numeric_link(theta=theta, d=d)) @ turns[i].T
@@ -165,7 +165,7 @@ def joint_values(robot: Robot, joint_map: Array, file: Path) -> list[str]:
         found = f"a sign or coupling of joint {joined([str(i + 1) for i in wrong])}, which follows another in the file"
         raise InputError("joints of the robot", found, "joints that follow others as in the file", file)
     places = []
-    for i in np.flatnonzero((S != np.eye(*S.shape)).any(axis=1)):
+    for i in np.flatnonzero((np.eye(*S.shape) != S).any(axis=1)):
         terms = [f"{S[i, j]:+.9g} q{j + 1}" for j in np.flatnonzero(S[i])]
         places.append(f"joint {i + 1} is at {' '.join(terms)}")
     if not places:
@@ -226,10 +226,9 @@ def _to_axis(axis: Array) -> Array:
     return T
 
 
-def _step(
-    M: Array, theta0: float, d0: float, alpha0: float, parallel: float
-) -> tuple[float, float, float, float, float]:
-    """Return theta, d, beta, alpha, a that reach the z axis of M, as `describe` says."""
+def _step(M: Array, near: Array, parallel: float) -> tuple[float, float, float, float, float]:
+    """Return theta, d, beta, alpha, a that reach the z axis of M, as `describe` says, near those of two rows (2, 5)."""
+    theta0, d0, alpha0 = near[0, 2], near[0, 3], near[1, 0]
     v = M[:3, 2]
     p = M[:3, 3]
     sine = np.hypot(v[0], v[1])
