@@ -108,16 +108,21 @@ def position_budget(result: Outcome, q: Array, marker: str | None = None) -> dic
 class TransmissionError(NamedTuple):
     """Transmission error of a joint (from 1) at values ``q`` (K,), and its standard uncertainty [rad].
 
+    As the controller counts the joint, or the model one that is ``coupled`` to several of the controller's.
     ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS of what the error moves in the
     measured lengths [m].
     """
 
     joint: int
+    coupled: bool
     q: Array
     error: Array
     standard: Array
     measured: tuple[float, float]
     effect: float
+
+    def __str__(self) -> str:
+        return f"joint {self.joint}{' of the model (coupled)' if self.coupled else ''}"
 
     @property
     def inside(self) -> np.ndarray:
@@ -154,8 +159,13 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         if C is not None:
             variance = np.sum((columns @ C[np.ix_(place, place)]) * columns, axis=1)
         effect = float(np.linalg.norm(J[np.ix_(length, place)] @ result.x[place]) / np.sqrt(rows))
-        ends = float(at[:, curve.joint - 1].min()), float(at[:, curve.joint - 1].max())
-        errors.append(TransmissionError(curve.joint, q, columns @ result.x[place], np.sqrt(variance), ends, effect))
+        row = part.robot.joint_map[curve.joint - 1]
+        own = np.flatnonzero(row)
+        joint, factor = (int(own[0]) + 1, row[own[0]]) if len(own) == 1 else (curve.joint, 1.0)
+        table = np.array([q / factor, columns @ result.x[place] / factor, np.sqrt(variance) / abs(factor)])
+        q, error, standard = table[:, :: int(np.sign(factor))]
+        low, high = sorted((end(at[:, curve.joint - 1]) / factor).item() for end in (np.min, np.max))
+        errors.append(TransmissionError(joint, len(own) > 1, q, error, standard, (low, high), effect))
     return errors
 
 

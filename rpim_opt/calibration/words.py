@@ -24,7 +24,7 @@ from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, ow
 
 MOST_ROWS, MOST_BOUNDS = 8, 5  # number of outliers and active bounds named individually
 LAST_DIGIT = 1e-4  # what tables of parameters show [mm, degree]
-WHERE = {"position": "in position", "orientation": "in orientation", "joint": "at the joints"}
+WHERE = {"position": "in position along each axis", "orientation": "in orientation", "joint": "at the joints"}
 """How the parts of the robot's repeatability are said."""
 DEFLECTIONS = {
     "compliance": "deflection of joints under gravity",
@@ -82,7 +82,7 @@ def curve_columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
         sizes = [curve.rms, np.abs(curve.error[inside]).max(), np.median(curve.standard[inside])]
         low, high = np.degrees(curve.measured)
         figures = [f"{1e3 * size:.3f}" for size in (*sizes, curve.effect)]
-        cells.append([f"joint {curve.joint}", f"{low:.1f} to {high:.1f}", *figures])
+        cells.append([str(curve), f"{low:.1f} to {high:.1f}", *figures])
     head = ["transmission error", "measured [deg]", "RMS [mrad]", "maximum [mrad]", "std, median [mrad]"]
     return [*head, "at the tool, RMS [mm]"], cells
 

@@ -152,6 +152,13 @@ class Record:
     reading: Mapping[str, str] = field(default_factory=dict)
     terms: tuple[str, ...] = ()
 
+    @property
+    def identity(self) -> str:
+        """Title, robot, date and digest, by which a file names the calibration that it follows from."""
+        serial, made = self.details.get("robot_serial"), self.dated().made[:10]
+        named = {"": self.title, "robot serial number ": serial, "calibrated ": made, "digest ": self.digest[:12]}
+        return ", ".join(word + text for word, text in named.items() if text)
+
     def dated(self) -> Record:
         """Return the record with today's date and versions, unless it has some."""
         if self.made:

@@ -160,7 +160,7 @@ def transmission_error(curve: TransmissionError, factor: float, largest: float, 
     ax.axvspan(low, high, color=COLORS["before"], alpha=0.2, lw=0, label="measured")
     ax.fill_between(at, error - half, error + half, color=COLORS["after"], alpha=0.3, lw=0, label="95 % interval")
     ax.plot(at, error, color=COLORS["after"], lw=1.2, label="error")
-    ax.set(xlabel=f"joint {curve.joint} [deg]", ylabel="error [mrad]", xlim=(at[0], at[-1]))
+    ax.set(xlabel=f"{curve} [deg]", ylabel="error [mrad]", xlim=(at[0], at[-1]))
     ax.set_ylim(-1e3 * largest, 1e3 * largest)
     _with_legend(ax)
 

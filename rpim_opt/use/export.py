@@ -30,7 +30,7 @@ from rpim_opt.data.measurements.camera import INTRINSICS
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import OF_JOINTS, RobotSetup, placed, same_place
-from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, write_robodk, write_robot
+from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, rounded, write_robodk, write_robot
 from rpim_opt.robot.formats.universal_robots import read_ur_kinematics, write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numeric_link
@@ -39,6 +39,7 @@ from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty
 
+OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
 ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
 CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
@@ -49,7 +50,7 @@ CONVENTION = {  # what is said of a table in a convention
 
 
 class Exported(NamedTuple):
-    """Files, sentences on what they do not hold, and whether the acceptance test of the robot is inconclusive."""
+    """Files, sentences on what they do not hold, and whether what is written is inconclusive."""
 
     files: list[Path]
     notes: list[str]
@@ -127,7 +128,7 @@ def export_files(
     ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
     a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
     numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
-    ``joint``, ``angle_deg`` (of the model), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
+    ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
     ``marker`` is the reflector, ``robot`` which of several (`together`).
 
     ``root`` and ``tip``, links of the URDF between which the robot is, are by default those that it was read between.
@@ -141,14 +142,13 @@ def export_files(
     to write, or a file cannot hold what was identified.
     """
     whole = result
-    result, notes = geometry_alone(whole)
+    result, lost = geometry_alone(whole)
+    note, of_geometry, remarks, undecided = _judged(whole, result, despite_verdict)
+    of_geometry += lost
     others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
     if corrections and any(others) and not transmission_errors(whole):
-        notes.append(
-            f"Not written: {Path(corrections).name}, since the calibration has no curves of transmission errors."
-        )
-        corrections = None
-    note, remarks, undecided = _judged(whole, result, despite_verdict)
+        without = f"Not written: {Path(corrections).name}, since the calibration has no curves of transmission errors."
+        remarks, corrections = [without, *remarks], None
     which: dict[str, Any] = {"marker": marker, "robot": robot}
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, partial(_write_urdf, result, marker, robot, **frames)),
@@ -159,15 +159,17 @@ def export_files(
     made: list[tuple[str | Path | None, Callable[[Path], Any]]] = [
         (mdh, lambda target: _write_table(identified(result, **which), dh, target)),
         (robodk, lambda target: write_robodk(identified(result, **which).robot, target)),
-        (corrections, partial(_write_joint_corrections, whole)),
     ]
     writers = _beside([(Path(source), write) for source, write in corrected if source], out)
     writers += [(Path(target), write) for target, write in made if target]
+    writers = [(to, lambda path, write=write: [*of_geometry, *(write(path) or ())]) for to, write in writers]
+    writers += [(Path(corrections), partial(_write_joint_corrections, whole))] if corrections else []
     if not writers:
         options = "--urdf, --ur-kinematics, --ur-calibration, --camera-info, --mdh, --robodk, --corrections"
         raise InputError("export", "nothing to write", f"{options}, one or several")
-    messages = write_all(writers, note)
-    notes = [*filter(None, [note]), *notes, *remarks, *messages]
+    beside = [note] * bool(note)
+    messages = write_all(writers, [f"{whole.record.identity}.", *beside])
+    notes = list(dict.fromkeys([*beside, *of_geometry, *remarks, *messages]))
     return Exported([target for target, _ in writers], notes, undecided)
 
 
@@ -187,32 +189,32 @@ def _beside(sources: Sequence[tuple[Path, Callable[[Path, Path], Any]]], out: st
     return writers
 
 
-def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], bool]:
-    """Return the note for every file, remarks, and whether what is written is inconclusive; or raise NotDelivered."""
+def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tuple[str, list[str], list[str], bool]:
+    """Return notes for every file and of the geometry, remarks, whether that is inconclusive; or raise NotDelivered."""
     accepted = accept(whole) if whole.record.requirement else None
     found = accepted.workspace if accepted else measured_workspace(whole)
     verdict, doubt = alone.verdict, inconclusive(whole, found)
-    remarks, undecided = list(filter(None, [whole.no_intervals])), False
+    remarks = list(filter(None, [whole.no_intervals]))
     if accepted:
         verdict = accepted.on(verdict)
         doubt = accepted.summary if accepted.verdict == "inconclusive" else ""
-        undecided = bool(doubt) and verdict.delivered
         remarks += [accepted.summary] if accepted.verdict == "accepted" else []
+    undecided = bool(doubt) and verdict.delivered
     note = " ".join(filter(None, [verdict.require(despite_verdict) or doubt, whole.caution]))
     if alone is whole or found is None:
-        return note, remarks, undecided
+        return note, [], remarks, undecided
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
     bound, required = float((found.expanded + stays).max()), found.requirement
-    note += (
-        f" Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at "
+    of_geometry = (
+        f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at "
         f"most {1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes what geometry alone "
         f"misses, at most {1e3 * stays.max():.3f} mm there."
     )
     if accepted and bound > required.limit:
         undecided = True
-        note += f" It is above the limit of {1e3 * required.limit:g} mm; only that of the whole model is within it."
+        of_geometry += f" It is above the limit of {1e3 * required.limit:g} mm; only the whole model's is within it."
     remarks.append("Other points and the flange's orientation may be less certain: `compensate --tool` says how much.")
-    return note.strip(), remarks, undecided
+    return note, [of_geometry], remarks, undecided
 
 
 def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
@@ -269,8 +271,8 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
 
 
 def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
-    """Write a DH table; say in which convention."""
-    write_robot(arm.robot, target, dh)
+    """Write a DH table, with what it says of itself in which convention."""
+    write_robot(rounded(arm.robot), target, dh)
     convention = CONVENTIONS[dh.lower()]
     alpha, a = arm.robot.mdh[0, :2]
     base, inside = arm.base, ""
@@ -282,21 +284,22 @@ def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
-    """Write four rows a period of the finest harmonic, with standard deviations; say how large the errors are."""
+    """Write four rows a period of the finest harmonic in the measured ranges; say what they are, and how large."""
     curves = transmission_errors(result)
     if not curves:
         accepted = "transmission errors of joints, which model 'auto' adds where the data support them"
         raise InputError("the calibration", "no transmission error", accepted)
     lines = ["joint,angle_deg,correction_mrad,std_mrad"]
     for curve in curves:
-        rows = zip(np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard, strict=True)
+        rows = np.column_stack([np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard])[curve.inside]
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
-    sizes = [f"joint {curve.joint} {1e3 * curve.rms:.3f}" for curve in curves]
+    sizes = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
     write_text(target, "\n".join(lines) + "\n")
     return [
-        f"Transmission errors (RMS, mrad): {joined(sizes)}. A joint stands at angle_deg plus the correction: subtract "
-        "it from a command. The corrections belong to the geometry of the whole model (`compensate` uses both), not to "
-        "that of other exported files."
+        f"Transmission errors (RMS, mrad): {joined(sizes)}. Angles are as the controller counts them, within the "
+        "measured ranges; std_mrad is the standard uncertainty (k = 1). A joint stands at angle_deg plus the "
+        "correction: subtract it from a command. The corrections belong to the geometry of the whole model "
+        "(`compensate` uses both), not to that of other exported files."
     ]
 
 
@@ -492,44 +495,46 @@ def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple
     return numbers.reshape(shape), match.start(1), match.end(1)
 
 
-def noted(text: str, ending: str, note: str) -> str:
-    """Return the text of a file with a note: a comment, a column of CSV, or the key ``source`` of JSON."""
-    if not note or note in text:
-        return text
+def noted(content: bytes, ending: str, notes: Sequence[str]) -> bytes:
+    """Return the content of a file with notes: comments, a column of CSV, or the key ``source`` of JSON."""
+    text = content.decode("utf-8-sig", OF_BYTES)
+    notes = ["".join(character if character.isprintable() else " " for character in each) for each in notes]
+    note = " ".join(notes)
     if ending == ".json":
-        content = json.loads(text)
-        return json_text({**content, "source": f"{note} {content.get('source', '')}".strip()})
-    if ending == ".csv":
+        whole = json.loads(text)
+        text = json_text({**whole, "source": f"{note} {whole.get('source', '')}".strip()})
+    elif ending == ".csv":
         header, *rows = csv.reader(text.splitlines())
         cells = [note, *[""] * len(rows)]
-        return csv_text([*header, "note"], [[*row, cell] for row, cell in zip(rows, cells, strict=False)])
-    if ending not in (".urdf", ".xml"):
-        return f"# {note}\n{text}"
-    declaration, mark, rest = text.rpartition("?>")
-    return f"{declaration}{mark}\n<!-- {note.replace('--', '-')} -->\n{rest.lstrip()}".lstrip()
+        text = csv_text([*header, "note"], [[*row, cell] for row, cell in zip(rows, cells, strict=False)])
+    elif ending in (".urdf", ".xml"):
+        note = re.sub("-+", "-", note)
+        text = re.sub(r"(?s)(<\?xml.*?\?>\s*)?", lambda declared: f"{declared[0]}<!-- {note} -->\n", text, count=1)
+    else:
+        text = "".join(f"# {each}\n" for each in notes) + text
+    return text.encode(errors=OF_BYTES)
 
 
-def write_all(writers: Sequence[Writer], note: str = "") -> list[str]:
-    """Write several files with a note in each, or none if one fails; return the writers' messages."""
+def write_all(writers: Sequence[Writer], notes: Sequence[str] = ()) -> list[str]:
+    """Write several files, or none if one fails; notes and its writer's messages stand in each; return the messages."""
     targets = [target for target, _ in writers]
     for target in targets:
         if target.is_dir() or targets.count(target) > 1:
             found = "a folder" if target.is_dir() else "two files with this name"
             raise InputError("the file", found, "a unique name for every file", target)
-    notes: list[str] = []
+    messages: list[str] = []
     contents: dict[Path, bytes] = {}
     with TemporaryDirectory() as folder:
         for number, (target, write) in enumerate(writers):
             path = Path(folder) / str(number) / target.name
             path.parent.mkdir()
             try:
-                notes += write(path) or ()
+                own = list(write(path) or ())
             except InputError as error:
                 file = target if error.file == path else error.file
                 raise InputError(error.where, error.found, error.accepted, file) from None
-            contents[target] = read_bytes(path)
-            if note:
-                contents[target] = noted(contents[target].decode(), path.suffix.lower(), note).encode()
+            messages += own
+            contents[target] = noted(read_bytes(path), path.suffix.lower(), [*notes, *own])
     with refused(", ".join(str(target) for target in contents)):
         write_files(contents)
-    return notes
+    return messages

@@ -27,14 +27,15 @@ SIZE, CYCLES, NOISE = 4e-4, 16, 2e-5
 """Ripple of joints 2 and 3 [rad], in cycles a turn; noise of a reading [m]."""
 
 
-def measured(ripple, configurations=120, seed=0):
+def measured(ripple, configurations=120, seed=0, signs=(1, 1, 1)):
     """Return a problem whose arm has that ripple and deviations, and other rows of the same arm."""
     rng = np.random.default_rng(seed)
-    parameters = ro.robot.model_parameters(ROBOT, tools={"": [0.05, 0.0, 0.3, 0, 0, 0]})
+    arm = dataclasses.replace(ROBOT, joint_map=np.diag(np.array(signs, dtype=float)))
+    parameters = ro.robot.model_parameters(arm, tools={"": [0.05, 0.0, 0.3, 0, 0, 0]})
     parameters = parameters.identify(["a?", "theta?", "d?", "alpha?"])
     q = rng.uniform(-1.0, 1.0, (2 * configurations, 3))
-    problem = ro.CalibrationProblem(ROBOT, parameters, ro.Dataset.of(q, np.zeros((len(q), 3)), NOISE))
-    stands = q + ripple * np.cos(CYCLES * q + [0.0, 0.5, 1.0]) * [0, 1, 1]
+    problem = ro.CalibrationProblem(arm, parameters, ro.Dataset.of(q, np.zeros((len(q), 3)), NOISE))
+    stands = q + ripple * np.cos(CYCLES * q * signs + [0.0, 0.5, 1.0]) * [0, 1, 1] * signs
     truth = rng.normal(size=len(parameters.free)) * 0.3 * parameters.free.scale
     y = problem.on(ro.Dataset.of(stands, np.zeros((len(q), 3)), NOISE)).modelled(truth)[0]
     data = ro.Dataset.of(q, y + NOISE * rng.normal(size=y.shape), NOISE)
@@ -72,6 +73,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     page = report.page(result)
     assert "transmission2_c1" not in page
     assert "Joint 2: 0." in page
+    assert "Exported files hold the geometry of a fit of its own" in page
     assert "parameter combinations are identifiable from 360 equations, without the transmission errors" in page
 
 
@@ -159,6 +161,9 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert rms(rows[:, 2] - wave - slow(q)) < 0.2 * 1e3 * SIZE
     assert said[-1].startswith("Transmission errors (RMS, mrad): joint 1")
     assert "subtract it from a command. The corrections belong to the geometry of the whole model" in said[-1]
+    assert said[-1] in lines[0][4]
+    assert "with this geometry" not in lines[0][4]
+    assert np.abs(table[:, 1]).max() <= np.degrees(1.0)  # no rows beyond the measured angles
     assert "reached with this geometry (U, 95 %): at most " in " ".join(said)
     assert "Acceptance" not in " ".join(said)
     required = dataclasses.replace(result.record, requirement=ro.data.Requirement(limit=1e-6))
@@ -166,7 +171,8 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert doubtful.inconclusive
     assert "whole model: Inconclusive: limit 0.001 mm" in doubtful.notes[0]
     assert "Missing: " in doubtful.notes[0]
-    assert doubtful.notes[0] in [row[-1] for row in csv.reader((tmp_path / "arm.csv").read_text().splitlines())]
+    assert doubtful.notes[0] in list(csv.reader((tmp_path / "arm.csv").read_text().splitlines()))[1][-1]
+    assert "fit of its own to the same measurements" in (tmp_path / "arm.csv").read_text()
     plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):
         ro.use.export_files(plain, corrections=tmp_path / "none.csv")
@@ -174,6 +180,19 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert [file.name for file in written] == ["arm.csv"]
     assert said[0] == "Not written: none.csv, since the calibration has no curves of transmission errors."
     assert not (tmp_path / "none.csv").exists()
+
+
+def test_corrections_count_as_the_controller_does(tmp_path):
+    """Joint 2 turns the other way in the table: its curve is that of the encoder's angle all the same."""
+    result = ro.calibrate(measured(SIZE, signs=(1, -1, 1))[0], model="auto")
+    ro.use.export_files(result, corrections=tmp_path / "joints.csv")
+    _, *lines = csv.reader((tmp_path / "joints.csv").read_text(encoding="utf-8").splitlines())
+    table = np.array([line[:3] for line in lines if line[0] == "2"], dtype=float)
+    q, found = np.radians(table[:, 1]), table[:, 2]
+    assert (np.diff(q) > 0).all()
+    wave = -1e3 * SIZE * np.cos(-CYCLES * q + 0.5)
+    slow = np.polynomial.Polynomial.fit(q, found - wave, 4)  # geometry may stand for it
+    assert rms((found - wave - slow(q))[np.abs(q) < 0.9]) < 0.2 * 1e3 * SIZE
 
 
 def test_commands_are_corrected_for_curves(rippled):
@@ -203,8 +222,8 @@ def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
     assert rms(alone.errors(others)) < 1.05 * rms(fitted.errors(others))  # both measurements without curves
     ro.use.export_files(updated, mdh=tmp_path / "robot.toml")
     text = (tmp_path / "robot.toml").read_text()
-    assert "alpha_rad" in text
-    assert "_deg" not in text.replace("limits_deg", "")
+    assert "alpha_deg" in text
+    assert "_rad" not in text
 
 
 @pytest.mark.parametrize("noise", ["level", "declared"])

@@ -159,7 +159,7 @@ def test_what_was_learned_is_said_and_nothing_else() -> None:
     sized = learned({"lengths": Size(2.0, 0.1), "angles": Size(1.0, 0.1)}, {"position": Size(5e-5, 0.1)})
     assert said(sized) == [
         "Estimated prior scale: lengths 2 x the stated one (95 % CI 1.6 to 2.4) and angles 1 x (95 % CI 0.82 to 1.2).",
-        "Robot repeatability (1 sigma): 0.05 mm (95 % CI 0.041 to 0.061) in position.",
+        "Robot repeatability (1 sigma): 0.05 mm (95 % CI 0.041 to 0.061) in position along each axis.",
     ]
 
 

@@ -278,7 +278,7 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
 
     Angles are in degrees and lengths in millimetres where that loses no bit, in rad and m elsewhere. With
     ``convention`` ``"standard"`` (or another word for it) a CSV goes from axis 1 to the same last frame, without alpha1
-    and a1 and with zeros for a and alpha of the last row, in mm and degrees with 15 digits.
+    and a1 and with zeros for a and alpha of the last row, in mm and degrees with 9 decimals.
 
     The file is written whole or not at all. Refused are another ending, one of two limits infinite, and in CSV a
     coupling of joints, a mounting other than on the floor, and a payload.
@@ -289,10 +289,8 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
     if convention == "standard":
         if ending != ".csv":
             raise InputError("--dh", "standard", "a name ending in .csv: robot.toml and its JSON are modified", path)
-        units = [display(dimension)[1] for dimension in MDH_DIMENSION.values()]
-        numbers = (standard_table(robot) / units).tolist()
-        rounded = np.array([[float(f"{number:.15g}") for number in row] for row in numbers]) * units
-        robot = replace(robot, mdh=rounded, gravity=replace(robot.gravity, masses=(), centres=()))
+        gravity = replace(robot.gravity, masses=(), centres=())
+        robot = rounded(replace(robot, mdh=standard_table(robot), gravity=gravity))
     content = _content(robot)
     if ending == ".json":
         write_json(path, content)
@@ -305,6 +303,12 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
         blocks += [("[[joint]]\n", joint) for joint in joints]
         lines = [head + "\n".join(f"{key} = {toml(value)}" for key, value in keys.items()) for head, keys in blocks]
         write_text(path, "\n\n".join(lines) + "\n")
+
+
+def rounded(robot: Robot) -> Robot:
+    """Return a robot with numbers of 9 decimals in mm and degrees: a robot of 10 m stays within 1 nm."""
+    units = np.array([display(dimension)[1] for dimension in MDH_DIMENSION.values()])
+    return replace(robot, mdh=(np.round(robot.mdh / units, 9) + 0.0) * units)
 
 
 def write_robodk(robot: Robot, path: str | Path) -> list[str]:
@@ -422,5 +426,5 @@ def _csv(content: dict[str, Any], in_si: bool, convention: str) -> str:
             row |= {f"{which}_{unit}": value for which, value in pair}
     if any("sign" in row for row in rows):
         rows = [{"sign": 1} | row for row in rows]
-    header += sorted({key for row in rows for key in row} - set(header))
+    header = list(dict.fromkeys([*header, *(key for row in rows for key in row)]))
     return csv_text([*header, "convention"], ([*(row.get(key, "") for key in header), convention] for row in rows))
