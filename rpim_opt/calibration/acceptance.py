@@ -383,8 +383,8 @@ def _missing(result: Calibration, limit: float, bound: float, repeatability: flo
         )
     return (
         f"Missing: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the "
-        f"robot's repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design PROBLEM "
-        "--augment --count 10` names the configurations that help most."
+        f"robot's repeatability would still contribute {1e3 * repeatability:.3f} mm. The command design with "
+        "--augment names the configurations that help most."
     )
 
 

@@ -36,6 +36,7 @@ from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import definition
+from rpim_opt.use.export import beyond_geometry
 from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
@@ -77,12 +78,12 @@ class Content(NamedTuple):
     """A result, with evaluations that several sections share."""
 
     result: Calibration
-    accepted: Acceptance | None
+    accepted: Acceptance | None  # the least favourable test by new measurements, or that by the result's own
+    tested: str  # the new measurements of that test
+    errors: tuple[str, Array, Array]  # what the headline's rows are, and their errors (N,) [m], nominal and identified
     map: Workspace | None
     composition: list[str]
     new: Mapping[str, Validation]
-    tests: Mapping[str, Acceptance]
-    """By new measurements, where the result has a limit."""
 
 
 def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> str:
@@ -100,11 +101,17 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
-    tests = {}
+    tests, tested = {}, ""
     for name, each in new.items() if accepted is not None else ():
         with contextlib.suppress(InputError):  # rows that are read in another way: a failure above
             tests[name] = accept(result, data=each.data)
-    content = Content(result, accepted, workspace, composition, new, tests)
+    if tests:  # new rows test all that the result's own test does
+        tested, accepted = max(tests.items(), key=lambda test: FAVOURABLE.index(test[1].verdict))
+    errors = headline_errors(result)
+    if any(np.isfinite(each.error).any() for each in new.values()):
+        nominal, identified = (np.concatenate([getattr(v, of) for v in new.values()]) for of in ("nominal", "error"))
+        errors = "new", nominal, identified
+    content = Content(result, accepted, tested, errors, workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
@@ -118,9 +125,7 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
 
 def _headline(content: Content) -> Iterator[Block]:
     result = content.result
-    # new rows test all that the result's own test does
-    tests = [*content.tests.values()] or [content.accepted]
-    accepted = max(tests, key=lambda test: 0 if test is None else FAVOURABLE.index(test.verdict))
+    accepted = content.accepted
     reasons = result.verdict.reasons
     yield "facts", [(FIELDS.get(key, key), text) for key, text in result.record.details.items()]
     if accepted is not None:
@@ -140,9 +145,9 @@ def _headline(content: Content) -> Iterator[Block]:
         if result.caution:
             text = "only for joint values as the table counts them: check the pendant (see below)."
         yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
-    yield "lead", {"text": summary.headline(result), "alarm": not result.verdict.delivered}
+    yield "lead", {"text": summary.headline(result, content.errors), "alarm": not result.verdict.delivered}
     yield "notes", [*filter(None, [result.caution]), *reasons, *result.verdict.beside(result.causes)]
-    name, nominal, identified = headline_errors(result)
+    name, nominal, identified = content.errors
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:
         raise InputError(f"the {name} data", "no measurement of a length", "positions, poses, distances, ...")
@@ -170,7 +175,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
     result = content.result
     record = result.record
     if content.accepted is not None:
-        yield "heading", "Acceptance"
+        yield "heading", f"Acceptance test by {content.tested}" if content.tested else "Acceptance"
         yield "bullets", _acceptance(result, content.accepted)
     yield "heading", "Accuracy"
     used = "Parameters are identified from the identification rows alone."
@@ -209,10 +214,6 @@ def _new_measurements(content: Content) -> Iterator[Block]:
         yield "text", validation.sentences()
         if np.isfinite(validation.error).any():
             yield "figures", [_error_figure(content.result, "new", validation.data)]
-        found = content.tests.get(name)
-        if found is not None:
-            checked = [] if found.held_out is None else [found.held_out["sentence"]]
-            yield "text", [f"Acceptance test by these rows. {found.sentences()[0]}", *checked, *found.reasons]
 
 
 def _acceptance(result: Calibration, found: Acceptance) -> list[str]:
@@ -302,7 +303,9 @@ def _parameters(content: Content) -> Iterator[Block]:
         allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
         rows.append([f"{name} [{unit}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)
-    yield "text", [note, *words.turned_frames(result)]
+    beyond = [name for robot in result.robots for name, value in beyond_geometry(result, robot).items() if value]
+    files = "Exported files hold the geometry of a fit of its own, without model extensions: other numbers than these."
+    yield "text", [note, *words.turned_frames(result), *([files] if beyond else [])]
     count = Counter(np.array(own.dimensions)[~own.of_frames].tolist())
     drawn = []
     for dimension in ("length", "angle"):
@@ -319,16 +322,17 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     if not curves:
         return
     yield "heading", "Transmission errors of the joints"
-    text = "The actual joint angle is the encoder value plus this error; outside the measured range it is unknown."
-    yield "text", [text]
+    text = "The actual joint angle is the controller's plus this error, both as the controller counts them; outside "
+    yield "text", [f"{text}the measured range it is unknown."]
     yield "table", Table("Within the measured range", *words.curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
     drawn = []
     for each in curves:
         draw = partial(plot.transmission_error, each, factor, largest)
-        caption = f"Joint {each.joint}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
-        drawn.append(figure(draw, f"Transmission error of joint {each.joint}", caption, 200.0))
+        joint = str(each).capitalize()
+        caption = f"{joint}: {1e3 * each.rms:.3f} mrad RMS, {mm(1e3 * each.effect)} mm RMS at the tool."
+        drawn.append(figure(draw, f"Transmission error of {each}", caption, 200.0))
     yield "figures", drawn
 
 
@@ -419,23 +423,22 @@ def _provenance(content: Content) -> Iterator[Block]:
     for name, robot in result.problem.arms.items():
         named = f"{name}: {robot.name}" if name else robot.name
         robots.append(" - ".join(filter(None, [named, f"{robot.dof} joints", robot.source])))
-    yield (
-        "facts",
-        [
-            ("Source", record.source or "not stated"),
-            ("Measurements", "simulated" if record.simulated else "not marked as simulated"),
-            ("Robot", "; ".join(robots)),
-            ("Formulation", f"{result.formulation.name}: {_formulation(result)}"),
-            ("Made", record.made),
-            ("Versions", ", ".join(f"{name} {version}" for name, version in record.versions.items())),
-        ],
-    )
-    count: Counter[tuple[str, str]] = Counter()
+    facts = {
+        "Source": record.source or ("" if record.details else "not stated"),
+        "Measurements": "simulated" if record.simulated else "",
+        "Robot": "; ".join(robots),
+        "Formulation": f"{result.formulation.name}: {_formulation(result)}",
+        "Made": record.made,
+        "Digest of the result": record.digest,
+        "Versions": ", ".join(f"{name} {version}" for name, version in record.versions.items()),
+    }
+    yield "facts", [(name, text) for name, text in facts.items() if text]
+    blocks: dict[str, list[Rows]] = {}
     for name, data in summary.sets(result).items():
         for block in data.blocks:
             what = " ".join(filter(None, [block.measurement.name, *block.markers, block.fixture]))
-            count[f"{name}, {what}", _noise(block)] += len(block.row)
-    rows = [[what, str(number), noise] for (what, noise), number in count.items()]
+            blocks.setdefault(f"{name}, {what}", []).append(block)
+    rows = [[what, str(sum(len(each.row) for each in of)), _noise(of)] for what, of in blocks.items()]
     head = ["data", "rows", "standard uncertainty"]
     yield "table", Table("Measurements and their stated standard uncertainties", head, rows, prose=True)
     if record.files:
@@ -472,11 +475,11 @@ def _formulation(result: Calibration) -> str:
     return f"{text}, constraints: {', '.join(bounds) or 'none'}"
 
 
-def _noise(block: Rows) -> str:
+def _noise(blocks: list[Rows]) -> str:
     """Return the stated standard deviations by component, as a range where rows differ."""
-    spread = np.sqrt(np.einsum("nii->ni", block.covariance))
+    spread = np.concatenate([np.sqrt(np.einsum("nii->ni", block.covariance)) for block in blocks])
     components: dict[str, list[str]] = {}
-    for (name, dimension), sigmas in zip(block.measurement.components.items(), spread.T, strict=True):
+    for (name, dimension), sigmas in zip(blocks[0].measurement.components.items(), spread.T, strict=True):
         unit, si = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3)}.get(dimension, ("", 1.0))
         low, high = sigmas.min() / si, sigmas.max() / si
         value = f"{low:.3g}" if high < 1.005 * low else f"{low:.3g} to {high:.3g}"
@@ -515,7 +518,8 @@ def _regularization(content: Content) -> Iterator[Block]:
                 mean = mm(1e3 * float(np.nanmean(errors)))
         own = f"{rule} (chosen)" if rule == result.selector else rule
         rows.append([own, f"{choice.weight:.3g}", mean, choice.note or WHY.get(rule, "given")])
-    title = "Weights chosen by the selection rules from the identification data alone"
+    title = "Weights chosen by the selection rules from the identification data alone. Mean errors are those of the "
+    title += "linearized program: large where a small weight leads beyond the linearization"
     yield "table", Table(title, ["selector", "weight", f"mean error, {name} [mm]", "criterion"], rows, prose=True)
 
 

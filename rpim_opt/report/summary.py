@@ -105,9 +105,9 @@ def cells(rows: Sequence[Mapping[str, Any]], unit: Unit = "mm") -> list[list[str
     ]
 
 
-def headline(result: Calibration) -> str:
-    """Return a sentence on the error reduction, on data not used for identification if there are any."""
-    name, nominal, identified = headline_errors(result)
+def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None) -> str:
+    """Return a sentence on the error reduction, by default on data not used for identification if there are any."""
+    name, nominal, identified = errors or headline_errors(result)
     before, after = statistics(nominal), statistics(identified)
     n = after["count"]
     if not n:
@@ -115,6 +115,7 @@ def headline(result: Calibration) -> str:
     where = {
         "validation": f"On {n} validation measurements, not used for identification,",
         "held out": f"On {n} measurements that were held out",
+        "new": f"On {n} new measurements, not used for identification,",
         "identification": f"On the {n} identification measurements (no validation data)",
     }[name]
     what = "position error" if of_positions(result) else "error"
@@ -129,7 +130,7 @@ def headline(result: Calibration) -> str:
     if not result.verdict.delivered:
         return f"Not delivered: do not use this robot before the points below are resolved. {sentence}"
     held = result.record.held_out
-    if held is not None:
+    if held is not None and name == "held out":
         sentence += (
             f" This validates the procedure with parameters from {held.used} rows; the delivered parameters are "
             f"from all {len(result.problem.labels)}."
@@ -183,9 +184,12 @@ def warnings(result: Calibration, checked: bool = False) -> list[str]:
 
 def nominal_note(result: Calibration) -> str:
     """Return a note that defines the nominal errors."""
-    fitted = (result.problem.parameters.placed & result.problem.parameters.identified).any()
-    frames = ", with its base, tool and other frames fitted to the identification data" if fitted else ""
-    return f"Nominal: the nominal robot{frames}."
+    if not (result.problem.parameters.placed & result.problem.parameters.identified).any():
+        return "Nominal: the nominal robot."
+    frames = "its base, tool and other frames fitted to the identification data"
+    return (
+        f"Nominal: the nominal robot, {frames}. Uncorrected commands (`compensate`) are in the identified base instead."
+    )
 
 
 def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:
@@ -201,8 +205,9 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     lacking = judged(result)
     accepted = None if record.requirement is None else accept(result)
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
+    doubt = inconclusive(result, uncertainty)
     remarks = [
-        *filter(None, [inconclusive(result, uncertainty)]),
+        *filter(None, [doubt]),
         *([] if uncertainty is None else [f"{uncertainty.summary}; region: {uncertainty.requirement.where}."]),
         *words.weight_lines(result),
         identifiability(result),
@@ -227,6 +232,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "lack_of_fit": lacking and lacking.content(),
         "details": dict(record.details),
         "acceptance": accepted and {**accepted.content(), "text": accepted.sentences()},
+        "conclusion": accepted.verdict if accepted else "inconclusive" if doubt else "accepted",
     }
 
 

@@ -294,11 +294,17 @@ def test_new_measurements_verify_a_result_and_are_held_against_its_limit() -> No
     assert "Without validation data" not in page(result, new)
     text = " ".join(Reader(page(required(result, 1e-3), new)).words.split())
     assert "Accepted" in text[: text.index("Validation on new measurements")]  # though no rows were held out
-    assert "Acceptance test by these rows. Accepted: limit 1 mm" in text
+    assert "Acceptance test by later.csv" in text
+    lead = f"On {len(later)} new measurements, not used for identification, the mean position error falls from"
+    assert lead in text
+    errors = new["later.csv"].error
+    assert re.search(rf"Maximum error, identified\s*{1e3 * errors.max():.3f} mm\s*of {len(later)} rows", text)
+    assert f"Held out: {len(later)} rows" in text[: text.index("Error [mm]")]
     off = replace(later, blocks=tuple(replace(block, y=block.y + 5e-3) for block in later.blocks))
     new["off.csv"] = ro.use.validate(result, off)
     text = " ".join(Reader(page(required(result, 1e-3), new)).words.split())
     assert "Accepted" not in text[: text.index("Validation on new measurements")]
+    assert "Acceptance test by off.csv" in text
     assert "Held out: 40 rows" in text
 
 
