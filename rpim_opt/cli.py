@@ -33,7 +33,7 @@ HELP = """Robot calibration by convex optimization.
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
 Exit codes: 0 done; 1 a limit or gate failed, or a robot is not delivered; 2 invalid input; 3 no solution found; 4
-acceptance inconclusive.
+inconclusive: acceptance, or a robot no more certain than the nominal one errs.
 """
 
 
@@ -139,7 +139,8 @@ UrKinematics = Annotated[File, Option(help="kinematics.yaml of ROS for a Univers
 CONF = "calibration.conf copied from a Universal Robot's controller; corrected file to --out."
 Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")]
 TIP = "The reflector is the tip link: write its identified pose."
-REMAINING = "Largest residual error plus its U (k = 2) [mm]; rows above are marked, exit code 1."
+REMAINING = "Largest residual error plus its U (k = 2) [mm]: exit code 1 above; default: the result's limit."
+ORIENTATION = "Correct orientations, or ignore them; default: correct if known better than the nominal ones."
 Workers = Annotated[int, Option(help="Number of parallel processes.")]
 Resume = Annotated[Choice, Option(help="Resume an interrupted run, or discard it and start again.")]
 Table = Annotated[File, Option(help="CSV file for the rows.")]
@@ -327,7 +328,8 @@ def calibrate(
 ) -> Answer:
     """Calibrate a problem: print the parameters and the errors before and after, with --out write result.json.
 
-    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if the test is inconclusive.
+    Exit code 1 if the robot is not delivered or the acceptance test rejects it; 4 if that is inconclusive: the test,
+    or without a limit the median U, which is above the error of the nominal robot.
     """
     with console.progress() as say:
         from rpim_opt.report.summary import describe, summary
@@ -350,7 +352,7 @@ def calibrate(
     if drop_outliers:
         rows = f"Refitted without {', '.join(without)}" if without else "No flagged row to drop: nothing was refitted"
         text = f"{rows}.\n\n{text}"
-    code = CODES[(document["acceptance"] or {"verdict": "accepted"})["verdict"]] if result.verdict.delivered else 1
+    code = CODES[document["conclusion"]] if result.verdict.delivered else 1
     return Answer(text, {**document, "refitted_without": without}, code, _saved(result, out))
 
 
@@ -542,8 +544,8 @@ def export(
 ) -> Answer:
     """Export the identified robot to files of other tools; all requested files are written, or none.
 
-    Exit code 1 if the robot is not delivered, or rejected by its acceptance test, and nothing is written; 4 if that is
-    inconclusive, or its limit is met by the whole model alone, not by the geometry of files, which they say.
+    Exit code 1 if the robot is not delivered, or rejected by its acceptance test, and nothing is written; 4 if
+    `calibrate` ends inconclusive, or the limit is met by the whole model alone, not by the geometry of files.
     """
     with _loaded(result) as (loaded, _):
         exported = ro.use.export_files(
@@ -560,7 +562,7 @@ def compensate(
     result: Result,
     targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
     tables: Tables = TABLES,
-    position_only: Annotated[bool, Option("--position-only", help="Ignore orientations.")] = False,
+    orientation: Annotated[Choice, Option("--orientation/--position-only", help=ORIENTATION)] = None,
     tool: Annotated[Text, Option(help="TCP in the DH table's flange frame [mm, deg]: x,y,z,roll,pitch,yaw.")] = None,
     marker: Marker = None,
     base: Annotated[bool, Option("--base", help="Correct for deviations of the base as well.")] = False,
@@ -581,15 +583,14 @@ def compensate(
         read, understood = ro.use.read_targets(loaded, targets, tables.options)
         say("compensating")
         compensation = ro.use.compensate(
-            loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=not position_only,
+            loaded, read.q, read.poses, torque=read.torque, label=read.label, orientation=orientation,
             tool=console.tool_frame(tool), marker=marker or "", base=base, largest=largest,
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
-            limit=float("inf") if limit is None else 1e-3 * limit,
+            limit=None if limit is None else 1e-3 * limit,
         )  # fmt: skip
-    document = {**compensation.content(), "limit_mm": limit}
     code = int(bool(compensation.missed))
     more = {"code": code, "left_out": understood.left_out, "notes": understood.notes}
-    return _with_table(compensation, compensation.csv(), out, document, **more)
+    return _with_table(compensation, compensation.csv(), out, compensation.content(), **more)
 
 
 @command

@@ -467,12 +467,29 @@ def test_what_the_uncertainty_allows_is_rarely_exceeded() -> None:
     assert named <= 3  # 40 sets at 1 %: more than three has a probability of 1e-3
 
 
+def test_a_robot_no_more_certain_than_the_nominal_one_errs_is_inconclusive_to_all(monkeypatch, tmp_path, cell) -> None:
+    """Without a limit as with one: the word and the exit code of calibrate are those of export."""
+    rng = np.random.default_rng(1)
+    q = rng.uniform(-2, 2, (14, 6))
+    p = urdf_points(cell / "arm.urdf", q)
+    write_csv(tmp_path / "few.csv", HEADER, np.hstack([p + 3e-4 * rng.normal(size=p.shape), q]))
+    folder = str(tmp_path / "few")
+    arguments = ["--robot", str(cell / "arm.urdf"), "--data", str(tmp_path / "few.csv"), "--units", "rad,m"]
+    assert run(monkeypatch, "new", folder, *arguments) == 0
+    assert run(monkeypatch, "calibrate", folder, "--out", str(tmp_path)) == 4
+    assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.toml")) == 4
+    assert "Inconclusive: the median U over the region" in (tmp_path / "arm.toml").read_text()
+
+
 def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path) -> None:
     outs = ["--mdh", str(tmp_path / "arm.json"), "--robodk", str(tmp_path / "dk.csv"), "--out", str(tmp_path / "o")]
     assert run(monkeypatch, "export", str(made / "results"), "--urdf", str(cell / "arm.urdf"), *outs, "--json") == 0
     document = json.loads(capsys.readouterr().out)
     assert document["written"] == [str(tmp_path / "o"), str(tmp_path / "arm.json"), str(tmp_path / "dk.csv")]
-    assert np.array_equal(ro.read_robot(tmp_path / "arm.json").mdh, ro.load_result(made / "results").robot.mdh)
+    written, result = (file.read_text() for file in (tmp_path / "arm.json", made / "results" / "result.json"))
+    assert np.abs(ro.read_robot(tmp_path / "arm.json").mdh - ro.load_result(made / "results").robot.mdh).max() < 1e-11
+    assert f"digest {json.loads(result)['digest'][:12]}." in json.loads(written)["source"]
+    assert "without base and tool: base x" in json.loads(written)["source"]
     (tmp_path / "ros.yaml").write_text(YAML_PLAIN)
     outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
     sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]
@@ -538,7 +555,12 @@ def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch,
         read = read_arm(path)
         first = numeric_link(*robot.mdh[0, :2]) if convention == "standard" else np.eye(4)
         flange = numeric_frame(read.base) @ ro.robot.forward_kinematics(read.robot, q) @ numeric_frame(read.tool)
-        assert np.abs(first @ flange - ro.robot.forward_kinematics(robot, q)).max() < 1e-12
+        assert np.abs(first @ flange - ro.robot.forward_kinematics(robot, q)).max() < 1e-10
+        with path.open() as stream:
+            rows = list(csv.DictReader(stream))
+        assert all(len(row["alpha_deg"].partition(".")[2]) <= 9 or "e-" in row["alpha_deg"] for row in rows)
+        assert "without base and tool: base x" in rows[0]["note"]
+        assert ", digest " in rows[0]["note"]
         missed = np.linalg.norm((base @ flange @ tool - result.forward(q))[:, :3, 3], axis=1)
         turn, reach = np.radians(0.0005), np.linalg.norm(flange[:, :3, 3], axis=1)
         assert (missed < 2e-6 + 2 * turn * reach).all()  # 0.001 mm and 0.001 deg are printed
@@ -604,6 +626,7 @@ def test_another_payload_is_compensated_for(monkeypatch, capsys, tmp_path) -> No
     problem, _ = simulated(("a[2-6]", "compliance[23]"), configurations=25, noise=5e-5)
     result = ro.calibrate(problem, ro.tikhonov, 1.0)
     ro.store.save_result(result, tmp_path / "result.json")
+    result = ro.load_result(tmp_path)
     q = problem.data.q[:6] / 2
     write_csv(tmp_path / "go.csv", [f"q{i}_rad" for i in range(1, 7)], q)
     arguments = ["compensate", str(tmp_path), str(tmp_path / "go.csv"), "--position-only", "--out"]
@@ -782,7 +805,7 @@ def test_one_robot_of_several_is_exported_by_its_name(monkeypatch, capsys, tmp_p
     assert run(monkeypatch, *files) == 2
     assert "robot: found '', accepted: left, right" in capsys.readouterr().err
     assert run(monkeypatch, *files, "--robot", "right") == 0
-    assert np.array_equal(ro.read_robot(tmp_path / "arm.toml").mdh, result.robots["right"].mdh)
+    assert np.abs(ro.read_robot(tmp_path / "arm.toml").mdh - result.robots["right"].mdh).max() < 1e-11
 
 
 # --- JSON, completion, help --------------------------------------------------------------------------------

@@ -40,7 +40,7 @@ EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared w
 LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is said
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
-AT_FAULT = {UNREACHABLE: " in the robot's base frame", ABOVE: ""}  # states of commands that miss, and of which target
+POSITION = np.diag([1.0, 1, 1, 0, 0, 0])[None]  # weights where of position and orientation the first one counts
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which a pose without a start looks for near ones; how many it tries
 WEIGHED = "a calibration with compliances identified from torques of gravity, or a term that depends on the payload"
@@ -58,15 +58,14 @@ class Compensation:
     identified parameters, those of the base included, their Jacobian J and the repeatability R; infinite without C.
     ``orientation_std`` (N,) [rad] is that of the orientation, with R where orientations were measured.
 
-    ``status`` of a row is ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (a joint limit
-    prevents that), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or
-    ``"near singular"`` (the correction would be too large, and was damped); ``"above the limit"`` where the position
-    error and its expanded uncertainty (k = 2) together exceed ``limit`` [m], infinite where none is stated. A row that
-    would be ``"ok"`` is ``"extrapolated"`` beyond the measured joint ranges, where no measurement checked the model;
-    ``outside`` are all rows there. ``note`` says why a robot is not delivered that is used all the same, and how joints
-    count whose signs or zeros were estimated; ``point`` which point is moved, with its place in the flange frame.
-    ``beside`` (N,) [m] is how far a stated position is from that of the nominal robot at the joint values stated beside
-    it, NaN where there are none.
+    ``status`` of a row is ``"ok"`` (of what counts, at most 0.1 um and 0.1 urad are left), ``"limited"`` (by a joint
+    limit), ``"unreachable"`` (for the nominal robot, too; the command is the nearest found) or ``"near singular"`` (the
+    correction would be too large, and was damped); ``"above the limit"`` where the position error and its expanded
+    uncertainty (k = 2) together exceed ``limit`` [m]. An ``"ok"`` row is ``"extrapolated"`` beyond the measured joint
+    ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, and how joints count whose signs
+    or zeros were estimated; ``point`` which point is moved, and why orientations are not corrected; ``source`` names
+    the calibration. ``beside`` (N,) [m] is how far a stated position is from that of the nominal robot at the joint
+    values stated beside it, NaN where there are none.
     """
 
     robot: Robot
@@ -85,14 +84,15 @@ class Compensation:
     note: str = ""
     point: str = ""
     limit: float = np.inf
+    source: str = ""
 
     def __str__(self) -> str:
         figures = []
         for name, values in {
-            "position [mm], nominal command": self.position_before,
+            "position [mm], uncorrected command": self.position_before,
             "position [mm], corrected, by the model": self.position_error,
             "position in the instrument's frame [mm], standard uncertainty": self.std,
-            "orientation [mrad], nominal command": self.orientation_before,
+            "orientation [mrad], uncorrected command": self.orientation_before,
             "orientation [mrad], corrected, by the model": self.orientation_error,
             "orientation in the instrument's frame [mrad], standard uncertainty": self.orientation_std,
         }.items():
@@ -103,23 +103,18 @@ class Compensation:
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
+            "Uncorrected commands err otherwise than the nominal robot of a report, whose base and tool are fitted.",
         ]
-        for status, where in {"limited": "", "near singular": "", **AT_FAULT}.items():
-            rows = []
-            for i in [i for i, each in enumerate(self.status) if each == status]:
-                expanded = f", U {1e3 * EXPANDED * self.std[i]:.3f} mm" if status == ABOVE else ""
-                rows.append(
-                    f"{self.label[i]} (error {1e3 * self.position_error[i]:.3f} mm{expanded}{self._at_limit(i)})"
-                )
+        at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
+        for status, where in {"limited": "", "near singular": "", **at_fault}.items():
+            rows = [f"{self.label[i]} ({self._left(i)})" for i, each in enumerate(self.status) if each == status]
             if rows:
                 lines.append(f"{status.capitalize()}{where}: {listed(rows)}.")
         uncertain = np.count_nonzero((np.array(self.status) == ABOVE) & (self.position_error <= self.limit))
-        for count, what in (
-            (len(self.missed) - uncertain, "miss their target"),
-            (uncertain, "reach their target by the model, with an uncertainty that is above the limit"),
-        ):
-            if count:
-                lines.append(f"{count} of {len(self.q)} commands {what}; do not execute these rows.")
+        unsure = "reach their target by the model, with an uncertainty that is above the limit"
+        counts = {"miss their target": len(self.missed) - uncertain, unsure: uncertain}
+        said = "{} of {} commands {}; do not execute these rows."
+        lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
             lines.append(
@@ -141,19 +136,23 @@ class Compensation:
 
         Without a limit an error counts that exceeds twice its standard uncertainty.
         """
-        far = np.isin(self.status, list(AT_FAULT))
+        far = np.isin(self.status, (UNREACHABLE, ABOVE))
         if not np.isfinite(self.limit):
             far |= self.position_error > EXPANDED * self.std
         return [self.label[i] for i in np.flatnonzero(far)]
 
-    def _at_limit(self, row: int) -> str:
-        """Return which joints of a row that misses its target are at a limit, as part of a sentence."""
+    def _left(self, row: int) -> str:
+        """Return the error of a row, its U where that counts, and the joints at a limit where it misses its target."""
+        error = f"error {1e3 * self.position_error[row]:.3f} mm"
+        error += f", U {1e3 * EXPANDED * self.std[row]:.3f} mm" if self.status[row] == ABOVE else ""
         if self.status[row] != "limited" and self.position_error[row] <= REACHED:
-            return ""
+            return error
         low, high = self.robot.limits.T
         at = np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high))
         units = [display(dimension) for dimension in self.robot.joint_dimensions]
-        return "".join(f", joint {i + 1} at its limit of {self.q[row, i] / units[i][1]:.6g} {units[i][0]}" for i in at)
+        return error + "".join(
+            f", joint {i + 1} at its limit of {self.q[row, i] / units[i][1]:.6g} {units[i][0]}" for i in at
+        )
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
@@ -183,13 +182,17 @@ class Compensation:
             "rows": records(self._columns()),
             "note": self.note,
             "point": self.point,
+            "source": self.source,
+            "limit_mm": 1e3 * self.limit if np.isfinite(self.limit) else None,
         }
 
     def csv(self) -> str:
-        """Return labels, corrected commands, remaining errors and status as CSV text."""
+        """Return labels, corrected commands, remaining errors, status and a note on their origin as CSV text."""
         columns = self._columns()
-        if self.note:
-            columns["note"] = [self.note, *[""] * (len(self.q) - 1)]
+        limit = f"Limit {1e3 * self.limit:g} mm." if np.isfinite(self.limit) else "No limit."
+        units = "std_mm and orientation_std_mrad are standard uncertainties (k = 1)."
+        note = " ".join(filter(None, [self.note, f"{self.source}.", self.point, units, limit]))
+        columns["note"] = [note, *[""] * (len(self.q) - 1)]
         return columns_csv(columns, joint_columns(self.robot.joint_dimensions))
 
 
@@ -199,7 +202,7 @@ def compensate(
     q: Array | None = None,
     poses: Array | None = None,
     *,
-    orientation: bool = True,
+    orientation: bool | None = None,
     tool: Sequence[float] | Array | None = None,
     marker: str = "",
     base: bool = False,
@@ -207,7 +210,7 @@ def compensate(
     payload: float | Array | None = None,
     payload_centre: Sequence[float] | Array | None = None,
     largest: float = 0.2,
-    limit: float = np.inf,
+    limit: float | None = None,
     label: Sequence[str] = (),
     robot: str = "",
     despite_verdict: bool = False,
@@ -232,8 +235,10 @@ def compensate(
 
     **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
     x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;
-    without ``q`` every pose is looked for from several configurations within the limits that come near. ``orientation``
-    says whether orientations count, ``label`` names the rows, ``robot`` is which of several.
+    without ``q`` every pose is looked for from several configurations within the limits that come near. ``label`` names
+    the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: w stays out
+    of the sum where its standard uncertainty is larger (RMS of all rows), as where positions of one reflector hardly
+    determine it. ``orientation=True`` corrects them all the same, with ``False`` those of targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
     frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
@@ -244,9 +249,9 @@ def compensate(
     the flange frame [m] where they were identified without, by default as the problem states them.
 
     ``largest`` is the largest correction of a joint [rad or m], ``limit`` [m] what the position error left by the model
-    and its expanded uncertainty (k = 2) may be together. A calibration that is not delivered, or that its acceptance
-    test rejects, raises NotDelivered unless ``despite_verdict``; InputError for shapes that do not fit, numbers that
-    are not finite, a reflector that is not known.
+    and its expanded uncertainty (k = 2) may be together, by default that of the record's requirement. A calibration
+    that is not delivered, or that its acceptance test rejects, raises NotDelivered unless ``despite_verdict``;
+    InputError for shapes that do not fit, numbers that are not finite, an unknown reflector.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
@@ -255,16 +260,18 @@ def compensate(
     >>> print(f"{1e3 * found.position_before.mean():.2f} mm, {1e3 * found.position_error.max():.4f} mm left")
     2.64 mm, 0.0000 mm left
     >>> print(found.csv().splitlines()[0])
-    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status
+    label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status,note
     """
     verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
     note = verdict.require(despite_verdict)
     note = " ".join(filter(None, [note, result.caution, result.no_intervals]))
     arm = pick(result.problem.arms, robot, "robot")
-    targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation)
+    targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation is not False)
+    if limit is None:
+        limit = result.record.requirement.limit if result.record.requirement else np.inf
     if not largest >= SMALLEST:
         raise InputError("largest", f"{largest}", f"a correction of at least {SMALLEST:g}")
-    oriented = orientation and (targets.poses is None or targets.poses.shape[1] == 7)
+    oriented = orientation is not False and (targets.poses is None or targets.poses.shape[1] == 7)
     if payload_centre is not None:
         arm = replace(arm, gravity=arm.gravity.carrying(arm.gravity.payload, list(payload_centre)))
     kind = pose if oriented else position
@@ -279,27 +286,38 @@ def compensate(
     if "payload" in cell.loads.stated:
         targets = targets._replace(payload=np.broadcast_to(mass, N))
 
-    def compensated(start: int) -> dict[str, Array]:
-        rows = slice(start, start + BLOCK)
-        return cell.compensated(Targets._make(None if each is None else each[rows] for each in targets), largest)
+    def compensated(turning: bool) -> dict[str, Any]:
+        def part(start: int) -> dict[str, Array]:
+            rows = Targets._make(None if each is None else each[start : start + BLOCK] for each in targets)
+            return cell.compensated(rows, largest, turning)
 
-    parts = on_all_cores(compensated, range(0, N, BLOCK))
-    whole: dict[str, Any] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+        parts = on_all_cores(part, range(0, N, BLOCK))
+        return {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
+
+    whole = compensated(turning=True)
+    point = cell.point
+    turn, of_turn = (1e3 * np.sqrt(np.mean(whole[f"orientation_{of}"] ** 2)) for of in ("before", "std"))
+    if orientation is None and turn < of_turn < np.inf:
+        whole = compensated(turning=False)
+        point += (
+            f" Orientation is not corrected: the correction, {turn:.2f} mrad, is smaller than its standard "
+            f"uncertainty, {of_turn:.2f} mrad (RMS; --orientation corrects it all the same)."
+        )
     expanded = EXPANDED * np.nan_to_num(whole["std"], posinf=0.0)
     above = (whole["position_error"] + expanded > limit) & (whole["status"] != UNREACHABLE)
     outside = result.outside(Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)}))
     status = np.where(above, ABOVE, whole["status"])
     status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
-    point = cell.point
     if targets.q is None:
         point += (
             " Targets without joint values are sought in the measured joint ranges first, and may be reached in "
             "another arm configuration: state q1, ... with them."
         )
     found = Compensation(
-        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=point, limit=limit
-    )
+        result.problem.arms[robot], targets.label, **whole, outside=outside, note=note, point=point, limit=limit,
+        source=result.record.identity,
+    )  # fmt: skip
     if tool is None:
         return found
     # the reflector that the stated tool took the place of
@@ -460,8 +478,8 @@ class _Cell(NamedTuple):
             covariance, marker, noise, result.variance_factor, point,
         )  # fmt: skip
 
-    def compensated(self, targets: Targets, largest: float) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets."""
+    def compensated(self, targets: Targets, largest: float, turning: bool) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some targets; ``turning`` corrects orientations, too."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
         # what the joints of the model bear, as `Arm.at` takes it
@@ -478,8 +496,8 @@ class _Cell(NamedTuple):
             if q is not None:
                 beside = self._norms(self.nominal.at(q, load, poses)[1])[0]
         _, before, J = self.identified.at(commands, load, target)
-        W = attainable(J)
-        reached = self._reached(missed, W)
+        reached = self._reached(missed, attainable(J))
+        W = attainable(J) if turning else POSITION
         due = np.where(reached[:, None], before - missed, 0.0)
         P = correction_weights(W @ J, times(W, due), largest)
         lowest, highest = self.robot.limits.T

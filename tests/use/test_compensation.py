@@ -123,6 +123,41 @@ def test_a_robot_that_is_known_exactly_goes_exactly_there(name: str) -> None:
         assert found.orientation_error[good].max() < 1e-10
 
 
+def test_orientation_is_corrected_where_it_is_known_better_than_nominally() -> None:
+    """Where a long tool is hardly known in its turn, positions of the reflector at its end say nothing of it."""
+    problem, _ = simulated(("theta?", "a?", "d?", "tool_*"), noise=1e-3, configurations=25, size=0.05)
+    result, q = ro.calibrate(problem, ro.tikhonov, 1.0), commands(ARM, 20)
+    found = ro.use.compensate(result, q)
+    assert rms(found.orientation_std) > rms(found.orientation_before)
+    assert "Orientation is not corrected: the correction, " in str(found)
+    assert (found.position_error[ok(found)] < 1e-7).all()
+    both = ro.use.compensate(result, q, orientation=True)
+    assert "Orientation is not corrected" not in str(both)
+    assert np.abs(found.q - q).max() < np.abs(both.q - q).max()
+    poses = wanted(result, q)
+    there = ro.use.compensate(result, q, poses)  # the nominal command is still that of the whole pose
+    assert np.abs(there.nominal - q).max() < 1e-6
+    sure, place = calibrated()[0], ro.use.compensate(calibrated()[0], q)
+    assert rms(place.orientation_std) < rms(place.orientation_before)
+    assert np.array_equal(place.q, ro.use.compensate(sure, q, orientation=True).q)
+
+
+def test_the_limit_of_a_result_holds_for_its_commands() -> None:
+    result, q = calibrated()[0], commands(ARM, 5)
+    required = replace(result, record=replace(result.record, requirement=ro.data.Requirement(2e-4)))
+    std = ro.use.compensate(required, q, limit=1.0, despite_verdict=True).std
+    limit = 2 * float(np.median(std)) + 1e-9
+    required = replace(result, record=replace(result.record, requirement=ro.data.Requirement(limit)))
+    found = ro.use.compensate(required, q, despite_verdict=True)
+    assert found.limit == limit
+    assert [status == "above the limit" for status in found.status] == (2 * found.std > limit).tolist()
+    assert 0 < len(found.missed) < 5
+    assert f"Above the limit of {1e3 * limit:g} mm: " in str(found)
+    note = next(csv.DictReader(found.csv().splitlines()))["note"]
+    assert f"standard uncertainties (k = 1). Limit {1e3 * limit:g} mm." in note
+    assert "Target point: the reflector" in note
+
+
 @pytest.mark.parametrize("name", ROBOTS)
 def test_positions_alone_need_smaller_corrections(name: str) -> None:
     result, q = known(name), commands(ROBOTS[name])
