@@ -28,8 +28,7 @@ RATIO_SD = 1.0
 """That of the ratio of two scales of the geometry: lengths, angles and joint offsets are made by different means, but
 few data do not identify each scale alone."""
 FARTHEST = 7.0  # logarithms of hyperparameters farther from their prior medians are implausible
-SETTLED, ROUGHLY, MOST_ROUNDS = 1e-8, 1e-4, 500
-"""Largest change of logarithms of local variances at their fixed point, and on the way to an optimum; iterations."""
+SETTLED, MOST_ROUNDS = 1e-8, 500  # largest change of logarithms of local variances at their fixed point; iterations
 STEEPEST = 0.8  # bound on the slope of a local variance's map: its steps are at most five times the map's
 COUPLED, LONGEST_COUPLED = 0.3, 1.0
 """Changes of logarithms of local variances below which their steps are Newton's, coupled; the longest of those."""
@@ -261,7 +260,7 @@ class Evidence:
         sizes = np.exp(logs[len(logs) - len(self.noise) :])
         return replace(self.fixed, **dict(zip(self.noise, map(float, sizes), strict=True)))
 
-    def at(self, logs: Array, near: Point | None = None, accuracy: float = SETTLED) -> Point:
+    def at(self, logs: Array, near: Point | None = None) -> Point:
         """Return the marginal likelihood at (s,); the iteration for local variances starts from those of ``near``."""
         prior = self.prior
         s = len(prior.hyperparameters)
@@ -270,7 +269,7 @@ class Evidence:
         v = size2
         if near is not None:
             v = near.v * size2 / prior.variances(near.logs)[0]
-        z, C, logdet, v = self._settled(parts, size2, v, accuracy)
+        z, C, logdet, v = self._settled(parts, size2, v)
         e2 = z**2 + C.diagonal()
         residuals = [part.y - part.X @ z for part in parts]
         own = ~prior.replaced
@@ -319,8 +318,8 @@ class Evidence:
             parts=parts,
         )
 
-    def optima(self, starts: Sequence[Array], accuracy: float = 1e-3) -> list[Point]:
-        """Return the local optima reached from some starts (s,), the best first.
+    def optima(self, starts: Sequence[Array | Point], accuracy: float = 1e-3) -> list[Point]:
+        """Return the local optima reached from some starts, logarithms (s,) or points there, the best first.
 
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
         accuracy.
@@ -330,24 +329,24 @@ class Evidence:
         def ask(logs: Array) -> Point:
             nonlocal last
             if not np.array_equal(logs, last.logs):
-                last = self.at(logs.copy(), last, ROUGHLY)
+                last = self.at(logs.copy(), last)
             return last
 
         for start in starts:
-            last = self.at(start, accuracy=ROUGHLY)
-            if not len(start):
-                known.append(self.at(start, last))
+            last = start if isinstance(start, Point) else self.at(start)
+            if not len(last.logs):
+                known.append(last)
                 continue
             optimum = scipy.optimize.minimize(
                 lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
-                start,
+                last.logs,
                 method="trust-exact",
                 jac=lambda logs: ask(logs).gradient,
                 hess=lambda logs: ask(logs).curvature,
                 options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
             )
             if all(np.abs(optimum.x - point.logs).max() > BASIN for point in known):
-                known.append(self.at(optimum.x, last))
+                known.append(ask(optimum.x))
         return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
@@ -398,9 +397,7 @@ class Evidence:
         """Which deviations have local variances."""
         return np.flatnonzero(self.prior.heavy & ~self.prior.replaced)
 
-    def _settled(
-        self, parts: Sequence[Whitened], size2: Array, v: Array, accuracy: float
-    ) -> tuple[Array, Array, float, Array]:
+    def _settled(self, parts: Sequence[Whitened], size2: Array, v: Array) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v, which are solved jointly; curves are integrated out first."""
         spectrum = self.prior.spectrum
         p = len(size2)
@@ -411,13 +408,13 @@ class Evidence:
         rows = self.prior.rows[:, :g]
         H = information[:g, :g] + rows.T @ rows
         h = information[:g, g] + rows.T @ self.prior.values
-        z, C, more, v = self._known(H, h, size2[:g], v[:g], accuracy)
+        z, C, more, v = self._known(H, h, size2[:g], v[:g])
         follow = regression[:, :g] @ C
         C = np.block([[C, -follow.T], [-follow, own + follow @ regression[:, :g].T]])
         z = np.append(z, regression[:, g] - regression[:, :g] @ z)
         return z, C, logdet + more, np.append(v, size2[g:])
 
-    def _known(self, H: Array, h: Array, size2: Array, v: Array, accuracy: float) -> tuple[Array, Array, float, Array]:
+    def _known(self, H: Array, h: Array, size2: Array, v: Array) -> tuple[Array, Array, float, Array]:
         """Return z, C, -ln|C| and v of all but curves, from their information matrix H and vector h.
 
         Local variances of Student-t deviations are a fixed point, found by Newton's steps for ln v:
@@ -438,7 +435,7 @@ class Evidence:
             change = np.log(weighed / ((tails + 1) * local))
             largest = np.abs(change).max(initial=0.0)
             rounds += 1
-            if largest <= accuracy or rounds == MOST_ROUNDS:
+            if largest <= SETTLED or rounds == MOST_ROUNDS:
                 return z, C, logdet, v
             step = change  # which always leads downhill, slowly
             if largest < before:

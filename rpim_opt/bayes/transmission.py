@@ -139,8 +139,7 @@ def _most_likely(
     beside = given(columns, curves)
     size = CURVES["transmission size"][0]
     starts = [beside.at(np.array([*np.log([size, length]), *plain.logs])) for length in STARTS]
-    start = min(starts, key=lambda point: point.value)
-    point = beside.optima([start.logs], ACCURACY)[0]
+    point = beside.optima([min(starts, key=lambda point: point.value)], ACCURACY)[0]
     return (point, curves, columns) if plain.value - point.value > GAIN else None
 
 

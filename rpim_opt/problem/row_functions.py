@@ -279,9 +279,10 @@ def loads_in(robot: Robot, block: Block) -> list[Array]:
 
 def require_loads(robot: Robot, parameters: Parameters, blocks: Sequence[Block]) -> None:
     """Refuse to identify from rows of a robot what needs columns that they do not have."""
+    ready = all(term.ready for term in robot.model.terms)
     for name in parameters.free.names:
         sided = name.startswith("backlash") and of_term(name)
-        if not sided and not all(term.ready for term in robot.model.terms):
+        if not sided and not ready:
             sided = dependencies(robot.model, robot.joint_types, lambda other, name=name: other == name).approach
         if sided and all(block.approach is None for block in blocks):
             found = f"'{name}' without directions of approach"

@@ -54,6 +54,7 @@ def of_joint(name: str) -> bool:
     return own == EXPANSION or bool(_TABLE.fullmatch(own) or _TERM.fullmatch(own))
 
 
+@lru_cache(KNOWN)
 def of_term(name: str) -> bool:
     """Return whether a parameter is of a joint's terms, not of the MDH table or of a frame."""
     return _TERM.fullmatch(own_name(name)) is not None

@@ -9,6 +9,7 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
+from rpim_opt.bayes.evidence import Evidence, Point
 from rpim_opt.bayes.hyperparameters import MOST, Estimator, sampled
 from rpim_opt.bayes.outliers import clustered, error_ratios, outlier_candidates, resistant_fit, unexplained
 from rpim_opt.data.dataset import Dataset
@@ -429,6 +430,21 @@ def test_the_covariance_knows_how_deviations_follow_sizes_and_what_tails_leave_o
 
 
 # --- the search --------------------------------------------------------------------------------------------------
+
+
+def test_the_marginal_likelihood_is_evaluated_once_at_every_place(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also where an optimum was found: its local variances are those of the search."""
+    places: list[bytes] = []
+    at = Evidence.at
+
+    def counted(self: Evidence, logs: Array, *near: Point) -> Point:
+        places.append(logs.tobytes() + self.data.y.tobytes() + self.data.X.tobytes())
+        return at(self, logs, *near)
+
+    monkeypatch.setattr(Evidence, "at", counted)
+    result = ro.calibrate(POSITION, model="auto")
+    assert result.learned is not None
+    assert len(places) == len(set(places)) > 5
 
 
 def test_sizes_agree_with_the_deviations_that_they_lead_to() -> None:
