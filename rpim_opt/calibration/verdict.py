@@ -425,14 +425,17 @@ def _large_deviations(result: Outcome) -> Iterator[str]:
 
 
 def _held(result: Outcome, problem: CalibrationProblem) -> list[str]:
-    """Say that a frame, or a parameter of a joint, that is not identified is another one than stated."""
+    """Say which stated frame or joint parameter is wrong and not identified; without curves, which would take it up."""
     if len(problem.arms) > 1:
         return []
     p = problem.parameters
+    now, own = rms(problem.errors(result.x)), result.x[~p.free.of_curves]
+    problem = problem.identifying(p.identified & ~p.of_curves)
+    p = problem.parameters
     held = ~p.identified & (p.placed | np.isin([name.rstrip("0123456789") for name in p.names], MDH))
     groups = [name if frame_of(name) == "_" else f"{frame_of(name)}*" for name in np.array(p.names)[held].tolist()]
-    now = rms(problem.errors(result.x))
-    best, said = ELSEWHERE * min(now, rms(problem.errors(ridge_deviations(problem)))), ""  # whatever limits the result
+    before = min(rms(problem.errors(x)) for x in (own, ridge_deviations(problem)))  # whatever limits the result
+    best, said = min(now, ELSEWHERE * before), ""
     for group in dict.fromkeys(groups):
         freed = problem.identifying(p.identified | [fits(name, group) for name in p.names])
         located = fitted_frames(freed)[0].parameters

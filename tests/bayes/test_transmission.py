@@ -10,7 +10,7 @@ import rpim_opt as ro
 from rpim_opt.bayes.evidence import WAVES, WAVES_LENGTH, Hierarchy
 from rpim_opt.bayes.hyperparameters import spectrum_of
 from rpim_opt.bayes.transmission import series
-from rpim_opt.calibration import words
+from rpim_opt.calibration import verdict, words
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.report import report
 from rpim_opt.robot.terms import Curve, transmission
@@ -75,6 +75,23 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     assert "Joint 2: 0." in page
     assert "Exported files hold the geometry of a fit of its own" in page
     assert "parameter combinations are identifiable from 360 equations, without the transmission errors" in page
+
+
+@pytest.mark.parametrize(("off", "said"), [("base", "the stated base is wrong"), ("tool", "the stated tool is wrong")])
+def test_a_frame_that_is_held_elsewhere_is_named_without_curves(monkeypatch, off, said):
+    """Fits of hundreds of coefficients, one for all that is held, took ten times the calibration's time."""
+    problem, _ = measured(SIZE)
+    p = problem.parameters
+    moved = p.nominal + np.isin(p.names, [f"{off}_x", f"{off}_y"]) * 4e-3
+    result = ro.calibrate(problem.with_parameters(dataclasses.replace(p, nominal=moved)), model="auto")
+    assert result.learned.curves is not None
+    counts = []
+    fit = verdict.ridge_deviations
+    monkeypatch.setattr(
+        verdict, "ridge_deviations", lambda alone: counts.append(len(alone.parameters.free)) or fit(alone)
+    )
+    assert any(said in reason for reason in result.verdict.reasons)
+    assert max(counts) < 40
 
 
 def test_outliers_that_ripple_hides_are_excluded():
