@@ -318,7 +318,7 @@ class Evidence:
             parts=parts,
         )
 
-    def optima(self, starts: Sequence[Array | Point], accuracy: float = 1e-3) -> list[Point]:
+    def optima(self, starts: Sequence[Array | Point], accuracy: float = 1e-5) -> list[Point]:
         """Return the local optima reached from some starts, logarithms (s,) or points there, the best first.
 
         By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the

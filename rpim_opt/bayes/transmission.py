@@ -123,9 +123,7 @@ def _most_likely(
 ) -> tuple[Point, tuple[Curve, ...], Array] | None:
     """Return the optimum of curves and noise, the curves and columns (m, c); None where they gain too little."""
     problem = models.whole
-    slopes = np.zeros((len(models.columns.data.y), len(problem.robot.joint_types)))
-    for stack in problem.stacks(at=problem.parameters.values_at(models.x)):
-        slopes[stack.index] = stack.joint
+    slopes = problem.joint_slopes(problem.parameters.values_at(models.x))
     q = problem.joint_values[problem.owners]
     centre, travel = (q.min(axis=0) + q.max(axis=0)) / 2, np.ptp(q, axis=0)
     joints = [j for j, kind in enumerate(problem.robot.joint_types) if kind == "revolute" and travel[j] > SHORTEST]
@@ -137,8 +135,7 @@ def _most_likely(
     curves = tuple(Curve(j + 1, float(centre[j]), float(2 * np.pi * turns[j]), int(counts[j])) for j in joints)
     columns = series(curves, q, slopes)
     beside = given(columns, curves)
-    size = CURVES["transmission size"][0]
-    starts = [beside.at(np.array([*np.log([size, length]), *plain.logs])) for length in STARTS]
+    starts = [beside.at(np.array([beside.centre[0], np.log(length), *plain.logs])) for length in STARTS]
     point = beside.optima([min(starts, key=lambda point: point.value)], ACCURACY)[0]
     return (point, curves, columns) if plain.value - point.value > GAIN else None
 
