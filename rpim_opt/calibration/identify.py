@@ -20,7 +20,7 @@ from rpim_opt.bayes.hyperparameters import Estimator, require_finite
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import Statement
 from rpim_opt.calibration.certificate import DECREASE
-from rpim_opt.calibration.loop import ROUNDS, Ended, Iteration, Options, minimize, nearby, require_start
+from rpim_opt.calibration.loop import FAR, ROUNDS, Ended, Iteration, Options, minimize, nearby, require_start
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.formulation import Formulation, formulation_of, tikhonov
 from rpim_opt.convex.rules.selection import Selector
@@ -42,8 +42,11 @@ NOISE = {
 MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["free"]}
 """Parts of the noise that a model tells apart: without its extensions joints would take gravity for noise."""
 LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
-FAR = 1000.0  # deviations in prior standard deviations beyond which a fit without a penalty is called divergent
-DIVERGES = "poorly identifiable combinations diverge without a penalty"
+DIVERGES = "poorly identifiable combinations diverge without a penalty; add one."
+DIVERGES_PENALIZED = (
+    "combinations that neither the data nor the penalty determine diverge; use a larger weight, or penalize all "
+    "parameters."
+)
 ZERO = 0.1  # standard deviation [rad] of a joint's zero that was found from the data
 
 
@@ -207,6 +210,8 @@ def ending(ended: Ended, most: int) -> str:
     """Return a sentence on how the loop ended and why."""
     state = ended.state
     iterations = counted(len(state.history), "iteration")
+    diverges = DIVERGES_PENALIZED if state.choice.weight else DIVERGES
+    exceeded = f"eviations exceed {FAR:g} prior standard deviations: {diverges}"
     if not ended.settled:
         what = "the predicted positions in the constraints still change; use a larger weight"
         return f"Not converged: after {ROUNDS} rounds {what}."
@@ -217,8 +222,8 @@ def ending(ended: Ended, most: int) -> str:
         )
     if ended.converged:
         text = f"Converged after {iterations}."
-        if state.choice.weight == 0 and np.abs(state.z).max(initial=0.0) > FAR:
-            text += f" Deviations exceed {FAR:g} prior standard deviations: {DIVERGES}; add one."
+        if state.far:
+            text += f" D{exceeded}"
         return " ".join(filter(None, [text, state.choice.note]))
     if state.outcome == "rest":
         decrease = ended.certificate.decrease
@@ -232,13 +237,15 @@ def ending(ended: Ended, most: int) -> str:
             "no step, however short, decreases the nonlinear objective; the formulation may have no minimum "
             "here, or the start is far from it."
         )
+    elif state.outcome == "far":
+        why = f"d{exceeded}"
     else:
         why = f"{counted(most, 'iteration')} {'was' if most == 1 else 'were'} not enough"
         last = [iteration.objective for iteration in state.history[-5:]]
         if len(last) == 5 and last[0] - last[-1] <= LEVEL * abs(last[-1]):
             why += ", though the objective hardly changes: the data hardly determine the solution; use a larger weight."
         elif state.choice.weight == 0 and most > 1:
-            why += f": {DIVERGES}; add one."
+            why += f": {DIVERGES}"
         else:
             why += "; allow more (max_iterations)."
     return " ".join(filter(None, [f"Not converged: {why}", state.choice.note]))

@@ -39,6 +39,9 @@ NEAR_FIRST = 0.01  # share of the solution that the next step at the first weigh
 STALLED, STALLED_MOST = 2, 20
 """Evaluations in a row that do not lower the objective beyond its accuracy, after which the loop is at rest: where the
 next step promises nothing, and whatever that promises."""
+FAR, FAR_ITERATIONS = 1000.0, 100
+"""Deviations in prior standard deviations beyond which a fit is called divergent; iterations after which it is given
+up there: combinations that neither data nor penalty hold lead on and on."""
 DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objective
 SAME_POSITIONS = 1e-4  # what a round may change, relative to 1 + |z|: the error of predicted positions is its square
 ROUNDS, LEAST_SHARE = 20, 1 / 8  # rounds at most; least share of the way to its solution at which the next linearizes
@@ -201,8 +204,8 @@ class State:
 
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2.
     ``stalled`` counts the evaluations since the objective was last lowered beyond its accuracy, to ``lowest``.
-    ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``), ``floor`` is what vanishing objectives are compared
-    with.
+    ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``, ``"far"``), ``floor`` is what vanishing objectives are
+    compared with.
     """
 
     z: Array
@@ -222,6 +225,11 @@ class State:
         """Return the state with another weight and its objective."""
         merit = self.program.objective(self.z, choice.weight)
         return replace(self, choice=choice, merit=merit, stalled=0, lowest=merit)
+
+    @property
+    def far(self) -> bool:
+        """Whether some deviation exceeds `FAR` prior standard deviations."""
+        return float(np.abs(self.z).max(initial=0.0)) > FAR
 
     def relative(self, length: float) -> float:
         """Return a length relative to that of the solution."""
@@ -338,6 +346,8 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
+        if state.evaluations > FAR_ITERATIONS and state.far:
+            return replace(state, outcome="far")
         try:
             solution, promised = self._predicted(state)
         except NoSolutionFound:
