@@ -169,13 +169,15 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     """Return a geometric grid of weights that covers all changes of the estimate.
 
     With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a penalty with
-    kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid.
+    kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid. Where each weight
+    takes solving it begins at eps s_1^2 at least: smaller weights are rounding beside the squares.
     """
     if program.formulation.penalty is None:
         raise InputError("weight", "a selector for a formulation without penalty", "weight 0")
+    least = 0.0 if program.closed_form else float(np.finfo(float).eps)
     if program.quadratic:
-        return grid_of(program.ridge, count)
-    weights = grid_of(ridge(program.model, program.penalty_form), count)
+        return grid_of(program.ridge, count, least)
+    weights = grid_of(ridge(program.model, program.penalty_form), count, least)
     n = program.model.A.shape[1]
     slope = None  # of the loss at nominal
     if program.loss_form is not None and not program.linear_penalty and not program.structure.inner:
@@ -193,12 +195,12 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     return np.geomspace(np.clip(weights[0], LEAST * -value, MOST * -value), -value, count)
 
 
-def grid_of(form: Ridge, count: int = 200) -> Array:
-    """Return the grid of weights of a closed-form estimator, from its singular values."""
+def grid_of(form: Ridge, count: int = 200, least: float = 0.0) -> Array:
+    """Return the grid of weights of a closed-form estimator, from its singular values, above ``least`` s_1^2."""
     s = form.s[form.seen]
     if not len(s):
         raise InputError("data", "no sensitivity to any identified parameter", "data that depend on at least one")
-    return np.geomspace(1e-4 * s[-1] ** 2, 10 * s[0] ** 2, count)
+    return np.geomspace(max(1e-4 * s[-1] ** 2, least * s[0] ** 2), 10 * s[0] ** 2, count)
 
 
 def least_between(score: Score, weights: Array, best: int, ratio: float = 1 + 1e-6) -> tuple[float, float]:
