@@ -169,12 +169,13 @@ def weight_grid(program: Program, count: int = 200) -> Array:
     """Return a geometric grid of weights that covers all changes of the estimate.
 
     With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a penalty with
-    kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid. Where each weight
-    takes solving it begins at eps s_1^2 at least: smaller weights are rounding beside the squares.
+    kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid. Where an
+    interior point solves it begins at eps s_1^2 at least: smaller weights are rounding beside the squares.
     """
     if program.formulation.penalty is None:
         raise InputError("weight", "a selector for a formulation without penalty", "weight 0")
-    least = 0.0 if program.closed_form else float(np.finfo(float).eps)
+    exact = program.quadratic and program.box is not None
+    least = 0.0 if exact else float(np.finfo(float).eps)
     if program.quadratic:
         return grid_of(program.ridge, count, least)
     weights = grid_of(ridge(program.model, program.penalty_form), count, least)

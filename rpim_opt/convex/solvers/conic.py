@@ -408,7 +408,7 @@ class ReducedProgram:
             tight[working - p.zero] = True
             dual = multipliers[p.zero :]
             rounding = 1e-9 * max(weight * np.abs(p.q).max(initial=0.0), np.abs(dual).max(initial=0.0))
-            met = slack[~tight] >= -1e-11 * (1 + np.abs(p.b[inequalities][~tight]))
+            met = slack >= -1e-11 * (1 + np.abs(p.b[inequalities]))
             if met.all() and (dual >= -rounding).all():
                 self.working, self.near = working, x
                 every = np.zeros(len(p.b))
@@ -416,7 +416,7 @@ class ReducedProgram:
                 return Point(x, every)
             keep = np.zeros(len(p.b), dtype=bool)
             keep[working[dual > 0]] = True
-            keep[inequalities[~tight & (slack < 0)]] = True
+            keep[inequalities[np.where(tight, ~met, slack < 0)]] = True
             working = np.flatnonzero(keep)
         return None
 
@@ -663,8 +663,6 @@ def on_working_set(
         rank = int((pivots > 1e-11 * pivots.max(initial=0.0)).sum())
         Y, Z, T = Q[:, :rank], Q[:, rank:], T[:rank, :rank]
         x = near + Y @ by_triangle(T, (b - A @ near)[order[:rank]], transposed=True)
-        if rank < len(b) and np.abs(A @ x - b).max() > 1e-9 * (1 + np.abs(b).max()):
-            return None
     if Z.shape[1]:
         reduced = np.vstack([np.sqrt(2) * squares.R @ Z[at], np.sqrt(weight) * root @ Z])
         L: Any = np.linalg.qr(reduced, mode="r")
