@@ -67,7 +67,7 @@ LARGE = 1e-2
 iterations where it is large."""
 DEAR = 1e6
 """Costs beside a loss from which they are scaled down."""
-MOST_ACTIVE_SETS = 8
+MOST_ACTIVE_SETS = 40
 """Active sets that are tried before Clarabel is asked for one."""
 
 
@@ -389,35 +389,37 @@ class ReducedProgram:
     # --- active set --------------------------------------------------------------------------------------------------
 
     def _by_active_set(self, squares: ReducedSquares, weight: float, working: np.ndarray, near: Array) -> Point | None:
-        """Return the minimum by a primal-dual active set; None where the sets of active rows cycle."""
+        """Return the minimum by a primal-dual active set; None where some set has none, or too many are tried.
+
+        All rows that are wrong change at once; where sets recur, the first of them alone, which never cycles where the
+        multipliers are unique (Murty, Opsearch 11, 1974).
+        """
         p = self.canonical
-        A = p.dense[0]
-        inequalities = np.arange(p.zero, p.linear)
+        A, b = p.dense[0][p.zero : p.linear], p.b[p.zero : p.linear]
         seen: set[bytes] = set()
+        cycles = False
         for _ in range(MOST_ACTIVE_SETS):
-            if working.tobytes() in seen:
-                return None
+            cycles |= working.tobytes() in seen
             seen.add(working.tobytes())
             active = np.concatenate([np.arange(p.zero), working])
             solution = on_working_set(squares, weight, p, active, near)
             if solution is None:
                 return None
             x, multipliers = solution
-            slack = p.b[inequalities] - A[inequalities] @ x
-            tight = np.zeros(len(inequalities), dtype=bool)
-            tight[working - p.zero] = True
-            dual = multipliers[p.zero :]
+            slack, dual = b - A @ x, np.zeros(len(b))
+            dual[working - p.zero] = multipliers[p.zero :]
             rounding = 1e-9 * max(weight * np.abs(p.q).max(initial=0.0), np.abs(dual).max(initial=0.0))
-            met = slack >= -1e-11 * (1 + np.abs(p.b[inequalities]))
+            met = slack >= -1e-11 * (1 + np.abs(b))
             if met.all() and (dual >= -rounding).all():
                 self.working, self.near = working, x
                 every = np.zeros(len(p.b))
                 every[active] = multipliers
                 return Point(x, every)
-            keep = np.zeros(len(p.b), dtype=bool)
-            keep[working[dual > 0]] = True
-            keep[inequalities[np.where(tight, ~met, slack < 0)]] = True
-            working = np.flatnonzero(keep)
+            tight = np.zeros(len(b), dtype=bool)
+            tight[working - p.zero] = True
+            changed = np.flatnonzero(tight != np.where(tight, (dual > 0) | ~met, slack < 0))
+            tight[changed[: 1 if cycles else None]] ^= True
+            working = p.zero + np.flatnonzero(tight)
         return None
 
     # --- Clarabel ----------------------------------------------------------------------------------------------------
