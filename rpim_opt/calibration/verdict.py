@@ -140,9 +140,7 @@ def noise_ratio(problem: Source, errors: Array, dimension: str = "length") -> fl
     """Return the RMS of errors (N,) [SI] over that of the stated noise; 0 if the dimension was not measured."""
     variance = stated_variance(problem, dimension)
     of = np.isfinite(errors) & (variance > 0)
-    if not of.any():
-        return 0.0
-    return rms(errors[of]) / float(np.sqrt(np.mean(variance[of])))
+    return rms(errors[of]) / float(np.sqrt(np.mean(variance[of]))) if of.any() else 0.0
 
 
 def stated_variance(problem: Source, dimension: str) -> Array:

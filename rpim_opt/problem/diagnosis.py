@@ -557,13 +557,14 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
         return
     fit = fit_points(points)
     label = [problem.data.label[i] for i in points.row]
-    far = np.flatnonzero(fit.error > FAR * np.median(fit.error))
+    limit = FAR * float(np.median(fit.error))  # of many rows far off some are near any other by chance
+    far = np.flatnonzero(fit.error > limit)
     away = np.linalg.norm(points.y[far, None] - fit.modelled, axis=2)
     away[points.marker[far, None] != points.marker] = np.inf
     other = {
         int(i): int(j)
         for i, j, fits in zip(far, away.argmin(axis=1), away.min(axis=1), strict=True)
-        if fits < BETTER * fit.error[i]
+        if fits < min(BETTER * fit.error[i], limit)
     }
     pairs = [f"{label[i]} and {label[j]}" for i, j in other.items() if i < j and other.get(j) == i]
     if pairs:
@@ -581,7 +582,7 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     model = transformed((fit.base @ forward_kinematics(points.robot, points.q[far]))[:, None], fit.tools)
     error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
     error[np.arange(len(far)), points.marker[far]] = np.inf
-    markers = [label[i] for i in far[error.min(axis=1) < BETTER * fit.error[far]]]
+    markers = [label[i] for i in far[error.min(axis=1) < np.minimum(BETTER * fit.error[far], limit)]]
     if markers:
         yield (
             f"{_rows(markers, 'fits', 'fit')} another reflector than the stated one (column marker): reflectors "
@@ -774,9 +775,10 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     error = fit_points(first[max(fitting)]).error
     far = np.append(0, np.cumsum(error > FAR * np.median(error)))
     start = int(np.argmin(2 * far - np.arange(len(far))))  # fewest rows that are on the wrong side of it
-    if len(points.row) - start < FEWEST:
+    rest = points.take(np.arange(start, len(points.row)))
+    if len(rest.row) < FEWEST or misfit(rest) < BETTER * whole:  # what fits as stated may fit otherwise by chance
         return
-    better = better_reading(problem.on(problem.data.take(points.row[start:])))
+    better = better_reading(problem.on(problem.data.take(rest.row)))
     if better is not None:
         yield f"from about row {problem.data.label[points.row[start]]} on {better.sentence}"
 

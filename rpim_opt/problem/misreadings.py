@@ -14,7 +14,7 @@ from scipy.special import fdtr
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import three_digits
+from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.position import from_elevation, from_zenith
 from rpim_opt.problem.problem import CalibrationProblem
@@ -149,9 +149,12 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
     )
     for factor, (unit, remedy) in ANGLES.items():
         yield of(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
-    for (factor, (unit, _)), i in product(list(ANGLES.items())[:2], np.flatnonzero(turning)):
-        remedy = f"multiply column q{i + 1} by {factor:.6g} or name its unit"
-        yield of(f"joint {i + 1} read {unit}", remedy, eye + (factor - 1) * np.outer(eye[i], eye[i]))
+    for (factor, (unit, _)), (i, j) in product(list(ANGLES.items())[:2], combinations(range(robot.dof + 1), 2)):
+        if turning[i:j].all() and j - i < robot.dof:  # one joint, or several next to each other
+            number, several = [str(k + 1) for k in range(i, j)], "s" * (j - i > 1)
+            remedy = f"multiply column{several} {joined([f'q{k}' for k in number])} by {factor:.6g} or name the unit"
+            what = f"joint{several} {joined(number)} read {unit}"
+            yield of(what, remedy, eye + (factor - 1) * np.diag(eye[i:j].sum(axis=0)))
     if not turning.all():
         for factor, (unit, _) in LENGTHS.items():
             remedy = f"multiply the columns of the linear joints by {factor:g} or name their unit"
