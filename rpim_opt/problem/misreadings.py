@@ -439,7 +439,7 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
     points = points_of(problem) or lengths_of(problem)
     if points is None:
         return None
-    mapping = None if explained(points) else search(points)
+    mapping = None if explained(points) else search(points, problem)
     if mapping is not None:
         return _of_mapping(mapping)
     # with zeros fitted, as of every other reading, unless they only fit what is wrong with some rows

@@ -522,7 +522,7 @@ def _weighed(result: Calibration, updated: Calibration, released: Sequence[str])
         causes.append(misfit.evidence(Cause(labels[0], "reading", tuple(labels)), *change))
         logs.append(log_bayes_factor(*change, np.full(len(equations), OUTLIER_WIDTH)))
     posterior = np.array(logs) + log_priors(causes)
-    whole = logsumexp([np.log(UNCHANGED), *posterior])
+    whole = float(np.logaddexp.reduce(posterior, initial=np.log(UNCHANGED)))
     order = np.argsort(-posterior)
     weighed = [causes[i]._replace(probability=float(np.exp(posterior[i] - whole))) for i in order]
     return tuple(weighed), misfit.fit

@@ -9,6 +9,7 @@ import shutil
 import subprocess
 import sys
 import tomllib
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -236,6 +237,26 @@ def test_six_rows_that_a_reading_fits_by_chance_are_read_as_they_are_written() -
     rows = [problem.data.label.index(f"c{i}") for i in (184, 185, 186, 188, 189, 190)]
     found = ro.problem.inspect(problem.on(problem.data.take(rows)))
     assert not any("the data fit" in warning for warning in found.warnings)
+
+
+@real
+def test_a_reversed_joint_of_an_arm_that_moved_little_is_that_and_no_large_zero() -> None:
+    """Zeros of any size take up errors of its geometry; what data leave open is missing, and does not reject."""
+    problem = ro.load(REAL / "motoman_right").problem
+    (block,) = problem.data.blocks
+    wrong = problem.on(replace(problem.data, blocks=(replace(block, q=block.q * [1, 1, -1, 1, 1, 1]),)))
+    result = ro.calibrate(wrong, ro.tikhonov, 1.0)
+    mapping = result.mapping
+    assert mapping is not None
+    assert mapping.explanations == "joint 3 reversed (sign = -1)"
+    told = [each for each in mapping.ambiguities if "as the controller counts, to decide" in each]
+    assert len(told) == 2 < len(mapping.alternatives)
+    assert all(str(result.message).count(each) == 0 and each in result.verdict.reasons for each in told)
+    low, high = problem.robot.limits.T
+    assert all(((each.deciding >= low) & (each.deciding <= high)).all() for each in mapping.alternatives)
+    accepted = ro.calibration.accept(result, ro.data.Requirement(5e-3))
+    assert accepted.verdict == "inconclusive"
+    assert set(told) <= set(accepted.reasons)
 
 
 @real

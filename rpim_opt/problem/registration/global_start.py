@@ -20,6 +20,7 @@ from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
+from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.problem.registration.points import (
     Candidates,
     Fit,
@@ -55,6 +56,7 @@ MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many ti
 COMPARED = 200  # configurations at which mappings are compared
 WRITE = "write sign, and add the zeros to theta_deg, of these joints in robot.toml"  # the remedy
 AS_STATED = "joints as stated"
+TOLD = 2  # other mappings of equal fit that are told, the best ones
 RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
 
 
@@ -119,7 +121,7 @@ class JointMapping:
             f"{self.starts} random starts: an optimum found by one start in {round(1 / RARE_BASIN)} is missed "
             f"with a probability of {(1 - RARE_BASIN) ** self.starts:.1g})."
         )
-        return " ".join([text, *self._said(self.alternatives)])
+        return " ".join([text, *(each for each in self._said(self.alternatives) if each not in self.ambiguities)])
 
     @property
     def ambiguities(self) -> tuple[str, ...]:
@@ -134,7 +136,7 @@ class JointMapping:
                 f"A left-handed measured frame with {self.behind} fits as well: a known direction in the instrument's "
                 "frame (such as up) or measured orientations would decide."
             )
-        for other in alternatives:
+        for other in alternatives[:TOLD]:
             what = described(self.joint_types, other.sign, other.zero).capitalize()
             if other.mirror:
                 first = described(self.joint_types, self.sign, self.zero)
@@ -146,8 +148,11 @@ class JointMapping:
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))
             sentences.append(
                 f"{what} fits as well, and differs by {three_digits(1e3 * other.apart)} mm at other "
-                f"configurations: measure at ({values}) to decide."
+                f"configurations: measure at ({values}), as the controller counts, to decide."
             )
+        more = len(alternatives) - TOLD
+        if more > 0:
+            sentences.append(f"So do {more} more: joints that moved little, or wrong data, decide nothing.")
         return tuple(sentences)
 
 
@@ -204,10 +209,10 @@ def find_mapping(problem: Source) -> tuple[JointMapping, CalibrationProblem] | N
     needed |= set(_anchor(problem)) if points.lengths else {f"base_{c}" for c in FRAME}
     if not needed <= set(problem.parameters.free.names) or explained(points):
         return None
-    mapping = search(points)
+    mapping = search(points, problem)
     if mapping is None or mapping.mirrored:
         return None
-    return mapping, with_mapping(problem, points, mapping)
+    return mapping, with_mapping(problem, points, mapping.sign, mapping.zero)
 
 
 def _anchor(problem: CalibrationProblem) -> list[str]:
@@ -222,9 +227,9 @@ def explained(points: Points) -> bool:
     return bool(rms(fit_arms(Candidates.of([few]), SHORT, robust=True))[0] <= UNEXPLAINED * few.extent)
 
 
-def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapping) -> CalibrationProblem:
+def with_mapping(problem: CalibrationProblem, points: Points, sign: Array, zero: Array) -> CalibrationProblem:
     """Return the problem with the joints mapped, and base and reflectors where the points put them then."""
-    robot = mapped(problem.robot, mapping.sign, mapping.zero)
+    robot = mapped(problem.robot, sign, zero)
     fit = fit_arms(Candidates.of([replace(points, robot=robot)]), LONG, robust=True)
     p = problem.parameters
     values = {f"theta{i}": theta for i, theta in enumerate(robot.mdh[:, 2], start=1)}
@@ -249,9 +254,12 @@ def with_mapping(problem: CalibrationProblem, points: Points, mapping: JointMapp
     return replace(problem, robots=robot, parameters=replace(p, nominal=nominal))
 
 
-def search(points: Points, seed: int = 0) -> JointMapping | None:
-    """Return the mapping that explains the points; None if the nominal one does too, or if none does."""
-    rng = np.random.default_rng(seed)
+def search(points: Points, problem: CalibrationProblem | None = None) -> JointMapping | None:
+    """Return the mapping that explains the points; None if the nominal one does too, or if none does.
+
+    Of a ``problem`` a plainer one comes first that explains them as well with deviations of its prior's size.
+    """
+    rng = np.random.default_rng(0)
     robot = points.robot
     n = robot.dof
     if n < len(robot.mdh):  # a sign or zero of a joint would not say what follows it
@@ -282,7 +290,7 @@ def search(points: Points, seed: int = 0) -> JointMapping | None:
     zero, tools = np.vstack([near.zero, pool.zero[best]]), np.concatenate([near.tools, pool.tools[best]])
     candidates = _signed(points, sign)._replace(zero=zero, tools=tools)
     fits = fit_arms(candidates, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
-    return _judged(points, sign, fits, starts, small, rng)
+    return _judged(points, problem, sign, fits, starts, small, rng)
 
 
 def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Array]:
@@ -310,8 +318,45 @@ def _round(points: Points, sign: Array, zero: Array) -> tuple[Array, Fit]:
     return sign[best], fit_arms(begun, LONG, zeros=True, noise=LEAST_NOISE)
 
 
+def _plainer(
+    points: Points, problem: CalibrationProblem, sign: Array, fits: Fit, inliers: np.ndarray
+) -> tuple[Array, Fit]:
+    """Return signs (B, dof) and fits of mappings without zeros, or with quarter turns, that explain points as well.
+
+    That is as well as the first of the given ones, with deviations of the size of the problem's prior, by residuals and
+    penalty together: zeros of any size take up errors of the geometry, where joints moved little.
+    """
+    n = points.robot.dof
+    zero = np.array([QUARTER * np.round(_gauged(points.robot, each) / QUARTER) for each in fits.zero])
+    zero *= _turning(points.robot)
+    signs = np.array(list(product([1.0, -1.0], repeat=n)))
+    both = np.unique(np.vstack([np.hstack([sign, zero]), np.hstack([signs, np.zeros_like(signs)])]), axis=0)
+    tried = fit_arms(_signed(points, both[:, :n])._replace(zero=both[:, n:]), LONG, robust=True, noise=LEAST_NOISE)
+    rows = points.row[np.unique(np.flatnonzero(inliers) // (len(inliers) // len(points.row)))]
+    alone = problem.on(problem.data.take(np.sort(rows)))
+
+    def squares(sign: Array, zero: Array) -> tuple[float, int]:
+        there = with_mapping(alone, points, sign, zero)
+        x = ridge_deviations(there)
+        model = there.linearize(x)
+        z = x / model.parameters.scale
+        r = model.b - model.A @ z
+        return float(r @ r + z @ z), len(r)
+
+    least, count = squares(sign[0], fits.zero[0])
+    near = np.flatnonzero(rms(tried) <= UNEXPLAINED * points.extent)
+    as_well = [i for i in near if squares(*np.split(both[i], 2))[0] < least * (1 + ODDS / count)]
+    return both[as_well, :n], Fit(*(each[as_well] for each in tried))
+
+
 def _judged(
-    points: Points, sign: Array, fits: Fit, starts: int, small: bool, rng: np.random.Generator
+    points: Points,
+    problem: CalibrationProblem | None,
+    sign: Array,
+    fits: Fit,
+    starts: int,
+    small: bool,
+    rng: np.random.Generator,
 ) -> JointMapping | None:
     """Return the plainest mapping of the best robot class, and others that fit as well; the first fit is nominal."""
     robot = points.robot
@@ -326,35 +371,60 @@ def _judged(
     cost = (fits.error[:, inliers] ** 2).sum(axis=1)
     chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
     near = [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
+    given = len(sign)
+    if problem is not None and not points.seen:
+        plainer = _plainer(points, problem, sign[near], Fit(*(each[near] for each in fits)), inliers)
+        near += range(given, given + len(plainer[0]))
+        sign, fits = np.vstack([sign, plainer[0]]), stacked([fits, plainer[1]])
+        left = rms(fits)
     measured = points.q.reshape(-1, robot.dof)
-    low, high = np.where(_turning(robot), [[-np.pi], [np.pi]], [measured.min(axis=0), measured.max(axis=0)])
+    measured_ends = np.stack([measured.min(axis=0), measured.max(axis=0)])
+    ends = np.where(_turning(robot), [[-np.pi], [np.pi]], measured_ends)
+    ends = np.where(np.isfinite(robot.limits.T), robot.limits.T, ends)
+    low, high = np.minimum(ends[0], measured_ends[0]), np.maximum(ends[1], measured_ends[1])
     elsewhere = rng.uniform(low, high, (COMPARED, robot.dof))
     zeros = [_gauged(robot, zero) for zero in fits.zero]
     moved = np.linalg.norm(fits.tools - Candidates.of([points]).stated, axis=-1).max(axis=-1)  # of reflectors
     plain = [_plain(*each) for each in zip(sign, zeros, moved, strict=True)]
     same = 0.5 * max(least, LEAST_NOISE)
-    alike: list[list[int]] = []  # fits that predict the same elsewhere, the plainest first, with that prediction
-    predictions: list[Array] = []
+    there: dict[int, Array] = {}
     for i in near:
         T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
-        there = transformed(T[:, None], fits.tools[i])
+        there[i] = transformed(T[:, None], fits.tools[i])
         if points.lengths:
-            there -= there.mean(axis=(0, 1))
-        gaps = [_apart(there, other, points.lengths) for other in predictions]
-        if gaps and min(gaps) <= same:
-            alike[int(np.argmin(gaps))].append(i)
+            there[i] -= there[i].mean(axis=(0, 1))
+
+    def is_of(i: int, group: list[int]) -> bool:
+        """Whether a fit predicts what a group's first does; a plainer one what any does, or with zeros near its own."""
+        if i < given:
+            return _apart(there[i], there[group[0]], points.lengths) <= same
+        turns = np.abs(np.angle(np.exp(1j * (np.array([zeros[j] for j in group]) - zeros[i])))).max(axis=1)
+        if ((turns < NEAR_ZERO) & (sign[group] == sign[i]).all(axis=1)).any():
+            return True
+        return any(_apart(there[i], there[j], points.lengths) <= same for j in group)
+
+    alike: list[list[int]] = []  # fits that predict the same elsewhere, the best first
+    for i in near:
+        groups = [each for each in alike if is_of(i, each)][: 1 if i < given else None]
+        if groups:
+            groups[0][:] = [*(j for each in groups for j in each), i]
+            alike = [each for each in alike if each not in groups[1:]]
         else:
             alike.append([i])
-            predictions.append(there)
+    predictions = [there[each[0]] for each in alike]
     plainest = [min(each, key=plain.__getitem__) for each in alike]
 
     def mirrors(first: int) -> list[bool]:
         return [points.lengths and bool(_apart(-there, predictions[first], True) <= same) for there in predictions]
 
-    first = min([0, *np.flatnonzero(mirrors(0)).tolist()], key=lambda k: plain[plainest[k]])
+    as_good = [0, *np.flatnonzero(mirrors(0)).tolist(), *(k for k, each in enumerate(alike) if max(each) >= given)]
+    first = min(as_good, key=lambda k: plain[plainest[k]])
+    if not plain[plainest[first]][0]:
+        return None
     mirror = mirrors(first)
     others = []
-    for k, i in enumerate(plainest):
+    for k in sorted(range(len(plainest)), key=lambda k: plain[plainest[k]]):
+        i = plainest[k]
         if k != first:
             far = np.linalg.norm(predictions[k] - predictions[first], axis=-1).max(axis=-1)
             deciding = elsewhere[int(np.argmax(far))]
