@@ -334,7 +334,9 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     lacking = [*_unmodelled(result, region), *unheld]
     if result.contradiction:
         lacking.append("Missing: constraints that the data do not contradict, on which the bound rests.")
-    against = list(result.verdict.reasons)
+    undecided = () if result.mapping is None else result.mapping.ambiguities
+    lacking += [reason for reason in result.verdict.reasons if reason in undecided]
+    against = [reason for reason in result.verdict.reasons if reason not in undecided]
     caution = " ".join(filter(None, [result.caution, _standing(result)]))
     try:
         mapped = workspace(result, requirement, region, drawn)
