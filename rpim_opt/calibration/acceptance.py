@@ -205,7 +205,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     if found is None or not (of_positions(result) and result.verdict.delivered and found.typical > nominal):
         return ""
     advice = (
-        "Measure more configurations (rpim-opt design --augment), with larger wrist rotations, or state what is known "
+        "Measure more configurations (command design, --augment), with larger wrist rotations, or state what is known "
         'of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
     if any(map(of_session, result.problem.parameters.free.names)):

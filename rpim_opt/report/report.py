@@ -53,13 +53,10 @@ def write_report(
 ) -> None:
     """Write a calibration report: one HTML file that needs no network, written whole or not at all.
 
-    In the order in which somebody signs it: verdict and headline; accuracy, with expanded uncertainty over the
-    workspace; identified parameters with their expanded uncertainties; diagnostics (residuals, identifiability,
-    flagged rows, convergence); provenance; and in an appendix the evidence for the regularization weight. Every text
-    of a user's file is shown as text. ``validation`` are measurements that were not used for identification, by default
-    those of the calibration's record; ``new`` are `ro.use.validate`'s results of further ones, by the names of their
-    tables, for a section of their own, with the acceptance test by them where the result has a limit. InputError where
-    they do not belong to the problem, or none is of a length.
+    Verdict and headline come first, then `SECTIONS`. Every text of a user's file is shown as text. ``validation`` are
+    measurements that were not used for identification, by default those of the calibration's record; ``new`` are
+    `ro.use.validate`'s results of further ones, by the names of their tables: headline and acceptance test are by them.
+    InputError where they do not belong to the problem, or none is of a length.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, weight=ro.l_curve)
@@ -322,8 +319,7 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     if not curves:
         return
     yield "heading", "Transmission errors of the joints"
-    text = "The actual joint angle is the controller's plus this error, both as the controller counts them; outside "
-    yield "text", [f"{text}the measured range it is unknown."]
+    yield "text", ["Controller's joint angle plus this error is the actual one; unknown outside the measured range."]
     yield "table", Table("Within the measured range", *words.curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)

@@ -231,7 +231,7 @@ def compensate(
     **Which frame.** What a calibration identified of the base is where the instrument stands and is not compensated:
     targets hold in the base as identified. A turn of joint 1 and one of the base are the same to the data; what the
     scales ascribe to the base stays. With ``base=True`` targets hold in the base as stated, and the robot corrects for
-    its place, too (``base = "auto"`` states none: then it is where registration puts it).
+    its place, too (with ``base = "auto"`` that of registration).
 
     **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
     x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;

@@ -377,9 +377,9 @@ def test_one_of_several_robots_goes_to_files(tmp_path: Path) -> None:
     for name in ("left", "right"):
         notes = ro.use.export_files(result, robot=name, mdh=tmp_path / f"{name}.toml").notes
         written = ro.read_robot(tmp_path / f"{name}.toml")
-        assert np.array_equal(written.mdh, result.robots[name].mdh)
+        assert np.abs(written.mdh - result.robots[name].mdh).max() < 1e-11
         arm = ro.use.identified(result, robot=name)
         q = np.random.default_rng(0).uniform(-1, 1, (5, written.dof))
         chain = numeric_frame(arm.base) @ ro.robot.forward_kinematics(written, q) @ numeric_frame(arm.tool)
-        assert np.abs(chain - result.forward(q, robot=name)).max() < 1e-12
+        assert np.abs(chain - result.forward(q, robot=name)).max() < 1e-10
         assert any(f"{1e3 * arm.tool[0]:.3f}" in note for note in notes)
