@@ -906,7 +906,7 @@ def _acceptable_part(problem: CalibrationProblem, x: Array) -> float:
     norms, count = problem.with_repeatability(None).whitened_errors(x)
     noise = NOISY * np.sqrt(count.sum() / max(float(norms @ norms), TINY))
     largest = {"length": REACH * arm_length(problem.robot, problem.data.blocks), "angle": ANGULAR}
-    own = [most / size for each, most in largest.items() if (size := rms(problem.errors(x, each)))]
+    own = [most / size for each, most in largest.items() if (size := rms(problem.errors(x, each))) > TINY]
     return max(noise, min(own, default=0.0))
 
 
