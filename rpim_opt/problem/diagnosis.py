@@ -904,10 +904,10 @@ def _acceptable_part(problem: CalibrationProblem, x: Array) -> float:
     A cause that leaves more is beyond its linearization, or one of several mistakes at best.
     """
     norms, count = problem.with_repeatability(None).whitened_errors(x)
-    noise = NOISY * np.sqrt(count.sum() / max(float(norms @ norms), TINY))
+    noise = NOISY * np.sqrt(count.sum()) / np.sqrt(max(float(norms @ norms), TINY))
     largest = {"length": REACH * arm_length(problem.robot, problem.data.blocks), "angle": ANGULAR}
     own = [most / size for each, most in largest.items() if (size := rms(problem.errors(x, each))) > TINY]
-    return max(noise, min(own, default=0.0))
+    return min(max(noise, min(own, default=0.0)), 1.0)
 
 
 def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[str]:
