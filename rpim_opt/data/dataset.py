@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from types import MappingProxyType
 from typing import Any
@@ -72,6 +72,17 @@ class Block(Brief):
         rows = {name: values[index] for name, values in whole.items() if values is not None}
         columns = {name: values[index] for name, values in self.columns.items()}
         return replace(self, row=row, columns=columns, **rows)
+
+    def by_place(self, markers: np.ndarray | None, fixtures: np.ndarray | None) -> tuple[Block, ...]:
+        """Return the rows by names of reflectors, (N,) or (N, p), and fixtures (N,), in the order of first rows."""
+        N, p = self.q.shape[:2]
+        own = np.array([""] * N, dtype=object) if markers is None else markers
+        of_points = np.broadcast_to(own.reshape(N, -1), (N, p))
+        groups: dict[tuple[str, ...], list[int]] = {}
+        for i, key in enumerate(zip(*of_points.T, [""] * N if fixtures is None else fixtures, strict=True)):
+            groups.setdefault(key, []).append(i)
+        parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
+        return tuple(replace(self.take(i, i), markers=tuple(names), fixture=place) for names, place, i in parts)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -211,8 +222,7 @@ class Dataset(Tabled):
                     for name in names:
                         group[root(("point", name))] = root(("rows", self.configuration[row]))
         joined = [root(("rows", number)) for number in self.configuration]
-        number = {each: i for i, each in enumerate(dict.fromkeys(joined))}
-        return replace(self, configuration=np.array([number[each] for each in joined], dtype=int))
+        return replace(self, configuration=_numbered(joined))
 
     def without(self, labels: Collection[str]) -> Dataset:
         """Return the rows whose label is not among ``labels``."""
@@ -241,8 +251,10 @@ class Dataset(Tabled):
         columns: Mapping[str, ArrayLike] = MappingProxyType({}),
         session: Sequence[str] = (),
         point: Sequence[str] | np.ndarray = (),
+        marker: Sequence[Any] | np.ndarray = (),
+        fixture: Sequence[str] | np.ndarray = (),
     ) -> Dataset:
-        """Return a dataset from arrays.
+        """Return a dataset from arrays; rows of equal joint values are one configuration.
 
         ``q`` (N, dof) are joint values of the controller [rad or m], (N, p, dof) where a row involves p points; ``y``
         (N, c) are measured values [SI], poses also as transforms (N, 4, 4). ``sigma`` is the standard deviation [SI] of
@@ -254,7 +266,8 @@ class Dataset(Tabled):
         of a ready type, ``"cable"``. ``torque`` [Nm] and ``approach``, the directions of the last movement (-1, 0 or
         +1), are (N, dof) or (N, p, dof) as q, ``payload`` (N,) is the mass at the flange [kg], ``columns`` are further
         columns by name, (N,) each [SI], which terms and measurements of your own see; ``session`` and ``point`` are N
-        names of the sessions, and of the points that were touched or seen.
+        names of the sessions, and of the points that were touched or seen. Where there are several, ``marker``, (N,)
+        or (N, p), are names of the reflectors, and ``fixture``, (N,), of the anchors, planes or spheres.
 
         InputError for an unknown name, shapes that do not fit together, numbers that are not finite, or a deviation
         that is not positive.
@@ -295,13 +308,15 @@ class Dataset(Tabled):
         stated = {name: _beside(values, name, like) for name, (values, like) in beside.items()}
         further = {name: _beside(values, f"column {name}", rows) for name, values in columns.items()}
         names = _names(point, "point", N)
-        seen = None if names is None else names[:, None]
-        sessions = named_sessions(session, N)
-        nameless = ("",) * points
-        block = Block(
-            measurement, q, y, covariance, rows, nameless, columns=further, point=seen, session=sessions, **stated
-        )
-        return cls((block,), label or tuple(str(i + 1) for i in range(N)), rows)
+        stated["point"] = None if names is None else names[:, None]
+        stated["session"] = named_sessions(session, N)
+        whole = Block(measurement, q, y, covariance, rows, ("",) * points, columns=further, **stated)
+        if len(marker) or len(fixture):
+            blocks = whole.by_place(_names(marker, "marker", N, points), _names(fixture, "fixture", N))
+        else:
+            blocks = (whole,)
+        configuration = _numbered(map(tuple, q.reshape(N, -1).tolist()))
+        return cls(blocks, label or tuple(str(i + 1) for i in range(N)), configuration)
 
     @classmethod
     def together(cls, parts: Sequence[Dataset], names: Sequence[str]) -> Dataset:
@@ -313,6 +328,12 @@ class Dataset(Tabled):
         joined = np.full(int(whole.configuration.max()) + 1, len(whole))
         np.minimum.at(joined, whole.configuration, first[stop])
         return replace(whole, configuration=joined[whole.configuration])
+
+
+def _numbered(keys: Iterable[Any]) -> np.ndarray:
+    """Return numbers (N,) from 0 of N keys, the same of equal ones, in the order of their first."""
+    number: dict[Any, int] = {}
+    return np.array([number.setdefault(key, len(number)) for key in keys], dtype=int)
 
 
 def _covariances(sigma: float | Array, N: int, k: int) -> Array:
@@ -340,11 +361,16 @@ def named_sessions(names: Sequence[Any] | np.ndarray, N: int) -> np.ndarray | No
     return sessions
 
 
-def _names(names: Sequence[Any] | np.ndarray, what: str, N: int) -> np.ndarray | None:
-    """Return names (N,), or None where there are none."""
+def _names(names: Sequence[Any] | np.ndarray, what: str, N: int, points: int = 1) -> np.ndarray | None:
+    """Return names (N,), or (N, p) of p points, or None where there are none."""
     if len(names) not in (0, N):
         raise InputError(what, f"{len(names)} names", f"{N}, one per row")
-    return np.array([str(name) for name in names], dtype=object) if len(names) else None
+    if not len(names):
+        return None
+    given = np.array(names, dtype=object)
+    if given.shape not in ((N,), (N, points)):
+        raise InputError(what, f"shape {given.shape}", f"{N} names, one per row" + (points > 1) * " or point")
+    return given.astype(str).astype(object)
 
 
 def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:

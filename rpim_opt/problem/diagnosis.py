@@ -406,12 +406,15 @@ def filled_rows(data: Dataset) -> Iterator[str]:
                 f"{_rows(between, 'is', 'are')} exactly half way between the points before and after: interpolated, "
                 "not measured; leave out what was filled in ([exclude])."
             )
-        again = labels[1:][(q[1:] == q[:-1]).all(axis=1) & (moves > FILLED)].tolist()
-        if again:
-            yield (
-                f"{_rows(again, 'has', 'have')} the joint values of the row before at another point: the log was not "
-                "updated; leave such rows out ([exclude])."
-            )
+        again = (q[1:] == q[:-1]).all(axis=1) & (moves > FILLED)
+        if again.any():
+            repeated = np.count_nonzero(again & ~np.append(False, again[:-1]))
+            if 2 * repeated > len(q) - np.count_nonzero(again):  # most configurations: no accident
+                cause = "are they of several reflectors? Name each row's reflector in a column `marker`."
+            else:
+                cause = "the log was not updated; leave such rows out ([exclude])."
+            which = _rows(labels[1:][again].tolist(), "has", "have")
+            yield f"{which} the joint values of the row before at another point: {cause}"
 
 
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:

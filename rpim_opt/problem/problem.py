@@ -635,7 +635,7 @@ def _depends_on(base: list[str], robot: Robot, parameters: Parameters, data: Dat
 def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, data: Dataset) -> Iterable[str]:
     """Return patterns of parameters; ``"auto"``: geometry, beta where it is needed, frames, own parameters of types."""
     if patterns != "auto":
-        return [patterns] if isinstance(patterns, str) else patterns
+        return patterns
     kinds = [block.measurement for block in data.blocks]
     own = {
         of_fixture(name, block.fixture)

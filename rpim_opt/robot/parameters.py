@@ -249,8 +249,8 @@ class Parameters(Tabled):
         """Return the dimension of a parameter: ``length``, ``angle``, ``ratio`` or ``compliance``."""
         return self.dimensions[self.names.index(name)]
 
-    def identify(self, patterns: Iterable[str]) -> Parameters:
-        """Return the same table with just the parameters identified that match one of the patterns.
+    def identify(self, patterns: str | Iterable[str]) -> Parameters:
+        """Return the same table with just the parameters identified that match the pattern, or one of several.
 
         A pattern is a name with ``*``, ``?`` and ``[...]`` as in file names: ``"a?"``, ``"beta[34]"``. InputError for
         one that matches no parameter.
@@ -261,7 +261,7 @@ class Parameters(Tabled):
         ('a1', 'a2', 'tool_x', 'tool_y', 'tool_z')
         """
         chosen = np.zeros(len(self), dtype=bool)
-        for pattern in patterns:
+        for pattern in [patterns] if isinstance(patterns, str) else patterns:
             hits = [fits(name, pattern) for name in self.names]
             if not any(hits):
                 raise InputError("key identify", f"pattern '{pattern}'", known_patterns(self.names, pattern))

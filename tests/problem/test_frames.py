@@ -188,6 +188,51 @@ def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:
     assert ro.problem.inspect(arm).observability.rank == ro.problem.observe(arm).rank
 
 
+REFLECTORS = {"A": [0.04, 0, 0.03, 0, 0, 0], "B": [0, 0.04, 0.03, 0, 0, 0], "C": [-0.04, 0, 0.05, 0, 0, 0]}
+
+
+def of_reflectors(marker: list[str]) -> ro.Dataset:
+    """Return the rows of three reflectors as arrays, with the names of the reflectors or none."""
+    read = ro.load("markers").problem.data
+    y = np.empty((len(read), 3))
+    for block in read.blocks:
+        y[block.row] = block.y
+    return ro.Dataset.of(read.q, y, 3e-5, marker=marker)
+
+
+@pytest.mark.parametrize("tool", [REFLECTORS, None])
+def test_several_reflectors_come_from_arrays_in_one_call(tool: dict[str, list[float]] | None) -> None:
+    folder = ro.load("markers")
+    data = of_reflectors([label[-1] for label in folder.problem.data.label])
+    problem = ro.problem_from(folder.problem.robot, data, tool=tool)
+    assert set(problem.parameters.free.names) == set(folder.problem.parameters.free.names)
+    assert len(set(data.configuration)) == 25
+    error, same = (ro.calibrate(each).errors(folder.validation).mean() for each in (problem, folder.problem))
+    assert error == pytest.approx(same, rel=0.02)
+
+
+def test_reflectors_that_have_no_name_or_no_start_are_named() -> None:
+    robot = ro.load("markers").problem.robot
+    warned = ro.problem.inspect(ro.problem_from(robot, of_reflectors([]))).warnings
+    assert any("are they of several reflectors?" in text for text in warned), warned
+    data = of_reflectors(["A", "B", "C"] * 25)
+    with pytest.raises(ro.InputError, match=r"found 'C', accepted: .* \(\[tool.C\]\): 'A', 'B'\."):
+        ro.problem_from(robot, data, tool={name: REFLECTORS[name] for name in "AB"})
+    with pytest.raises(ro.InputError, match="marker: found 2 names, accepted: 75, one per row"):
+        of_reflectors(["A", "B"])
+    with pytest.raises(ro.InputError, match=r"found pattern 'auto', accepted: names or patterns of alpha1\.\.6"):
+        ro.load("markers").problem.parameters.identify("auto")
+
+
+def test_two_points_of_a_row_and_anchors_have_names_from_arrays() -> None:
+    bar = ro.Dataset.of(
+        np.zeros((3, 2, 6)), [[0.1]] * 3, 1e-5, measurement="distance", marker=[["A", "B"], ["B", "C"], ["A", "B"]]
+    )
+    assert [(block.markers, block.row.tolist()) for block in bar.blocks] == [(("A", "B"), [0, 2]), (("B", "C"), [1])]
+    wire = ro.Dataset.of(np.zeros((2, 6)), [[0.1]] * 2, 1e-5, measurement="cable", fixture=["left", "right"])
+    assert [block.fixture for block in wire.blocks] == ["left", "right"]
+
+
 def test_a_problem_from_an_array_alone_says_what_a_robot_is() -> None:
     problem = ro.load("position").problem
     table: Any = problem.robot.mdh

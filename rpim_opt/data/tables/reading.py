@@ -14,7 +14,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, RowError, choices, in_file
 from rpim_opt.basics.tables import Columns, numbers, read_columns, texts
 from rpim_opt.basics.units import LARGEST, SMALLEST, Unit, quantities, split_unit, with_unit
-from rpim_opt.data.dataset import Block, Dataset
+from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.position import position
 from rpim_opt.robot.mdh import Robot
@@ -85,9 +85,9 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
         raise InputError("the header", ", ".join(table), accepted)
     point = texts(table[naming[0]], naming[0]) if naming else ()
     session = texts(table.get("session", ()), "session")
-    whole = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
-    blocks = _by_markers(whole.blocks[0], table, kind, label)
-    data = Dataset(blocks, label, _configurations(table, q.reshape(N, -1)))
+    stated |= {"marker": _markers(table, kind, q, label), "fixture": texts(table.get("fixture", ()), "fixture")}
+    data = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
+    data = replace(data, configuration=_configurations(table, q.reshape(N, -1)))
     return data.grouped_by_points() if kind.touching else data
 
 
@@ -98,22 +98,16 @@ def _configurations(table: Columns, joints: Array) -> np.ndarray:
     return np.unique(joints, axis=0, return_inverse=True)[1].reshape(-1)
 
 
-def _by_markers(whole: Block, table: Columns, kind: Measurement, label: Sequence[str]) -> tuple[Block, ...]:
-    """Return a block's rows by reflectors and fixture, in the order of their first rows."""
+def _markers(table: Columns, kind: Measurement, q: Array, label: Sequence[str]) -> np.ndarray | tuple[()]:
+    """Return the names (N, p) of the reflectors at the joint values q (N, p, dof), or none."""
     N = len(label)
     markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
     if kind.points == 2:
         for i, name in enumerate(label):
-            if markers[0][i] == markers[1][i] and np.array_equal(whole.q[i, 0], whole.q[i, 1]):
+            if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
                 found = "the same reflector twice in one configuration"
                 raise InputError(f"row {name}", found, "to_marker or to_q1, ... of another point")
-    if not {"marker", "to_marker", "fixture"} & set(table):
-        return (whole,)
-    groups: dict[tuple[str, ...], list[int]] = {}
-    for i, key in enumerate(zip(*markers, _names(table, ["fixture"], N), strict=True)):
-        groups.setdefault(key, []).append(i)
-    parts = ((names, place, np.array(rows)) for (*names, place), rows in groups.items())
-    return tuple(replace(whole.take(i, i), markers=tuple(names), fixture=place) for names, place, i in parts)
+    return np.column_stack(markers) if {"marker", "to_marker"} & set(table) else ()
 
 
 def _beside_each_other(columns: Numbers, stems: Sequence[str], N: int) -> Array:

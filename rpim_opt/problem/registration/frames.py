@@ -152,7 +152,7 @@ def problem_from(
     data: Dataset,
     identify: Iterable[str] = "auto",
     base: ArrayLike | Literal["auto"] = "auto",
-    tool: ArrayLike | None = None,
+    tool: ArrayLike | Mapping[str, ArrayLike] | None = None,
 ) -> CalibrationProblem:
     """Return the problem of a robot and its measurements, base and tool located in closed form.
 
@@ -160,8 +160,9 @@ def problem_from(
     ``identify`` are patterns of names, or ``"auto"``, as for `CalibrationProblem.identify`. ``base`` (6,) is a start of
     the base in the instrument's frame: x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, or its transform (4, 4);
     ``"auto"`` registers it; zero where the measurements do not depend on it. ``tool`` (6,) or (4, 4) is a start of the
-    reflector in the frame behind the last joint's modified-DH row, by default that of the URDF's tip, or zero; one that
-    the data contradict is replaced by its registration. InputError for data of another number of joints, data that do
+    reflector in the frame behind the last joint's modified-DH row, by default that of the URDF's tip, or zero, of
+    several reflectors (``marker``) the start of all, or of each by name, ``{"A": ..., "B": ...}``; one that the data
+    contradict is replaced by its registration. InputError for data of another number of joints, data that do
     not determine where the base is, or a pattern that matches no parameter.
 
     >>> import rpim_opt as ro
@@ -182,11 +183,15 @@ def problem_from(
     if joints - {robot.joint_map.shape[1]}:
         found = f"{', '.join(map(str, sorted(joints)))} joint values per row"
         raise InputError("the data", found, f"{robot.joint_map.shape[1]}, those of '{robot.name}'")
-    start = np.zeros(6) if tool is None else _frame(tool, "tool")
+    if isinstance(tool, Mapping):
+        starts = {marker: _frame(frame, f"tool '{marker}'") for marker, frame in tool.items()}
+    else:
+        start = np.zeros(6) if tool is None else _frame(tool, "tool")
+        starts = dict.fromkeys(sorted({marker for block in data.blocks for marker in block.markers}), start)
     placed = None if isinstance(base, str) and base == "auto" else _frame(base, "base")
     if placed is None and not any(block.measurement.registers for block in data.blocks):
         placed = np.zeros(6)  # lengths do not depend on it
-    parameters = starting_parameters(robot, data, placed, {"": start})
+    parameters = starting_parameters(robot, data, placed, starts)
     problem = CalibrationProblem(robot, parameters.identify(identifiable(identify, robot, parameters, data)), data)
     found = relocated(problem)
     return found if isinstance(found, CalibrationProblem) else problem
@@ -239,8 +244,8 @@ def starting_parameters(
     for block in data.blocks:
         for marker in set(block.markers) - set(tools):
             where = f"row {data.label[block.row[0]]}, column marker"
-            known = ", ".join(f"[tool.{name}]" if name else "[tool]" for name in tools)
-            raise InputError(where, f"'{marker}'", f"a reflector with a table of its own; there is {known}")
+            known = ", ".join(f"'{name}'" if name else "one without a name" for name in tools)
+            raise InputError(where, f"'{marker}'", f"a reflector whose start is stated ([tool.{marker}]): {known}")
     own = {**(own or {}), **starting_cameras(data, own or {})}
     places = tools
     if base is None:
