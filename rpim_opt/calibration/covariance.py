@@ -7,7 +7,7 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, stdtrit
+from scipy.special import chdtrc, chdtri, stdtrit
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -179,7 +179,9 @@ def noise_test(squares: float, freedom: float, learned: bool = False, factor: fl
     upper = float(chdtrc(freedom, squares))
     probability = 2 * min(upper, 1 - upper)
     if probability >= UNLIKELY:
-        return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise (ratio {ratio:.2f}).")
+        low, high = np.sqrt(chdtri(freedom, [1 - UNLIKELY / 2, UNLIKELY / 2]) / freedom)
+        found = f"ratio {ratio:.2f}; by chance {low:.2f} to {high:.2f}"
+        return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise ({found}).")
     cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"
     if upper >= 0.5:
         cause = "the noise is smaller than stated"

@@ -186,7 +186,7 @@ def monte_carlo(result: Outcome, draws: int = 200, seed: int = 0) -> Array:
     rng = np.random.default_rng(seed)
     program = result.program
     fitted = program.model.A @ result.z
-    if result.program.linear_penalty:
+    if result.known_covariance is not None:
         variance = result.spread.noise_variance
     else:  # no degrees of freedom are known: as many as parameters
         squares = np.sum((fitted - program.model.b) ** 2)

@@ -228,8 +228,8 @@ def _deviations(result: Outcome) -> Iterator[str]:
     p = result.problem.parameters
     types = [(robot, *each) for robot, arm in result.problem.arms.items() for each in enumerate(arm.joint_types, 1)]
     zeros = {p.called(robot, f"d{joint}") for robot, joint, kind in types if kind == "prismatic"}
-    worst = (1.0, "")
-    for name, x in zip(p.free.names, result.x, strict=True):
+    worst = (1.0, "", "")
+    for i, (name, x) in enumerate(zip(p.free.names, result.x, strict=True)):
         kind = own_name(name).rstrip("0123456789")
         joint = own_name(name).removeprefix(kind)
         if kind not in MACHINED or not joint or name in zeros:
@@ -237,9 +237,20 @@ def _deviations(result: Outcome) -> Iterator[str]:
         unit, largest = MACHINED[kind]
         sentence = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
         sentence = f"{sentence}: manufacturing errors stay below {1e3 * largest:g} {unit}."
-        worst = max(worst, (float(abs(x)) / largest, sentence))
-    if worst[1]:
-        yield f"{worst[1]} Check the order, signs and units of the joint columns, and the DH table."
+        if abs(x) / largest > worst[0]:
+            worst = (float(abs(x)) / largest, sentence, _cause(result, i, largest))
+    if worst[0] > 1:
+        yield f"{worst[1]} {worst[2]}"
+
+
+def _cause(result: Outcome, i: int, largest: float) -> str:
+    """Return why the identified parameter at i deviates by more than any robot does, beyond ``largest`` [SI]."""
+    form = result.program.penalty_form
+    penalized = result.weight > 0 and form is not None and form.matrix[:, i].any()
+    C = result.known_covariance
+    if not penalized and C is not None and C[i, i] > largest**2:
+        return "Neither the data nor a penalty determine it: add a penalty on it, or do not identify it."
+    return "Check the order, signs and units of the joint columns, and the DH table."
 
 
 def _worse(result: Outcome) -> Iterator[str]:

@@ -244,8 +244,6 @@ def _exchanged(A: Array, prior: Array, chosen: np.ndarray, criterion: str, C: Ar
     return np.array(picked)
 
 
-FAINT = 1e-2
-"""Coefficients of a combination (in millimetres and milliradians) below this part of its largest are left out."""
 TIE = 1e-6
 """Sizes that differ by less than this part are the same but for rounding: the order of the parameters decides."""
 
@@ -358,12 +356,12 @@ def observe(problem: Source) -> Observability:
             null *= free.scale
             # the first of the largest counts as one, or rounding would choose the sign of d6 - tool_z
             null /= null[np.argmax(np.abs(null) >= (1 - TIE) * np.abs(null).max())]
-            nulls.append(np.where(np.abs(null) > FAINT, null, 0.0))
+            nulls.append(null)
     nulls.sort(key=lambda null: tuple(np.flatnonzero(null)))
     base = []
     for i in np.argsort(pivot):
         sums = W[i] * free.scale[pivot[i]] / free.scale[rest]
-        added = {free.names[k]: float(v) for k, v in zip(rest, sums, strict=True) if abs(v) > FAINT}
+        added = {free.names[k]: float(v) for k, v in zip(rest, sums, strict=True) if v}
         base.append({free.names[pivot[i]]: 1.0} | added)
     return Observability(
         names=free.names, singular_values=s, rank=rank, configurations=configurations,

@@ -450,6 +450,17 @@ def test_a_damped_program_that_no_solver_solves_is_damped_more() -> None:
     assert "diverge without a penalty; add one" in result.message
 
 
+def test_a_penalty_that_leaves_redundant_parameters_out_is_the_cause_of_their_deviations() -> None:
+    """And not the table, which would be searched for a mistake in vain."""
+    offsets = ro.Formulation("joint offsets", penalty=lambda z: cp.sum_squares(z["theta?"]))
+    for name, weight in (("pose", 1.0), ("pose", None), ("position", 1.0)):
+        result = ro.calibrate(ro.load(name).problem, offsets, weight)
+        assert ("neither the data nor the penalty determine diverge" in result.message) == (name == "pose")
+        (said,) = [text for text in result.verdict.reasons if "manufacturing errors" in text]
+        assert "Neither the data nor a penalty determine it: add a penalty on it" in said
+        assert "DH table" not in str(result.verdict)
+
+
 def test_one_configuration_has_its_torques_in_a_row() -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
     q, torque = np.full(6, 0.1), np.ones(6)

@@ -82,7 +82,9 @@ def test_the_noise_is_as_declared_in_99_of_100_cases() -> None:
     for tail in (0.005, 0.995):
         edge = chi2.ppf(tail, 40) / 40
         inner, outer = (edge * (1 + by * (0.5 - tail)) for by in (1e-6, -1e-6))
-        assert "agree with the measurement noise (" in stand_in(60, 20.0, inner).result.noise_test().verdict
+        agreed = stand_in(60, 20.0, inner).result.noise_test().verdict
+        assert "agree with the measurement noise (" in agreed
+        assert f"{np.sqrt(edge):.2f}" in agreed.partition("by chance")[2]
         assert "agree with the measurement noise (" not in stand_in(60, 20.0, outer).result.noise_test().verdict
 
 

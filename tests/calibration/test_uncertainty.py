@@ -93,6 +93,23 @@ def test_monte_carlo_serves_losses_and_penalties_without_a_covariance() -> None:
     assert 0.7 < np.median(spread[moved] / squares[moved]) < 1.8  # 1.25 with normal noise and no penalty
 
 
+def test_monte_carlo_serves_a_loss_with_variables_of_its_own() -> None:
+    """The mean of the worst quarter, as a user writes it; its draws scatter more than those of least squares."""
+
+    def worst(v: cp.Expression) -> cp.Expression:
+        t = cp.Variable()
+        return v.size * t + 4 * cp.sum(cp.pos(v - t))
+
+    formulation = ro.Formulation("worst quarter", worst, cp.sum_squares, loss_over="configuration")
+    result = ro.calibrate(ro.load("position").problem, formulation, weight=1.0)
+    squares = ro.calibrate(ro.load("position").problem, weight=1.0)
+    spread, least = (ro.calibration.monte_carlo(each, draws=40).std(axis=0) for each in (result, squares))
+    a2 = result.problem.parameters.free.names.index("a2")
+    assert 1 < spread[a2] / least[a2] < 5
+    with pytest.raises(ro.InputError, match="`forward`, monte_carlo, l_curve and k_fold do not"):
+        ro.calibration.Uncertainty(result)
+
+
 def test_what_a_constraint_of_a_script_holds_is_marked() -> None:
     problem = ro.load("position").problem
     fixed = ro.Formulation("a2", penalty=cp.sum_squares, constraints=(lambda z, p: p.x["a2"] == 1e-4,))
