@@ -453,7 +453,7 @@ class Outcome:
             return None
 
     def parameter_rows(self) -> list[dict[str, Any]]:
-        """Return name, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
+        """Return parameter, unit, nominal, identified, deviation and std of every identified parameter, in that unit.
 
         ``std`` is None where the formulation has no covariance, or an infinite one.
         """
@@ -461,7 +461,7 @@ class Outcome:
         C = self.known_covariance
         std = np.full(len(self.x), np.inf) if C is None else np.sqrt(np.diag(C))
         columns = {"nominal": free.nominal, "identified": free.values(self.x), "deviation": self.x, "std": std}
-        return free.rows(columns, key="name")
+        return free.rows(columns)
 
     @cached_property
     def flagged(self) -> tuple[Flag, ...]:

@@ -49,7 +49,7 @@ def rotated(row: Mapping[str, Any]) -> bool:
 
 def turned_frames(result: Outcome) -> list[str]:
     """Return a note on the parameters that tables mark with ``*``, since they are `rotated`."""
-    names = [row["name"] for row in result.parameter_rows() if rotated(row)]
+    names = [row["parameter"] for row in result.parameter_rows() if rotated(row)]
     if not names:
         return []
     turn = "roll, pitch and yaw of the rotation from the nominal to the identified frame, about the axes of its parent"
@@ -69,7 +69,7 @@ def columns(result: Outcome) -> tuple[list[str], list[list[str]]]:
         if not of_curve:
             figures = [f"{row['nominal']:z.4f}", f"{row['identified']:z.4f}", f"{row['deviation']:+z.4f}"]
             std = "-" if row["std"] is None else f"{row['std']:.4f}"
-            name = f"{row['name']} *" if rotated(row) else row["name"]
+            name = f"{row['parameter']} *" if rotated(row) else row["parameter"]
             cells.append([name, row["unit"], *figures, std])
     return ["parameter", "unit", "nominal", "identified", "deviation", "std"], cells
 
@@ -271,7 +271,7 @@ def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
 
 
 FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
-    "parameters": lambda result: [{"parameter": row.pop("name"), **row} for row in result.parameter_rows()],
+    "parameters": Outcome.parameter_rows,
     "errors": lambda result: [
         {"label": label, "nominal_mm": float(before), "identified_mm": float(after)}
         for label, before, after in zip(

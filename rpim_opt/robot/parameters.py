@@ -162,14 +162,14 @@ class Parameters(Tabled):
         shown = ", ".join([*self.names[:SHOWN], "..."] if len(self) > SHOWN else self.names)
         return f"{shown}: {np.count_nonzero(self.identified)} of {len(self)} identified"
 
-    def rows(self, columns: Mapping[str, Array], key: str = "parameter") -> list[dict[str, Any]]:
-        """Return name (by a key), unit, and in it the figures (P,) [SI] of every parameter; None for infinite ones."""
+    def rows(self, columns: Mapping[str, Array]) -> list[dict[str, Any]]:
+        """Return name, unit, and in it the figures (P,) [SI] of every parameter; None for infinite ones."""
         rows: list[dict[str, Any]] = []
         for i, (name, dimension) in enumerate(zip(self.names, self.dimensions, strict=True)):
             unit, si = display(dimension)
             figures = {column: float(values[i] / si) for column, values in columns.items()}
             known = {column: value if np.isfinite(value) else None for column, value in figures.items()}
-            rows.append({key: name, "unit": unit, **known})
+            rows.append({"parameter": name, "unit": unit, **known})
         return rows
 
     def _frame_rows(self) -> list[dict[str, Any]]:

@@ -270,7 +270,7 @@ def figures(result: Calibration) -> dict[str, Any]:
         "message": result.message,
         "iterations": len(result.history),
         "flagged": result.outliers,
-        "parameters": result.parameter_rows(),
+        "parameters": [{"name": row.pop("parameter"), **row} for row in result.parameter_rows()],
     }
 
 

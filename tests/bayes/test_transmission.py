@@ -69,7 +69,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     text = words.parameter_table(result)
     assert "transmission2_c1" not in text
     assert text.count("joint 2") == 1
-    assert any(row["name"] == "transmission2_c1" for row in result.parameter_rows())
+    assert any(row["parameter"] == "transmission2_c1" for row in result.parameter_rows())
     page = report.page(result)
     assert "transmission2_c1" not in page
     assert "Joint 2: 0." in page

@@ -20,7 +20,7 @@ def stated(*constraints: Any) -> ro.Formulation:
 
 
 def widths(result: Any) -> dict[str, float]:
-    return {row["name"]: row["std"] for row in result.parameter_rows()}
+    return {row["parameter"]: row["std"] for row in result.parameter_rows()}
 
 
 def test_a_parameter_that_is_held_has_no_width_and_the_others_those_of_a_problem_without_it() -> None:

@@ -25,7 +25,7 @@ FREE = RESULT.problem.parameters.free
 def test_rows_are_in_the_parameters_units() -> None:
     values = FREE.values(RESULT.x)
     rows = RESULT.parameter_rows()
-    assert [row["name"] for row in rows] == list(FREE.names)
+    assert [row["parameter"] for row in rows] == list(FREE.names)
     for i, row in enumerate(rows):
         si = {"mm": 1e-3, "mrad": 1e-3, "deg": np.pi / 180}[row["unit"]]
         assert row["nominal"] == pytest.approx(FREE.nominal[i] / si, rel=1e-12, abs=1e-12)
@@ -140,7 +140,7 @@ def test_turns_of_frames_are_no_differences() -> None:
     lengths = problem.with_parameters(problem.parameters.identify(["d?", "base_[xyz]"]))
     assert not words.turned_frames(ro.calibrate(lengths, ro.tikhonov, weight=1.0))
     result = ro.calibrate(problem, ro.tikhonov, weight=1.0)
-    rows = {row["name"]: row for row in result.parameter_rows()}
+    rows = {row["parameter"]: row for row in result.parameter_rows()}
     told = words.turned_frames(result)[0].split(" turn ")[0]
     for name, row in rows.items():
         missed = abs(row["identified"] - row["nominal"] - row["deviation"])

@@ -105,7 +105,7 @@ def test_the_report_says_the_figures_of_the_result(arm, arm_page) -> None:
     for digest in arm.record.files.values():
         assert digest in text
     for row in arm.parameter_rows():
-        assert f"{row['name']} [{row['unit']}]" in text
+        assert f"{row['parameter']} [{row['unit']}]" in text
         assert f"{row['identified']:.4f}" in text
     assert "loss sum_squares of each equation, penalty sum_squares, constraints: none" in text
 
