@@ -213,8 +213,9 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
                 continue
             style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
             ax.plot([x], [y], color=f"C{k}", label=label, **style)
-    ax.set(xlabel="residual norm [standard deviations of the noise]")
-    ax.set(ylabel="deviation norm [prior standard deviations]")
+    norms = "residual norm [standard deviations of the noise]", "deviation norm [prior standard deviations]"
+    ax.set(xlabel="root of the loss" if program.loss_form is None else norms[0])
+    ax.set(ylabel="root of the penalty" if program.penalty_form is None else norms[1])
     logarithmic(ax, "x")
     logarithmic(ax, "y")
     return _with_legend(ax)

@@ -24,6 +24,8 @@ _FRAME = re.compile(r"\w*_r[xyz]")
 SIZES: dict[Place, int] = {"joint": 1, "link": 6, "base": 6, "tool": 6}  # how many numbers a term returns
 ENDS = ("base", "tool")  # places that an arm has once: parameters there have no number
 EXPECTED_WAVE = 1e-5  # scale of one harmonic of a transmission error before it is estimated [rad]
+SOMEWHERE, ROUNDING = 0.5, 1e-12
+"""Value [SI] of whatever a term sees where its motion with all parameters zero is evaluated, and what may be left."""
 BEND_SCALE = 1e-4  # prior standard deviation of a joint's deflection by one component of one link's first moment [rad]
 
 
@@ -251,8 +253,9 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
         return None
     try:
         moves = term.moves(joint, *sizes)
-    except (AttributeError, TypeError) as error:
+    except (AttributeError, TypeError, RuntimeError) as error:  # an `if` of a symbol is a RuntimeError
         accepted = f"moves({', '.join([term.at, *(entry.name for entry in term.entries)])}) using only what `Joint` has"
+        accepted += " and functions of CasADi (ca.if_else)"
         raise InputError(f"term '{term.name}'", f"{type(error).__name__}: {error}", accepted) from error
     if isinstance(moves, list | tuple):
         moves = ca.vertcat(*moves)
@@ -261,6 +264,20 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
         accepted = f"{SIZES[term.at]}, as a term of a {term.at} returns"
         raise InputError(f"term '{term.name}'", f"{moves.numel()} numbers", accepted)
     return ca.vec(moves)
+
+
+def _still_at_zero(term: Term, joint: Joint) -> ca.SX:
+    """Return the motion of a term with symbols for its parameters; refuse one that moves with all of them zero."""
+    sizes = ca.SX.sym("sizes", len(term.entries))
+    moves = term_motion(term, joint, dict(zip(term.names(joint.number), ca.vertsplit(sizes), strict=True)).__getitem__)
+    if term.entries:
+        still = ca.substitute(moves, sizes, ca.SX.zeros(len(term.entries)))
+        seen = ca.symvar(still)
+        left = float(ca.norm_inf(ca.Function("still", seen, [still]).call([ca.DM(SOMEWHERE)] * len(seen))[0]))
+        if left > ROUNDING:
+            found = f"a motion of {left:.2g} rad or m with all parameters zero"
+            raise InputError(f"term '{term.name}'", found, "none: its constant part belongs into the nominal robot")
+    return moves
 
 
 class Curve(NamedTuple):
@@ -396,9 +413,7 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    more = term_motion(term, Joint(i, configuration), ca.SX.sym)
-                    if more is not None:
-                        moves = ca.vertcat(moves, more)
+                    moves = ca.vertcat(moves, _still_at_zero(term, Joint(i, configuration)))
         return Dependencies(
             torques=ca.depends_on(moves, torque),
             gravity=ca.depends_on(moves, gravity.payload),

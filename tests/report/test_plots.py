@@ -39,6 +39,12 @@ def drawn(ax, label: str):
     return next(line for line in ax.lines if line.get_label() == label)
 
 
+def test_the_l_curve_of_what_is_no_norm_says_so(ax) -> None:
+    ro.plot.l_curve(ro.calibrate(ro.load("position").problem, ro.group_lasso, 1.0), ax=ax)
+    assert ax.get_xlabel() == "residual norm [standard deviations of the noise]"
+    assert ax.get_ylabel() == "root of the penalty"
+
+
 def test_flagged_rows_are_marked(ax) -> None:
     instance = ro.load("blunders")
     result = ro.calibrate(instance.problem, ro.robust, 1.0)

@@ -487,6 +487,10 @@ def test_a_problem_file_identifies_and_scales_what_a_script_adds(tmp_path: Path)
             "column 't'",
         ),
         (
+            lambda: blank().with_model(ro.Model([ro.robot.Term(lambda j, s: s + 1e-2, {"p_mrad": 1.0})])),
+            "a motion of 0.01 rad or m with all parameters zero",
+        ),
+        (
             lambda: ro.Model(
                 [
                     ro.robot.Term(lambda j, s: s, {"p_mm": 1.0}, columns={"t": ""}),
@@ -509,7 +513,14 @@ def test_backlash_of_a_users_own_needs_directions() -> None:
         problem.with_model(ro.Model([ro.robot.Term(moves, scales)]))
 
 
-@pytest.mark.parametrize("moves", [lambda joint, size: size * joint.speed, lambda joint: joint.q])
+@pytest.mark.parametrize(
+    "moves",
+    [
+        lambda joint, size: size * joint.speed,
+        lambda joint: joint.q,
+        lambda joint, size: size if joint.q > 0 else -size,
+    ],
+)
 def test_a_term_that_cannot_be_called_is_refused(moves: Callable) -> None:
     term = ro.robot.Term(moves, {"odd_mrad": 0.1})
     with pytest.raises(ro.InputError, match=r"term 'odd'.*accepted: moves\(joint, odd\)"):
