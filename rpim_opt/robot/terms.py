@@ -266,18 +266,16 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
     return ca.vec(moves)
 
 
-def _still_at_zero(term: Term, joint: Joint) -> ca.SX:
-    """Return the motion of a term with symbols for its parameters; refuse one that moves with all of them zero."""
-    sizes = ca.SX.sym("sizes", len(term.entries))
-    moves = term_motion(term, joint, dict(zip(term.names(joint.number), ca.vertsplit(sizes), strict=True)).__getitem__)
-    if term.entries:
-        still = ca.substitute(moves, sizes, ca.SX.zeros(len(term.entries)))
-        seen = ca.symvar(still)
-        left = float(ca.norm_inf(ca.Function("still", seen, [still]).call([ca.DM(SOMEWHERE)] * len(seen))[0]))
-        if left > ROUNDING:
-            found = f"a motion of {left:.2g} rad or m with all parameters zero"
-            raise InputError(f"term '{term.name}'", found, "none: its constant part belongs into the nominal robot")
-    return moves
+def _require_still(term: Term, moves: ca.SX, sizes: Sequence[ca.SX]) -> None:
+    """Refuse a term that moves with all its parameters zero, of which ``sizes`` are the symbols."""
+    if not sizes:
+        return
+    still = ca.substitute(moves, ca.vertcat(*sizes), ca.SX.zeros(len(sizes)))
+    seen = ca.symvar(still)
+    left = float(ca.norm_inf(ca.Function("still", seen, [still]).call([ca.DM(SOMEWHERE)] * len(seen))[0]))
+    if left > ROUNDING:
+        found = f"a motion of {left:.2g} rad or m with all parameters zero"
+        raise InputError(f"term '{term.name}'", found, "none: its constant part belongs into the nominal robot")
 
 
 class Curve(NamedTuple):
@@ -413,7 +411,11 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    moves = ca.vertcat(moves, _still_at_zero(term, Joint(i, configuration)))
+                    sizes = dict(zip(names, ca.vertsplit(ca.SX.sym("sizes", len(names))), strict=True))
+                    more = term_motion(term, Joint(i, configuration), sizes.__getitem__)
+                    if more is not None:
+                        _require_still(term, more, [*sizes.values()])
+                        moves = ca.vertcat(moves, more)
         return Dependencies(
             torques=ca.depends_on(moves, torque),
             gravity=ca.depends_on(moves, gravity.payload),
