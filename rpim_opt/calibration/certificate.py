@@ -76,7 +76,7 @@ def certified(
     promised = objective - program.objective(best, weight)
     if not np.isfinite(promised):
         return Certificate(step, violation)
-    return Certificate(step, violation, max(promised, 0.0) / max(abs(objective), floor, TINY))
+    return Certificate(step, violation, float(max(promised, 0.0) / max(abs(objective), floor, TINY)))
 
 
 def _differentiated(model: LinearModel, residual: Callable[[Array], Array], z: Array) -> LinearModel:

@@ -112,11 +112,13 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
     n = after["count"]
     if not n:
         return ""
+    equations, unknowns = result.program.model.equations, len(result.x)
+    few = f"; {equations} equations for {unknowns} parameters" if equations < unknowns else ""
     where = {
         "validation": f"On {n} validation measurements, not used for identification,",
         "held out": f"On {n} measurements that were held out",
         "new": f"On {n} new measurements, not used for identification,",
-        "identification": f"On the {n} identification measurements (no validation data)",
+        "identification": f"On the {n} identification measurements (no validation data{few})",
     }[name]
     what = "position error" if of_positions(result) else "error"
     ratio = before["mean_mm"] / max(after["mean_mm"], 1e-12)

@@ -153,7 +153,7 @@ def compare(
         "Metrics": figured,
         "Options": [f"{name} = {value}" for name, value in (options or {}).items()],
     }
-    settings = {name: ", ".join(values) for name, values in axes.items() if values}
+    settings = {name: "; ".join(values) for name, values in axes.items() if values}
     return Comparison(tuple(rows), tuple(figured), frozenset(drawn), settings, made)
 
 

@@ -276,7 +276,7 @@ def errors_by(returned: Any, problem: CalibrationProblem, label: str) -> Callabl
     except (TypeError, ValueError):
         raise InputError(f"method {label}", f"a {type(returned).__name__}", accepted) from None
     if x.shape != (n,) or not np.isfinite(x).all():
-        found = f"shape {x.shape}, finite: {bool(np.isfinite(x).all())}"
+        found = f"numbers of shape {x.shape}" if np.isfinite(x).all() else "numbers that are not finite"
         raise InputError(f"method {label}", found, accepted)
     return lambda data, dimension: problem.on(data).errors(x, dimension)
 

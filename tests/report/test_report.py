@@ -18,6 +18,7 @@ import rpim_opt as ro
 from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
 from rpim_opt.report import report
 from rpim_opt.report.report import page
+from rpim_opt.report.summary import headline
 from tests.browser import NAMES, PROGRAM, Browser, browser
 from tests.simulate import simulated
 from tests.test_cli import run
@@ -108,6 +109,14 @@ def test_the_report_says_the_figures_of_the_result(arm, arm_page) -> None:
         assert f"{row['parameter']} [{row['unit']}]" in text
         assert f"{row['identified']:.4f}" in text
     assert "loss sum_squares of each equation, penalty sum_squares, constraints: none" in text
+
+
+def test_fewer_equations_than_parameters_stand_in_the_headline() -> None:
+    """A fit to them says nothing of other configurations, and its errors of these look like a success."""
+    problem = ro.load("position").problem
+    few = ro.calibrate(problem.on(problem.data.take(np.arange(10))))
+    assert "(no validation data; 30 equations for 34 parameters)" in headline(few)
+    assert "equations" not in headline(ro.calibrate(problem))
 
 
 def test_one_file_that_loads_nothing(arm_page) -> None:

@@ -302,6 +302,15 @@ def test_a_journal_knows_the_package_that_computed(tmp_path: Path, monkeypatch: 
         ro.compare("position", selectors=1.0, journal=journal, progress=False)
 
 
+def test_names_with_commas_are_told_apart_and_a_method_that_answers_no_numbers_is_named() -> None:
+    methods = {"short": lambda problem: [0.0], "blind": lambda problem: [np.nan] * len(problem.parameters.free)}
+    found = ro.compare("position", ["tikhonov"], ["reml", 1.0], methods=methods, progress=False)
+    assert found.asked["Methods"] == "tikhonov, reml; tikhonov, 1; short; blind"
+    notes = "\n".join(found.summary().notes)
+    assert "Method short: found numbers of shape (1,), accepted: 34 finite deviations" in notes
+    assert "Method blind: found numbers that are not finite" in notes
+
+
 @pytest.mark.slow
 def test_two_processes_and_a_cluster_give_the_same(tmp_path: Path) -> None:
     own = ro.Formulation("own", loss=lambda r: cp.sum(cp.huber(r, 1.5)), penalty=cp.sum_squares)
