@@ -228,19 +228,19 @@ def _deviations(result: Outcome) -> Iterator[str]:
     p = result.problem.parameters
     types = [(robot, *each) for robot, arm in result.problem.arms.items() for each in enumerate(arm.joint_types, 1)]
     zeros = {p.called(robot, f"d{joint}") for robot, joint, kind in types if kind == "prismatic"}
-    worst = (1.0, "", "")
+    worst, said = 1.0, ""
     for i, (name, x) in enumerate(zip(p.free.names, result.x, strict=True)):
         kind = own_name(name).rstrip("0123456789")
         joint = own_name(name).removeprefix(kind)
         if kind not in MACHINED or not joint or name in zeros:
             continue
         unit, largest = MACHINED[kind]
-        sentence = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
-        sentence = f"{sentence}: manufacturing errors stay below {1e3 * largest:g} {unit}."
-        if abs(x) / largest > worst[0]:
-            worst = (float(abs(x)) / largest, sentence, _cause(result, i, largest))
-    if worst[0] > 1:
-        yield f"{worst[1]} {worst[2]}"
+        if abs(x) / largest > worst:
+            worst = float(abs(x)) / largest
+            said = f"{name} deviates by {three_digits(1e3 * x)} {unit}"
+            said += f": manufacturing errors stay below {1e3 * largest:g} {unit}. {_cause(result, i, largest)}"
+    if said:
+        yield said
 
 
 def _cause(result: Outcome, i: int, largest: float) -> str:

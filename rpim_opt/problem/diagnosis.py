@@ -409,10 +409,9 @@ def filled_rows(data: Dataset) -> Iterator[str]:
         again = (q[1:] == q[:-1]).all(axis=1) & (moves > FILLED)
         if again.any():
             repeated = np.count_nonzero(again & ~np.append(False, again[:-1]))
+            cause = "the log was not updated; leave such rows out ([exclude])."
             if 2 * repeated > len(q) - np.count_nonzero(again):  # most configurations: no accident
                 cause = "are they of several reflectors? Name each row's reflector in a column `marker`."
-            else:
-                cause = "the log was not updated; leave such rows out ([exclude])."
             which = _rows(labels[1:][again].tolist(), "has", "have")
             yield f"{which} the joint values of the row before at another point: {cause}"
 

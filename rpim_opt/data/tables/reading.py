@@ -100,8 +100,8 @@ def _configurations(table: Columns, joints: Array) -> np.ndarray:
 
 def _markers(table: Columns, kind: Measurement, q: Array, label: Sequence[str]) -> np.ndarray | tuple[()]:
     """Return the names (N, p) of the reflectors at the joint values q (N, p, dof), or none."""
-    N = len(label)
-    markers = [_names(table, column, N) for column in [["marker"], ["to_marker", "marker"]][: kind.points]]
+    first = texts(table.get("marker", ("",) * len(label)), "marker")
+    markers = [first, texts(table.get("to_marker", first), "to_marker")][: kind.points]
     if kind.points == 2:
         for i, name in enumerate(label):
             if markers[0][i] == markers[1][i] and np.array_equal(q[i, 0], q[i, 1]):
@@ -121,12 +121,6 @@ def _of_joints(stem: str, columns: Numbers, robot: Robot, kind: Measurement, N: 
     own = [f"{stem}{i}" for i in range(1, robot.dof + 1)]
     points = [own, [f"to_{name}" for name in own] if (f"to_{stem}1", "") in columns else own][: kind.points]
     return np.stack([_beside_each_other(columns, names, N) for names in points], axis=1)
-
-
-def _names(table: Columns, columns: Sequence[str], N: int) -> Sequence[str]:
-    """Return the texts of the first of the columns that is there, or N empty ones."""
-    column = next((each for each in columns if each in table), None)
-    return texts(table[column], column) if column else ("",) * N
 
 
 # --- columns ---------------------------------------------------------------------------------------------------------
