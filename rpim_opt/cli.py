@@ -716,9 +716,7 @@ def compare(
 @command
 def robots() -> Answer:
     """List the ready robots that a problem file may name."""
-    from rpim_opt.robot.library import find_robot
-
-    ready = {name: ro.read_robot(find_robot(name)) for name in ro.robots()}
+    ready = {name: ro.read_robot(name) for name in ro.robots()}
     rows = [{"robot": name, "name": robot.name, "joints": robot.dof} for name, robot in ready.items()]
     text = table(["robot", "name", "joints"], [[str(cell) for cell in row.values()] for row in rows])
     return Answer(text, {"robots": rows})
@@ -807,4 +805,5 @@ def main() -> None:
         except ABORT:
             console.fail("Interrupted.", INTERRUPTED)
         except RpimError as error:
-            console.fail(str(error), next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))
+            text = error.command if isinstance(error, InputError) else str(error)
+            console.fail(text, next((code for kind, code in FAILURES.items() if isinstance(error, kind)), 2))

@@ -146,6 +146,17 @@ def test_a_reflector_that_is_not_the_tip_is_placed_in_the_tip_links_frame(made: 
     assert "state --tool" in str(ro.use.compensate(result, np.zeros((1, 6))))
 
 
+def test_a_reflector_at_an_unknown_place_is_said_to_start_at_the_flange(monkeypatch, capsys, cell, tmp_path) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("arm.urdf").write_text(urdf_text(ARM.mdh, np.eye(4)))
+    assert (
+        run(monkeypatch, "new", "arm", "--robot", "arm.urdf", "--data", str(cell / "measured.csv"), "--units", "m,rad")
+        == 0
+    )
+    assert "The reflector starts at the flange's origin" in capsys.readouterr().out
+    assert "unknown: starts at the flange's origin" in Path("arm/problem.toml").read_text()
+
+
 def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cell, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     assert run(monkeypatch, "new", "arm", "--robot", str(cell / "arm.urdf"), "--data", str(cell / "measured.csv"),
@@ -153,6 +164,7 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     said = capsys.readouterr().out
     assert re.search(r"joint_1 .* q1_rad ", said)
     assert "Guessed: the data are in the robot's base frame" in said
+    assert "The reflector starts at the tip link, x " in said
     assert run(monkeypatch, "inspect", "arm") == 0
     assert "Warning" not in capsys.readouterr().out
     assert run(monkeypatch, "calibrate", "arm", "--out", "arm/results") == 0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import wraps
@@ -18,6 +19,9 @@ MANY = 24  # names that are listed one by one
 LONGEST_COMPARED = 200
 """Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
 
+OPTION = re.compile(r"(rpim-opt [^,;()]*)|(?<![\w-])--([a-z][a-z-]*)")
+"""A command with its options, which stays as it is, or an option."""
+
 
 class RpimError(Exception):
     """Base class of all exceptions of this package."""
@@ -28,7 +32,8 @@ class InputError(RpimError):
 
     Reads as one sentence, ``file, where: found ..., accepted: ...``; the parts stay available as attributes. ``where``
     is the key, column, row or argument, ``found`` and ``accepted`` what stands there and what could, ``file`` the file
-    that it stands in, None where there is none.
+    that it stands in, None where there is none. Options of the command line, ``--tip-measured``, are named as arguments
+    of a script, ``tip_measured``, but in the attribute ``command``, which the command line prints.
 
     >>> import rpim_opt as ro
     >>> error = ro.InputError("key joint 2.d_mm", "'long'", "a finite number")
@@ -42,7 +47,8 @@ class InputError(RpimError):
         self.found = _one_line(found)
         self.accepted = _one_line(accepted)
         place = f"{_one_line(str(file))}, {self.where}" if file else self.where
-        super().__init__(f"{place}: found {self.found}, accepted: {self.accepted}.")
+        self.command = f"{place}: found {self.found}, accepted: {self.accepted}."
+        super().__init__(OPTION.sub(lambda match: match[1] or match[2].replace("-", "_"), self.command))
 
     def within(self, file: object) -> InputError:
         """Return the error with the file added, unless it already names one."""

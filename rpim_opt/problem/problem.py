@@ -192,7 +192,9 @@ class CalibrationProblem(RobotModel):
                 if tool_prefix(marker) + "x" not in names:
                     known = sorted({n.split("_")[1] for n in names if n.startswith("tool_") and n.count("_") == 2})
                     found = f"'{marker}'" if marker else "no name of a reflector"
-                    raise InputError("column marker", found, "a reflector of " + choices(marker, known))
+                    of_one = "no names of reflectors: the parameters have one, tool_x to tool_rz"
+                    accepted = f"a reflector of {choices(marker, known)}" if known else of_one
+                    raise InputError("column marker", found, accepted)
             for name in block.measurement.parameters:
                 if of_fixture(name, block.fixture) not in names:
                     where = f"measurement {block.measurement.name}"

@@ -10,9 +10,8 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
 from rpim_opt.robot.chain import RobotSetup
-from rpim_opt.robot.formats.tables import SHEETS, read_robot, read_sheet
+from rpim_opt.robot.formats.tables import READY, SHEETS, read_robot, read_sheet
 
-READY = Path(__file__).resolve().parent / "ready"
 ROBOT_FILES = (".toml", ".urdf", ".json", ".yaml", ".yml", *SHEETS)
 REFUSED = {
     ".xacro": "a xacro file, which ROS's command expands (xacro arm.urdf.xacro > arm.urdf)",

@@ -123,6 +123,7 @@ def new_problem(
     identified, validated, seen = (f"{chain}_{name}" if chain else name for name in TABLES)
     board = stated_target(target, seen)
     kind, how = _kind(arm, understanding, board, measurement)
+    understanding = replace(understanding, kind=kind)
     rows = rows_of(understanding, on_board(understanding.columns, board.board), arm, kind)
     columns = understanding.columns
     held = _held_out(rows, hold_out, seed)
@@ -165,7 +166,7 @@ def new_problem(
         *of_chain,
     )
     counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    return Started(folder, counts, notes, replace(understanding, kind=kind), not dry_run)
+    return Started(folder, counts, notes, understanding, not dry_run)
 
 
 def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
@@ -176,13 +177,14 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, noise:
             f"Assumed measurement noise (1 sigma): {assumed}. State the instrument's own in [noise] of problem.toml: "
             "noise beyond it is taken for the robot's repeatability."
         )
-    # of a URDF, or of a DH table in another convention than the modified one
-    if placed(arm.tool) != placed(np.zeros(6)):
+    there = "the flange's origin"
+    if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
-        yield (
-            f"[tool], `known` and --tool refer to the flange frame after the last joint. In it {frame} is at "
-            f"{placed(arm.tool)}: transform points of {frame} by it."
-        )
+        there = f"{frame}, {placed(arm.tool)} (transform points of {frame} by it)"
+    yield (
+        f"{understanding.kind.words.thing_at} starts at {there}: state its place in [tool] if it is known. [tool], "
+        "`known` and --tool refer to the flange frame after the last joint."
+    )
     if placed(arm.base) != placed(np.zeros(6)):
         yield (
             "[base], boxes and poses for `compensate` refer to the robot's base, the first frame of its DH table. In "
@@ -360,7 +362,7 @@ def _problem_text(arm: RobotSetup, kind: Measurement, rows: Dataset, chain: str,
         rows=rows,
         how=how,
         markers=markers,
-        tool=arm.tool,
+        tool=np.where(np.abs(arm.tool) < 1e-12, 0.0, arm.tool),
         cameras=cameras,
         touched=list(dict.fromkeys(touched))[:2],
         base=None if base is None else _frame(base),

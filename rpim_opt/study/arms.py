@@ -14,7 +14,6 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.extensions import gravity_torques
 from rpim_opt.robot.formats.tables import read_robot
-from rpim_opt.robot.library import find_robot
 from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.robot.parameters import model_parameters
 
@@ -63,7 +62,7 @@ def simulated_arm(
     ('ABB IRB 120-3/0.58', 200, True)
     """
     name = list(KINDS)[seed % len(KINDS)]
-    robot = read_robot(find_robot(name))
+    robot = read_robot(name)
     rng = np.random.default_rng([seed, 77])
     length = np.exp(rng.uniform(np.log(5e-5), np.log(1e-3)))
     angle = min(length * np.exp(rng.uniform(0, np.log(30))), 5e-3)

@@ -34,7 +34,7 @@ from rpim_opt.robot.formats.tables import CONVENTIONS, read_robot, rounded, writ
 from rpim_opt.robot.formats.universal_robots import read_ur_kinematics, write_ur_calibration, write_ur_kinematics
 from rpim_opt.robot.formats.urdf import read_urdf, remembered_ends, write_origins, write_urdf
 from rpim_opt.robot.kinematics import FRAME, frame_numbers, numeric_frame, numeric_link
-from rpim_opt.robot.library import READY, robots
+from rpim_opt.robot.library import robots
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty
@@ -354,7 +354,7 @@ def _write_urdf(
         moved = 1e3 * np.linalg.norm(tool[:3] - own.tool[:3])
         notes.append(
             f"URDF: {tip} moved by {moved:.3g} mm (--tip-measured) to the identified reflector, {placed(tool)} in the "
-            "DH table's flange frame."
+            f"DH table's flange frame: whatever refers to {tip} moves with it."
         )
     elif of_tool:
         at = placed(frame_numbers(np.linalg.inv(numeric_frame(own.tool)) @ numeric_frame(arm.tool)))
@@ -436,7 +436,7 @@ def _catalogued(robot: Robot) -> Robot:
     def lengths(mdh: Array) -> Array:  # a is negative in Base only; of parallel axes 2 to 4 the sum of offsets counts
         return np.array([*np.abs(mdh[:, 1]), *mdh[4:, 3], mdh[1:4, 3].sum()])
 
-    ready = [read_robot(READY / f"{name}.toml") for name in robots() if name.startswith("ur")]
+    ready = [read_robot(name) for name in robots() if name.startswith("ur")]
     apart = [float(np.abs(lengths(each.mdh) - lengths(robot.mdh)).max()) for each in ready]
     if min(apart) > ANOTHER_MODEL:
         raise InputError("robot", robot.name, "one of Universal Robots' models")

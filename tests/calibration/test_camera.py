@@ -203,7 +203,7 @@ def test_new_makes_a_folder_from_corners(place: str, tmp_path: Path) -> None:
     cells = np.column_stack([np.degrees(block.q[:, 0]), block.y])
     rows = [",".join([name, *map(repr, row)]) for name, row in zip(block.point[:, 0], cells.tolist(), strict=True)]
     (tmp_path / "corners.csv").write_text("\n".join([",".join(head), *rows]))
-    with pytest.raises(ro.InputError, match="--target"):
+    with pytest.raises(ro.InputError, match="target: found"):
         ro.store.new_problem(tmp_path / "cell", "ur5e", tmp_path / "corners.csv")
     made = ro.store.new_problem(tmp_path / "cell", "ur5e", tmp_path / "corners.csv", hold_out=0.2, target="5x4,40mm")
     assert made.understood.content()["measurement"] == STUDY.PLACES[place][0]

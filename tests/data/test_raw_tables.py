@@ -304,7 +304,7 @@ def test_the_label_is_the_column_that_tells_rows_apart(tmp_path: Path) -> None:
     found = read(write(tmp_path, HEAD.replace("Point,", "Collection,Group,Point,") + rows))
     assert found.columns["label"] == ["P1", "P2"]
     rows = "a,P1,1,2,401,5,6\nb,P2,3,4,402,6,7\n"
-    with pytest.raises(ro.InputError, match="such as --key 'Point'"):
+    with pytest.raises(ro.InputError, match="such as key 'Point'"):
         read(write(tmp_path, HEAD.replace("Point,", "Name,Point,") + rows))
 
 

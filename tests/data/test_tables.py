@@ -78,6 +78,7 @@ HOSTILE = {
     "unnamed column": (GOOD.replace("x_mm", ""), "the header: found a column without a name"),
     "column twice": (GOOD.replace("y_mm", "x_mm"), "the header: found column 'x_mm' twice"),
     "column in two units": (f"{HEAD},x_m\na,1,2,3,4,5,6\n", "column 'x' in two units"),
+    "a driver's header": (GOOD.replace("x_mm", "/tracker/point/x"), "rpim-opt new (ro.store.new_problem)"),
     "unknown column": (GOOD.replace("x_mm", "px_mm"), "column 'px_mm'"),
     "no unit": (GOOD.replace("x_mm", "x"), "column 'x' without a unit"),
     "unknown unit": (GOOD.replace("x_mm", "x_in"), "column 'x_in'"),

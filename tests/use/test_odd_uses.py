@@ -18,6 +18,7 @@ from rpim_opt.use.export import export_urdf, write_all
 from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.recalibration import Cause, Moved
 from tests.simulate import simulated
+from tests.test_cli import run
 
 
 @cache
@@ -54,6 +55,21 @@ RIVAL = Cause("theta3", "joint offset", ("theta3",), 45.0, 1e-8, 0.4)
 
 def unlikely(fit: Any) -> Any:
     return fit._replace(squares=1e4, probability=1e-12)
+
+
+def test_a_script_is_told_of_arguments_and_a_command_of_options(monkeypatch, capsys, tmp_path) -> None:
+    result = calibrated()
+    with pytest.raises(ro.InputError, match=r"^marker: found 'B'"):
+        ro.use.compensate(result, np.zeros((1, 6)), marker="B")
+    with pytest.raises(ro.InputError, match=r"accepted: urdf, \.\.\.; mdh and others name their own"):
+        ro.use.export_files(result, tmp_path / "x.toml", mdh=tmp_path / "y.toml", despite_verdict=True)
+    data = result.problem.data
+    named = replace(data, blocks=tuple(replace(block, markers=("B",)) for block in data.blocks))
+    with pytest.raises(ro.InputError, match="found 'B', accepted: no names of reflectors"):
+        result.problem.on(named)
+    ro.store.save_result(result, tmp_path / "result.json")
+    assert run(monkeypatch, "export", str(tmp_path), "--mdh", "y.toml", "--out", "x.toml", "--despite-verdict") == 2
+    assert "accepted: --urdf, ...; --mdh and others name their own" in capsys.readouterr().err
 
 
 def test_an_update_says_what_came_out() -> None:
@@ -173,7 +189,7 @@ def test_a_table_of_another_kind_or_with_a_numbered_quaternion_is_refused(tmp_pa
     head = [*(f"J{i} [deg]" for i in range(1, 7)), "X [mm]", "Y [mm]", "Z [mm]", "Q0", "Q1", "Q2", "Q3"]
     path.write_text(",".join(head) + "\n" + ",".join(["1"] * 9 + ["1", "0", "0", "0"]) + "\n")
     with pytest.raises(
-        ro.InputError, match=r"an ambiguous order .* accepted: --quaternion wxyz or xyzw, or names qw, qx"
+        ro.InputError, match=r"an ambiguous order .* accepted: quaternion wxyz or xyzw, or names qw, qx"
     ):
         ro.use.read_measurements(pose.calibrate(weight=1.0), path)
 

@@ -189,7 +189,8 @@ def quantities_of(
         if stem not in known:
             others = {key: dimensions for key, dimensions in known.items() if "cov_" not in key}
             accepted = [each for key, dimensions in others.items() for each in with_unit(key, *dimensions, count=1)]
-            raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]))
+            raw = "; rpim-opt new (ro.store.new_problem) makes such a table of an instrument's or a controller's"
+            raise InputError("the header", f"column '{name}'", choices(name, [*names, *accepted]) + raw)
         if dimension not in known[stem]:
             accepted = ", ".join(with_unit(stem, *known[stem]))
             raise InputError("the header", f"column '{name}' without a unit of the right dimension", accepted)

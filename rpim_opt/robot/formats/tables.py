@@ -23,6 +23,7 @@ from rpim_opt.robot.chain import Chain, RobotSetup, describe, joint_values, stan
 from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
+READY = Path(__file__).resolve().parents[1] / "ready"
 SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")
 """Endings of tables with one row per joint."""
 ENDINGS = (".toml", ".json", *SHEETS)
@@ -149,7 +150,8 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
 def _ending(path: Path) -> str:
     ending = path.suffix.lower()
     if ending not in ENDINGS:
-        raise InputError("the file's name", f"'{path.name}'", "a name ending in " + ", ".join(ENDINGS))
+        accepted = f"a name ending in {', '.join(ENDINGS)}; read_urdf reads .urdf; ready robots are ro.robots()"
+        raise InputError("the file's name", f"'{path.name}'", accepted)
     return ending
 
 
@@ -158,7 +160,7 @@ def _ending(path: Path) -> str:
 
 @of_file
 def read_robot(path: str | Path) -> Robot:
-    """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file.
+    """Return the robot of a ``.toml``, ``.json`` or ``.csv`` file, or a ready one by its name (``ro.robots()``).
 
     TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
     of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``,
@@ -170,7 +172,7 @@ def read_robot(path: str | Path) -> Robot:
     >>> ro.read_robot("robot.toml").mdh[1].round(4).tolist()  # alpha, a, theta, d, beta
     [1.5708, 0.0, 0.0, 0.107, 0.0]
     """
-    path = Path(path)
+    path = next((ready for ready in READY.glob("*.toml") if ready.stem == str(path)), Path(path))
     ending = _ending(path)
     if ending in SHEETS:
         described = read_sheet(path)

@@ -73,11 +73,10 @@ def read_ur_calibration(path: str | Path, nominal: Robot) -> RobotSetup:
     the nearly parallel axes 2, 3 and 4 the file's d are metres to kilometres, theta and a follow; here beta2 and
     beta3 take the tilt and every number is near nominal.
 
-    ``nominal`` is the model, a ready robot such as ``read_robot(find_robot("ur5e"))``.
+    ``nominal`` is the model, a ready robot such as ``read_robot("ur5e")``.
 
     >>> import rpim_opt as ro
-    >>> from rpim_opt.robot.library import find_robot
-    >>> nominal = ro.read_robot(find_robot("ur10"))
+    >>> nominal = ro.read_robot("ur10")
     >>> arm = ro.robot.read_ur_calibration("calibration.conf", nominal)
     >>> (1e3 * (arm.robot.mdh - nominal.mdh)[:, 3]).round(2)  # deviations of d [mm]
     array([ 0.66,  0.  ,  0.  , -0.83, -0.02,  0.02])

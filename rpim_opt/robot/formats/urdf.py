@@ -501,7 +501,7 @@ class _Urdf:
 def _only(links: Sequence[str], where: str, accepted: str, which: str) -> str:
     """Return the only one of links; of several one has to be named."""
     if len(links) > 1:
-        accepted = f"{accepted}: --urdf-{which}, urdf_{which} in problem.toml, or the argument {which}"
+        accepted = f"{accepted}: --urdf-{which}, also a key in problem.toml, or the argument {which}"
         raise InputError(where, ", ".join(links), accepted)
     return links[0]
 
