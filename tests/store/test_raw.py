@@ -86,7 +86,10 @@ def test_a_dry_run_says_every_column_and_writes_nothing(monkeypatch, capsys, tmp
     assert "joint 1" in lines["J1 [deg]"]
     assert "not used" in lines["RMS"]
     assert f"\n{COUNT} rows, measurement position.\n" in said
-    assert f"\nDry run, nothing written: {tmp_path / 'cell'}\nidentification.csv: {COUNT} rows\nMeasurement" in said
+    assert (
+        f"\nDry run, nothing written: {tmp_path / 'cell'}\nidentification.csv: {COUNT} rows\nThe reflector starts"
+        in said
+    )
     assert new(monkeypatch, arm, tmp_path / "cell", path, "--dry-run", "--json") == 0
     content = json.loads(capsys.readouterr().out)
     assert [each["name"] for each in content["columns"][:2]] == ["label", "q1_deg"]
