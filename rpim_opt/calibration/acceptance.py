@@ -31,7 +31,7 @@ from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import Verdict, refuse_misread
 from rpim_opt.calibration.words import VAGUE
 from rpim_opt.data.dataset import Dataset
-from rpim_opt.data.record import Requirement
+from rpim_opt.data.record import HeldOut, Requirement
 from rpim_opt.problem.diagnosis import LEAST_TRAVEL
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.workspace import in_base, markers, within
@@ -402,30 +402,41 @@ def _standing(result: Calibration) -> str:
     return f"Joint{'s' * (len(still) > 1)} {joined(still)} did not move: the verdict holds only at the measured values."
 
 
+def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, HeldOut, list[str], str] | None:
+    """Return held-out rows, their errors, labels that a fit to all rows excluded, and what moved; None without any."""
+    apart, held = result.record.validation if data is None else data, result.record.held_out
+    if apart is not None:
+        held = compared(result, apart)
+        return apart, held, [], "".join(displaced(result, apart, held))
+    if held is None:
+        return None
+    row = {label: row for row, label in enumerate(result.problem.data.label)}
+    apart = result.problem.data.take([row[label] for label in held.label if label in row])
+    return apart, held, excluded_by_fit(result), ""
+
+
+def _of_instrument(data: Dataset, confidence: float) -> Array:
+    """Return what the instrument may add to the errors of rows (N,) [m], with a confidence."""
+    largest = np.zeros(len(data))
+    for block in data.blocks:
+        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
+        if lengths:
+            largest[block.row] = distance_quantile(block.covariance[:, lengths][:, :, lengths], STATED, confidence)
+    return largest
+
+
 def _held_out(
     result: Calibration, region: Region, requirement: Requirement, data: Dataset | None
 ) -> tuple[dict[str, Any] | None, list[str], list[str]]:
     """Return what held-out rows say of a limit: a document [mm] or None, that they miss it, and what is lacking."""
-    apart = result.record.validation if data is None else data
-    held, excluded, moved = result.record.held_out, [], ""
-    if apart is not None:
-        held = compared(result, apart)
-        moved = "".join(displaced(result, apart, held))
-    elif held is not None:
-        excluded = excluded_by_fit(result)
-        known = {label: row for row, label in enumerate(result.problem.data.label)}
-        apart = result.problem.data.take([known[label] for label in held.label if label in known])
-    else:
+    found = _rows_apart(result, data)
+    if found is None:
         return None, [], ["Missing: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
+    apart, held, excluded, moved = found
     kept = ~np.isin(held.label, excluded)
     error, sigmas, allowed = held.error[kept], held.sigmas[kept], held.allowed[kept]
     inside = np.isfinite(error) & region.rows(apart)
-    instrument = np.zeros(len(apart))  # what it may add to an error, with the required confidence
-    for block in apart.blocks:
-        lengths = [i for i, d in enumerate(block.measurement.components.values()) if d == "length"]
-        if lengths:
-            covariance = block.covariance[:, lengths][:, :, lengths]
-            instrument[block.row] = distance_quantile(covariance, STATED, requirement.confidence)
+    instrument = _of_instrument(apart, requirement.confidence)
     missing = [apart.label[i] for i in np.flatnonzero(inside & (error > requirement.limit + instrument))]
     beyond = [apart.label[i] for i in np.flatnonzero(sigmas > allowed)]
     rows, count = len(apart), int(inside.sum())

@@ -266,11 +266,11 @@ def term_motion(term: Term, joint: Joint, value: Callable[[str], Symbol]) -> ca.
     return ca.vec(moves)
 
 
-def _require_still(term: Term, moves: ca.SX, sizes: Sequence[ca.SX]) -> None:
-    """Refuse a term that moves with all its parameters zero, of which ``sizes`` are the symbols."""
-    if not sizes:
+def _require_still(term: Term, moves: ca.SX, symbols: Sequence[ca.SX]) -> None:
+    """Refuse a term that moves with all its parameters zero, of which ``symbols`` are the symbols."""
+    if not symbols:
         return
-    still = ca.substitute(moves, ca.vertcat(*sizes), ca.SX.zeros(len(sizes)))
+    still = ca.substitute(moves, ca.vertcat(*symbols), ca.SX.zeros(len(symbols)))
     seen = ca.symvar(still)
     left = float(ca.norm_inf(ca.Function("still", seen, [still]).call([ca.DM(SOMEWHERE)] * len(seen))[0]))
     if left > ROUNDING:
@@ -411,10 +411,10 @@ def dependencies(model: Model, joint_types: Sequence[str], used: Callable[[str],
             for i in term.places(joint_types):
                 names = term.names(i)
                 if not names or any(map(used, names)):
-                    sizes = dict(zip(names, ca.vertsplit(ca.SX.sym("sizes", len(names))), strict=True))
-                    more = term_motion(term, Joint(i, configuration), sizes.__getitem__)
+                    symbols = dict(zip(names, ca.vertsplit(ca.SX.sym("symbols", len(names))), strict=True))
+                    more = term_motion(term, Joint(i, configuration), symbols.__getitem__)
                     if more is not None:
-                        _require_still(term, more, [*sizes.values()])
+                        _require_still(term, more, [*symbols.values()])
                         moves = ca.vertcat(moves, more)
         return Dependencies(
             torques=ca.depends_on(moves, torque),

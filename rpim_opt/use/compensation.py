@@ -276,38 +276,16 @@ def compensate(
         arm = replace(arm, gravity=arm.gravity.carrying(arm.gravity.payload, list(payload_centre)))
     kind = pose if oriented else position
     cell = _Cell.of(result, robot, arm, kind, tool, marker, base, targets.torque is not None)
-    N = len(targets.label)
-    mass = np.asarray(arm.gravity.payload if payload is None else payload, dtype=float)
-    if payload is not None or payload_centre is not None:
-        if "payload" not in cell.loads.stated:
-            raise InputError("payload", "a payload without effect on the model", WEIGHED)
-        if mass.shape not in ((), (N,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
-            raise InputError("payload", f"{payload}", f"a mass [kg] that is not negative, one or {N}")
-    if "payload" in cell.loads.stated:
-        targets = targets._replace(payload=np.broadcast_to(mass, N))
-
-    def compensated(turning: bool) -> dict[str, Any]:
-        def part(start: int) -> dict[str, Array]:
-            rows = Targets._make(None if each is None else each[start : start + BLOCK] for each in targets)
-            return cell.compensated(rows, largest, turning)
-
-        parts = on_all_cores(part, range(0, N, BLOCK))
-        return {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
-
-    whole = compensated(turning=True)
-    point = cell.point
-    turn, of_turn = (1e3 * np.sqrt(np.mean(whole[f"orientation_{of}"] ** 2)) for of in ("before", "std"))
-    if orientation is None and turn < of_turn < np.inf:
-        whole = compensated(turning=False)
-        point += (
-            f" Orientation is not corrected: the correction, {turn:.2f} mrad, is smaller than its standard "
-            f"uncertainty, {of_turn:.2f} mrad (RMS; --orientation corrects it all the same)."
-        )
+    weighed = payload is not None or payload_centre is not None
+    targets = targets._replace(payload=cell.payloads(payload, len(targets.label), weighed))
+    whole, why = _corrected(cell, targets, largest, orientation)
+    point = cell.point + why
     expanded = EXPANDED * np.nan_to_num(whole["std"], posinf=0.0)
     above = (whole["position_error"] + expanded > limit) & (whole["status"] != UNREACHABLE)
-    outside = result.outside(Dataset.of_robots({robot: Dataset.of(whole["q"], np.zeros((N, 3)), 1.0)}))
+    reached = Dataset.of(whole["q"], np.zeros((len(expanded), 3)), 1.0)
+    outside = result.outside(Dataset.of_robots({robot: reached}))
     status = np.where(above, ABOVE, whole["status"])
-    status[np.isin(np.arange(N), outside.rows) & (status == "ok")] = "extrapolated"
+    status[np.isin(np.arange(len(status)), outside.rows) & (status == "ok")] = "extrapolated"
     whole["status"] = tuple(status.tolist())
     if targets.q is None:
         point += (
@@ -323,6 +301,30 @@ def compensate(
     # the reflector that the stated tool took the place of
     reflector = _Cell.of(result, robot, arm, kind, None, cell.marker, base, targets.torque is not None)
     return replace(found, point=point + _less_known(found, targets, reflector))
+
+
+def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
+    """Return what `_Cell.compensated` does for all rows, and why orientations are not corrected, where they are not.
+
+    They are corrected first: only that tells by how much, and how well they are known where the commands end.
+    """
+
+    def compensated(turning: bool) -> dict[str, Any]:
+        def part(start: int) -> dict[str, Array]:
+            rows = Targets._make(None if each is None else each[start : start + BLOCK] for each in targets)
+            return cell.compensated(rows, largest, turning)
+
+        parts = on_all_cores(part, range(0, len(targets.label), BLOCK))
+        return {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
+
+    whole = compensated(turning=True)
+    turn, of_turn = (1e3 * np.sqrt(np.mean(whole[f"orientation_{of}"] ** 2)) for of in ("before", "std"))
+    if orientation is not None or not turn < of_turn < np.inf:
+        return whole, ""
+    return compensated(turning=False), (
+        f" Orientation is not corrected: the correction, {turn:.2f} mrad, is smaller than its standard uncertainty, "
+        f"{of_turn:.2f} mrad (RMS; --orientation corrects it all the same)."
+    )
 
 
 def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
@@ -477,6 +479,17 @@ class _Cell(NamedTuple):
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
             covariance, marker, noise, result.variance_factor, point,
         )  # fmt: skip
+
+    def payloads(self, stated: float | Array | None, count: int, weighed: bool) -> Array | None:
+        """Return the masses (N,) [kg] of N commands, None without effect, which is refused where one is ``weighed``."""
+        if "payload" not in self.loads.stated:
+            if weighed:
+                raise InputError("payload", "a payload without effect on the model", WEIGHED)
+            return None
+        mass = np.asarray(self.robot.gravity.payload if stated is None else stated, dtype=float)
+        if mass.shape not in ((), (count,)) or not (mass >= 0).all() or not np.isfinite(mass).all():
+            raise InputError("payload", f"{stated}", f"a mass [kg] that is not negative, one or {count}")
+        return np.broadcast_to(mass, count)
 
     def compensated(self, targets: Targets, largest: float, turning: bool) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some targets; ``turning`` corrects orientations, too."""

@@ -293,10 +293,10 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     for curve in curves:
         rows = np.column_stack([np.degrees(curve.q), 1e3 * curve.error, 1e3 * curve.standard])[curve.inside]
         lines += [f"{curve.joint},{angle:.4f},{value:.5f},{of_value:.5f}" for angle, value, of_value in rows]
-    sizes = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
+    errors = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
     write_text(target, "\n".join(lines) + "\n")
     return [
-        f"Transmission errors (RMS, mrad): {joined(sizes)}. Angles are as the controller counts them, within the "
+        f"Transmission errors (RMS, mrad): {joined(errors)}. Angles are as the controller counts them, within the "
         "measured ranges; std_mrad is the standard uncertainty (k = 1). A joint stands at angle_deg plus the "
         "correction: subtract it from a command. The corrections belong to the geometry of the whole model "
         "(`compensate` uses both), not to that of other exported files."

@@ -450,6 +450,15 @@ def test_a_damped_program_that_no_solver_solves_is_damped_more() -> None:
     assert "diverge without a penalty; add one" in result.message
 
 
+def test_a_fit_that_leads_on_and_on_is_given_up() -> None:
+    """After 200 iterations beyond a thousand prior standard deviations, not after the 500 that are allowed."""
+    norms = ro.Formulation("sum of norms", loss=cp.sum, loss_over="configuration")
+    result = ro.calibrate(ro.load("paper_arm").problem, norms, 0.0)
+    assert not result.converged
+    assert "deviations exceed 1000 prior standard deviations" in result.message
+    assert 100 < len(result.history) <= 200
+
+
 def test_a_penalty_that_leaves_redundant_parameters_out_is_the_cause_of_their_deviations() -> None:
     """And not the table, which would be searched for a mistake in vain."""
     offsets = ro.Formulation("joint offsets", penalty=lambda z: cp.sum_squares(z["theta?"]))

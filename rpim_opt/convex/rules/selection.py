@@ -168,9 +168,9 @@ def require_weight(weight: float, where: str, file: object = None) -> float:
 def weight_grid(program: Program, count: int = 200) -> Array:
     """Return a geometric grid of weights that covers all changes of the estimate.
 
-    With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a penalty with
-    kinks (lasso) leaves nothing to identify from its own largest weight on, which ends the grid. Where an
-    interior point solves it begins at eps s_1^2 at least: smaller weights are rounding beside the squares.
+    With a squared penalty from 1e-4 s_r^2 to 10 s_1^2, s the singular values of A that are not zero; a nonsmooth
+    penalty (lasso) leaves nothing to identify from its own largest weight on, which ends the grid. Where an interior
+    point solves, the grid begins at eps s_1^2 at least: smaller weights are rounding beside the squares.
     """
     if program.formulation.penalty is None:
         raise InputError("weight", "a selector for a formulation without penalty", "weight 0")

@@ -10,7 +10,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
@@ -349,6 +351,105 @@ def _plainer(
     return both[as_well, :n], Fit(*(each[as_well] for each in tried))
 
 
+class _SameRobot(NamedTuple):
+    """Mappings that predict the same elsewhere, the best first: their prediction, and the plainest of them."""
+
+    members: list[int]
+    prediction: Array
+    plainest: int
+
+
+@dataclass(frozen=True, eq=False)
+class _Mappings:
+    """Mappings that explain points: signs (B, dof) and fits, those from ``given`` on added by `_plainer`."""
+
+    points: Points
+    sign: Array
+    fits: Fit
+    given: int
+
+    @cached_property
+    def zeros(self) -> list[Array]:
+        """Zeros (dof,) that base and tool do not take up."""
+        return [_gauged(self.points.robot, zero) for zero in self.fits.zero]
+
+    @cached_property
+    def moved(self) -> Array:
+        """How far a reflector is from its stated place (B,) [m]."""
+        return np.linalg.norm(self.fits.tools - Candidates.of([self.points]).stated, axis=-1).max(axis=-1)
+
+    def plain(self, i: int) -> tuple[int, int, int, float, tuple[float, ...]]:
+        """How far one is from that stated: joints that change, reflectors, reversed joints, zeros, then signs."""
+        reverse, zero = self.sign[i] < 0, np.abs(self.zeros[i])
+        changed = int((reverse | (zero > NEAR_ZERO)).sum())
+        size = round(float(zero.sum()), 2)
+        return changed, int(self.moved[i] / SAME_TOOL), int(reverse.sum()), size, tuple(self.sign[i].tolist())
+
+    def predicted(self, i: int, q: Array) -> Array:
+        """Return the reflectors' places at q (N, dof), of lengths about their mean."""
+        T = self.fits.base[i] @ forward_kinematics(mapped(self.points.robot, self.sign[i], self.fits.zero[i]), q)
+        there = transformed(T[:, None], self.fits.tools[i])
+        return there - there.mean(axis=(0, 1)) if self.points.lengths else there
+
+    def robots(self, near: Sequence[int], q: Array, same: float) -> list[_SameRobot]:
+        """Return mappings by what they predict at q (N, dof), to ``same`` [m].
+
+        A given one belongs to the first whose best predicts what it does. A plainer one belongs to all of which some
+        mapping predicts the same, or has its signs and zeros near its own: these are one robot then.
+        """
+        there = {i: self.predicted(i, q) for i in near}
+
+        def alike(i: int, other: int) -> bool:
+            return _apart(there[i], there[other], self.points.lengths) <= same
+
+        def near_zeros(i: int, other: int) -> bool:
+            turns = np.angle(np.exp(1j * (self.zeros[other] - self.zeros[i])))
+            return bool((np.abs(turns) < NEAR_ZERO).all() and (self.sign[other] == self.sign[i]).all())
+
+        groups: list[list[int]] = []
+        for i in near:
+            if i < self.given:
+                of = [group for group in groups if alike(i, group[0])][:1]
+            else:
+                of = [group for group in groups if any(near_zeros(i, j) or alike(i, j) for j in group)]
+            whole = [*(j for group in of for j in group), i]
+            place = next((k for k, group in enumerate(groups) if group in of), len(groups))
+            groups = [*groups[:place], whole, *(group for group in groups[place:] if group not in of)]
+        return [_SameRobot(group, there[group[0]], min(group, key=self.plain)) for group in groups]
+
+    def same(self, robot: _SameRobot) -> tuple[Alternative, ...]:
+        """Return other descriptions of a robot that change as few joints as its plainest."""
+        first, types = robot.plainest, self.points.robot.joint_types
+        also = {described(types, self.sign[first], self.zeros[first]): first}
+        for k in sorted(robot.members, key=self.plain):
+            if self.plain(k)[0] == self.plain(first)[0]:
+                also.setdefault(described(types, self.sign[k], self.zeros[k]), k)
+        none = np.zeros(len(types))
+        others = [k for k in also.values() if k != first]
+        return tuple(Alternative(self.sign[k], self.zeros[k], 0.0, none, moved=float(self.moved[k])) for k in others)
+
+
+def _likely(points: Points, fits: Fit) -> tuple[list[int], np.ndarray]:
+    """Return the fits within `ODDS` of chi-squared, the best first, and which errors (E,) of the best are inliers."""
+    best = int(np.argmin(rms(fits)))
+    inliers = fits.error[best] <= GROSS * np.median(fits.error[best])
+    equations = (1 if points.lengths else 3) * int(inliers.sum())
+    free = max(equations - max(points.robot.dof - 2, 0) - fits.tools[0].size - len(FRAME), 1)
+    cost = (fits.error[:, inliers] ** 2).sum(axis=1)
+    chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
+    return [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS], inliers
+
+
+def _elsewhere(points: Points, rng: np.random.Generator) -> Array:
+    """Return configurations (N, dof) within the joint limits and wherever joints were measured."""
+    measured = points.q.reshape(-1, points.robot.dof)
+    low, high = measured.min(axis=0), measured.max(axis=0)
+    ends = np.where(_turning(points.robot), [[-np.pi], [np.pi]], [low, high])
+    limits = points.robot.limits.T
+    ends = np.where(np.isfinite(limits), limits, ends)
+    return rng.uniform(np.minimum(ends[0], low), np.maximum(ends[1], high), (COMPARED, points.robot.dof))
+
+
 def _judged(
     points: Points,
     problem: CalibrationProblem | None,
@@ -359,90 +460,48 @@ def _judged(
     rng: np.random.Generator,
 ) -> JointMapping | None:
     """Return the plainest mapping of the best robot class, and others that fit as well; the first fit is nominal."""
-    robot = points.robot
     left = rms(fits)
-    least = left.min()
+    least = float(left.min())
     if not least <= ACCEPTED * points.extent or (small and EXPLAINED * least >= left[0]):
         return None
-    best = int(np.argmin(left))
-    inliers = fits.error[best] <= GROSS * np.median(fits.error[best])
-    equations = (1 if points.lengths else 3) * int(inliers.sum())
-    free = max(equations - max(robot.dof - 2, 0) - fits.tools[0].size - 6, 1)
-    cost = (fits.error[:, inliers] ** 2).sum(axis=1)
-    chi2 = cost / max(cost[best] / free, LEAST_NOISE**2)
-    near = [int(i) for i in np.argsort(chi2) if chi2[i] < chi2.min() + ODDS]
+    near, inliers = _likely(points, fits)
     given = len(sign)
     if problem is not None and not points.seen:
-        plainer = _plainer(points, problem, sign[near], Fit(*(each[near] for each in fits)), inliers)
-        near += range(given, given + len(plainer[0]))
-        sign, fits = np.vstack([sign, plainer[0]]), stacked([fits, plainer[1]])
-        left = rms(fits)
-    measured = points.q.reshape(-1, robot.dof)
-    measured_ends = np.stack([measured.min(axis=0), measured.max(axis=0)])
-    ends = np.where(_turning(robot), [[-np.pi], [np.pi]], measured_ends)
-    ends = np.where(np.isfinite(robot.limits.T), robot.limits.T, ends)
-    low, high = np.minimum(ends[0], measured_ends[0]), np.maximum(ends[1], measured_ends[1])
-    elsewhere = rng.uniform(low, high, (COMPARED, robot.dof))
-    zeros = [_gauged(robot, zero) for zero in fits.zero]
-    moved = np.linalg.norm(fits.tools - Candidates.of([points]).stated, axis=-1).max(axis=-1)  # of reflectors
-    plain = [_plain(*each) for each in zip(sign, zeros, moved, strict=True)]
-    same = 0.5 * max(least, LEAST_NOISE)
-    there: dict[int, Array] = {}
-    for i in near:
-        T = fits.base[i] @ forward_kinematics(mapped(robot, sign[i], fits.zero[i]), elsewhere)
-        there[i] = transformed(T[:, None], fits.tools[i])
-        if points.lengths:
-            there[i] -= there[i].mean(axis=(0, 1))
+        plainer, more = _plainer(points, problem, sign[near], Fit(*(each[near] for each in fits)), inliers)
+        near += range(given, given + len(plainer))
+        sign, fits = np.vstack([sign, plainer]), stacked([fits, more])
+    found, elsewhere, same = (
+        _Mappings(points, sign, fits, given),
+        _elsewhere(points, rng),
+        0.5 * max(least, LEAST_NOISE),
+    )
+    robots = sorted(found.robots(near, elsewhere, same), key=lambda each: found.plain(each.plainest))
+    best = next(each for each in robots if near[0] in each.members)
 
-    def is_of(i: int, group: list[int]) -> bool:
-        """Whether a fit predicts what a group's first does; a plainer one what any does, or with zeros near its own."""
-        if i < given:
-            return _apart(there[i], there[group[0]], points.lengths) <= same
-        turns = np.abs(np.angle(np.exp(1j * (np.array([zeros[j] for j in group]) - zeros[i])))).max(axis=1)
-        if ((turns < NEAR_ZERO) & (sign[group] == sign[i]).all(axis=1)).any():
-            return True
-        return any(_apart(there[i], there[j], points.lengths) <= same for j in group)
+    def mirrors(one: _SameRobot, other: _SameRobot) -> bool:
+        return points.lengths and _apart(-one.prediction, other.prediction, True) <= same
 
-    alike: list[list[int]] = []  # fits that predict the same elsewhere, the best first
-    for i in near:
-        groups = [each for each in alike if is_of(i, each)][: 1 if i < given else None]
-        if groups:
-            groups[0][:] = [*(j for each in groups for j in each), i]
-            alike = [each for each in alike if each not in groups[1:]]
-        else:
-            alike.append([i])
-    predictions = [there[each[0]] for each in alike]
-    plainest = [min(each, key=plain.__getitem__) for each in alike]
-
-    def mirrors(first: int) -> list[bool]:
-        return [points.lengths and bool(_apart(-there, predictions[first], True) <= same) for there in predictions]
-
-    as_good = [0, *np.flatnonzero(mirrors(0)).tolist(), *(k for k, each in enumerate(alike) if max(each) >= given)]
-    first = min(as_good, key=lambda k: plain[plainest[k]])
-    if not plain[plainest[first]][0]:
+    # robots that a plainer mapping describes, and mirror images, are as good as the best
+    first = next(each for each in robots if each is best or mirrors(each, best) or max(each.members) >= given)
+    changes = found.plain(first.plainest)[0]
+    if not changes:
         return None
-    mirror = mirrors(first)
     others = []
-    for k in sorted(range(len(plainest)), key=lambda k: plain[plainest[k]]):
-        i = plainest[k]
-        if k != first:
-            far = np.linalg.norm(predictions[k] - predictions[first], axis=-1).max(axis=-1)
-            deciding = elsewhere[int(np.argmax(far))]
-            apart = _apart(predictions[k], predictions[first], points.lengths)
-            others.append(Alternative(sign[i], zeros[i], apart, deciding, mirror[k]))
+    for each in robots:
+        if each is not first:
+            far = np.linalg.norm(each.prediction - first.prediction, axis=-1).max(axis=-1)
+            apart = _apart(each.prediction, first.prediction, points.lengths)
+            of = found.sign[each.plainest], found.zeros[each.plainest]
+            others.append(Alternative(*of, apart, elsewhere[int(np.argmax(far))], mirrors(each, first)))
+    i = first.plainest
     nominal = float(rms(fit_arms(Candidates.of([points]), SHORT, robust=True))[0])
-    i = plainest[first]
-    behind = _behind_a_mirror(points, MIRRORED * left[i])
-    if plain[i][0] < 2:  # fewer changes than a mirror and a joint
+    left = float(rms(fits)[i])
+    behind = _behind_a_mirror(points, MIRRORED * left)
+    if changes < 2:  # fewer changes than a mirror and a joint
         behind = [name for name in behind if name == AS_STATED]
-    again: dict[str, Alternative] = {}
-    for k in sorted(alike[first], key=plain.__getitem__):
-        if plain[k][0] == plain[i][0]:
-            also = Alternative(sign[k], zeros[k], 0.0, np.zeros(robot.dof), moved=float(moved[k]))
-            again.setdefault(described(robot.joint_types, sign[k], zeros[k]), also)
     return JointMapping(
-        robot.joint_types, sign[i], zeros[i], nominal, float(left[i]), starts, tuple(others),
-        mirrored=AS_STATED in behind, behind=" or ".join(behind), same=tuple(again.values())[1:], moved=float(moved[i]),
+        points.robot.joint_types, sign[i], found.zeros[i], nominal, left, starts, tuple(others),
+        mirrored=AS_STATED in behind, behind=" or ".join(behind), same=found.same(first), moved=float(found.moved[i]),
     )  # fmt: skip
 
 
@@ -477,11 +536,3 @@ def _gauged(robot: Robot, zero: Array) -> Array:
     quarter = QUARTER * np.round(zero / QUARTER)
     quarter = np.where(quarter < -1.5 * QUARTER, np.pi, quarter)  # half a turn either way
     return np.where(turning & (np.abs(np.angle(np.exp(1j * (zero - quarter)))) < np.radians(2)), quarter, zero)
-
-
-def _plain(sign: Array, zero: Array, moved: float) -> tuple[int, int, int, float, tuple[float, ...]]:
-    """How far a mapping is from the stated one: joints that change, reflectors, reversed joints, zeros, then signs."""
-    reverse = sign < 0
-    changed = int((reverse | (np.abs(zero) > NEAR_ZERO)).sum())
-    size = round(float(np.abs(zero).sum()), 2)
-    return changed, int(moved / SAME_TOOL), int(reverse.sum()), size, tuple(sign.tolist())
