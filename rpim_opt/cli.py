@@ -487,13 +487,10 @@ def update(
     """
     with _loaded(result) as (loaded, say):
         read = ro.use.read_measurements(loaded, data, measurement, tables.options)
+        named = source or ", ".join(file.name for file in data)
+        released = reset.replace(",", " ").split()
         recalibration = ro.use.update(
-            loaded,
-            read.data,
-            prior_inflation=prior_inflation,
-            reset=reset.replace(",", " ").split(),
-            source=source or ", ".join(file.name for file in data),
-            progress=say,
+            loaded, read.data, prior_inflation=prior_inflation, reset=released, source=named, progress=say
         )
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))

@@ -76,11 +76,7 @@ ENVIRONMENT.filters["coded"] = coded
 
 
 def render(
-    title: str,
-    kind: str,
-    heading: str,
-    top: Iterable[Block],
-    sections: Iterable[tuple[str, Iterable[Block]]],
+    title: str, kind: str, heading: str, top: Iterable[Block], sections: Iterable[tuple[str, Iterable[Block]]]
 ) -> str:
     """Return a page as HTML, with escaped texts, inline style and pictures, without scripts or external resources."""
     style = (TEMPLATES / "page.css").read_text(encoding="utf-8")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -15,14 +15,7 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined
-from rpim_opt.robot.kinematics import (
-    FRAME,
-    forward_kinematics,
-    frame,
-    frame_numbers,
-    numeric_frame,
-    numeric_link,
-)
+from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame, frame_numbers, numeric_frame, numeric_link
 from rpim_opt.robot.mdh import MDH, Robot
 from rpim_opt.robot.terms import Joint, Symbol, Term
 
@@ -45,8 +38,8 @@ class RobotSetup:
     """A robot with its base and tool frames; the tip of a file is at base @ MDH chain(q) @ tool."""
 
     robot: Robot
-    base: Array  # (6,) x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx, as `model_parameters` takes them
-    tool: Array  # (6,)
+    base: Array = field(default_factory=partial(np.zeros, 6))  # x, y, z [m], roll, pitch, yaw [rad], R = Rz Ry Rx
+    tool: Array = field(default_factory=partial(np.zeros, 6))
     names: tuple[str, ...] = ()  # the file's, of the joints
 
 

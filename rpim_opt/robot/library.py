@@ -5,8 +5,6 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-import numpy as np
-
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.files import inside, require_file
 from rpim_opt.robot.chain import RobotSetup
@@ -66,10 +64,9 @@ def read_arm(
 
         return read_ur_kinematics(file)
     if convention:
-        raise InputError(
-            "--dh", f"'{convention}' of {file.name}", "a table of numbers; other files state their convention"
-        )
-    return RobotSetup(read_robot(file), np.zeros(6), np.zeros(6))
+        accepted = "a table of numbers; other files state their convention"
+        raise InputError("--dh", f"'{convention}' of {file.name}", accepted)
+    return RobotSetup(read_robot(file))
 
 
 def find_source(robot: str | Path) -> Path:

@@ -56,9 +56,8 @@ class Gravity:
         object.__setattr__(self, "payload", _mass(self.payload, "payload"))
         object.__setattr__(self, "payload_centre", _vector(self.payload_centre, "centre of the payload"))
         if len(self.centres) != len(self.masses):
-            raise InputError(
-                "gravity", f"{len(self.masses)} masses, {len(self.centres)} centres", "one centre per mass"
-            )
+            found = f"{len(self.masses)} masses, {len(self.centres)} centres"
+            raise InputError("gravity", found, "one centre per mass")
 
     def mounted(self, mounting: str | Sequence[float], base: ArrayLike | None = None) -> Gravity:
         """Return the same masses on a robot mounted on "floor", "ceiling" or "wall", or with a gravity direction (3,).

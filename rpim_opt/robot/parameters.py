@@ -291,6 +291,10 @@ class Parameters(Tabled):
         result[self.identified] = self.free.values(x)
         return result
 
+    def by_name(self, x: Array) -> dict[str, float]:
+        """Return `values_at` by the parameters' names."""
+        return dict(zip(self.names, self.values_at(x).tolist(), strict=True))
+
     def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:
         """Return the same table with other scales, given as in a problem file's ``[scale]``.
 

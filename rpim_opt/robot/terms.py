@@ -178,9 +178,8 @@ class Term:
                 accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx of frames"
                 raise InputError(where, "a reserved name", accepted)
             if self.at in ENDS and "{}" in entry.name:
-                raise InputError(
-                    where, "a placeholder for the joint's number", f"none: the {self.at} has one parameter"
-                )
+                accepted = f"none: the {self.at} has one parameter"
+                raise InputError(where, "a placeholder for the joint's number", accepted)
             if not entry.scale >= SMALLEST:
                 raise InputError(where, f"a scale of {entry.scale:g}", "a number greater than zero")
         if len({entry.name for entry in self.entries}) < len(self.entries):

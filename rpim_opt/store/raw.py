@@ -96,11 +96,7 @@ def usual_noise(kind: Measurement) -> dict[str, float]:
 
 
 def rows_of(
-    found: Understanding,
-    columns: Columns,
-    arm: RobotSetup,
-    kind: Measurement,
-    noise: Mapping[str, float] | None = None,
+    found: Understanding, columns: Columns, arm: RobotSetup, kind: Measurement, noise: Mapping[str, float] | None = None
 ) -> Dataset:
     """Return the measurements of interpreted columns; errors use the file's column names."""
     try:

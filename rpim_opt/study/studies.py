@@ -284,9 +284,9 @@ def run_cases(
     work: Callable[[Mapping[str, Any]], Work],
     workers: int,
     progress: Progress,
-    journal: Path | None = None,
-    code: Mapping[str, str] | None = None,
-    resume: bool | None = True,
+    journal: Path | None,
+    code: Mapping[str, str],
+    resume: bool | None,
 ) -> list[Row]:
     """Return every case with its figures, in the order of the cases.
 
@@ -294,7 +294,6 @@ def run_cases(
     from. Those of an interrupted run are resumed (true), dropped (false), or refused (None), as those of other code.
     """
     keyed = [(json.dumps(case, sort_keys=True), case) for case in cases]
-    code = code or {}
     stored = {} if journal is None or resume is False else _resumed(journal, code, resume)
     done = {key: stored[key] for key, _ in keyed if key in stored}
     if journal is not None:  # anew: without a line that was not finished

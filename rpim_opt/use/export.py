@@ -97,10 +97,10 @@ def beyond_geometry(result: Calibration, robot: str) -> dict[str, float]:
     terms of a user's own; and origins, which only a URDF holds.
     """
     p, arm = result.problem.parameters, result.robots[robot]
-    values = p.values_at(result.x)
+    values = p.by_name(result.x)
     held = [p.called(robot, f"ratio{i + 1}") for i in range(len(arm.joint_map)) if i not in arm.leading]
     terms = {name for name in p.names if of_term(name) or name in p.terms}.difference(held)
-    return {p.names[i]: float(values[i]) for i in p.places_of(robot) if p.names[i] in terms}
+    return {name: values[name] for name in np.array(p.names)[p.places_of(robot)].tolist() if name in terms}
 
 
 def export_files(
@@ -248,10 +248,9 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         try:
             alone = result.calibrate_again(stated, model="geometry")
         except (InputError, ValueError) as error:  # of functions of a user's own
+            where = f"formulation '{result.formulation.name}'"
             found = f"no fit without {listed(lost, 6)}, which files cannot hold: {str(error).rstrip('.')}"
-            raise InputError(
-                f"formulation '{result.formulation.name}'", found, "functions that need none of it"
-            ) from error
+            raise InputError(where, found, "functions that need none of it") from error
         if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.learned.left_out:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
@@ -469,7 +468,7 @@ def export_camera(result: Calibration, source: str | Path, target: str | Path) -
     cameras = {name.rpartition("_")[0] for name in p.names if own_name(name).startswith("camera_")}
     if len(cameras) != 1:
         raise InputError("the calibration", counted(len(cameras), "camera"), "one camera")
-    values = dict(zip(p.names, p.values_at(result.x).tolist(), strict=True))
+    values = p.by_name(result.x)
     fx, fy, cx, cy, *distortion = (values[f"{min(cameras)}_{name}"] for name in INTRINSICS)
     text = read_bytes(path).decode()
     before = _yaml_list(text, "camera_matrix", (3, 3), path)[0]

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, in_file
+from rpim_opt.basics.exceptions import InputError, of_file
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
 from rpim_opt.basics.text import Tabled, counted, listed, table
 from rpim_opt.basics.units import FOREIGN, LARGEST, UNITS, dimension_of, parse_units, split
@@ -177,6 +177,7 @@ def _rows(values: Array, N: int, what: str) -> Array:
     return array
 
 
+@of_file
 def read_approaches(source: Any, units: str = "") -> Performance:
     """Return pose accuracy and repeatability of a table of repeated approaches (`iso9283`).
 
@@ -192,13 +193,8 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     >>> round(1e3 * found.accuracy, 3), round(1e3 * found.repeatability, 3)
     (2.0, 1.0)
     """
-    with in_file(source):
-        columns = read_raw(Path(source)).columns if isinstance(source, str | Path) else read_columns(source)
-        return _performance(columns, parse_units(units))
-
-
-def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str]) -> Performance:
-    """Return the performance of a table whose columns are recognized by their names."""
+    columns = read_raw(Path(source)).columns if isinstance(source, str | Path) else read_columns(source)
+    stated = parse_units(units)
     poses: dict[str, str] = {}
     figures: dict[str, dict[str, tuple[str, float]]] = {"measured": {}, "wanted": {}}
     for name in columns:
@@ -211,7 +207,7 @@ def _performance(columns: Mapping[str, Sequence[Any]], units: Mapping[str, str])
             if meaning.stem in of:
                 raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
             dimension = "length" if meaning.stem in AXES else "angle"
-            unit = unit or units.get(dimension, "")
+            unit = unit or stated.get(dimension, "")
             if not unit or dimension_of(unit) != dimension:
                 found = f"column '{name}' without a unit of {dimension}"
                 raise InputError("the header", found, "x_mm, or --units deg,mm")

@@ -129,27 +129,23 @@ def read_measurements(
         raise InputError("measurement", "several", choices("", types))
     calibrated = pick(types, measurement or next(iter(types)), "measurement")
     understanding = _understood(result, source, calibrated, options or TableOptions())
-    kind = _measured_in(understanding, calibrated)
     columns = understanding.columns
+    stems = {split_unit(name)[0] for name in columns}
+    kind = calibrated
+    if not any(stems >= set(form) for form in (kind.columns, *(form for form, _ in kind.forms))):
+        # a part of what was calibrated: poses may be validated by positions
+        kind = next((part for part in kind.parts if stems >= set(part.columns)), kind)
     board = board_of(result.problem.sample().data)
     if kind.by_camera and board and not any(column.startswith("target_") for column in columns):
         columns = on_board(columns, board)
     noise = _typical_noise([block for block in blocks if block.measurement is calibrated], kind)
-    data = rows_of(understanding, columns, RobotSetup(robot, np.zeros(6), np.zeros(6)), kind, noise)
+    data = rows_of(understanding, columns, RobotSetup(robot), kind, noise)
     name = time_column(understanding.raw)
     clock = None if name is None else (name, tuple(str(cell) for cell in understanding.raw[name]))
     left_out = tuple(column for column in understanding.left_out if column.lower() != name)
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
     return Measured(data, left_out, (*notes, *understanding.notes), clock)
-
-
-def _measured_in(understanding: Understanding, calibrated: Measurement) -> Measurement:
-    """Return the type that columns show: the calibrated one, or a part: poses may be validated by positions."""
-    stems = {split_unit(name)[0] for name in understanding.columns}
-    if any(stems >= set(form) for form in (calibrated.columns, *(form for form, _ in calibrated.forms))):
-        return calibrated
-    return next((part for part in calibrated.parts if stems >= set(part.columns)), calibrated)
 
 
 def _typical_noise(blocks: Sequence[Block], kind: Measurement) -> dict[str, float]:
@@ -169,7 +165,7 @@ def _understood(
     if not all(Path(str(each)).suffix.lower() in EXCEL for each in sources):
         reading.pop("sheet", None)
     options = TableOptions.stated({**reading, **stated.texts()})
-    arm = RobotSetup(result.problem.robot, np.zeros(6), np.zeros(6), options.joints)
+    arm = RobotSetup(result.problem.robot, names=options.joints)
     try:
         return understand_of(arm, sources, kind, options, targets)
     except InputError:

@@ -220,11 +220,11 @@ def update(
     # a frame that was reset may be anywhere: then it is registered anew
     start = None if released else previous_deviations(result, problem)
     changes: list[Cause] = []
-    weighings: list[tuple[tuple[Cause, ...], Fit]] = []
+    first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released
     while True:
         updated = _recalibrated(result, problem, released, prior_inflation, start)
         causes, after = _weighed(result, updated, released)
-        weighings.append((causes, after))
+        first = first or (causes, after)
         # the most probable of the causes that chance does not explain
         cause = next((cause for cause in causes if cause.p_value * len(causes) < FALSE_ALARM), None)
         if cause is None:
@@ -239,7 +239,6 @@ def update(
         else:
             released += cause.members
         start = updated.x
-    first, before = weighings[0]
     robots = " and ".join(robot.name for robot in result.problem.arms.values())
     if not after.likely:
         # another unit or order explains them, or they are further off than the robot ever was uncalibrated
@@ -263,16 +262,9 @@ def update(
         excluded=excluded, simulated=record.simulated, noise_assumed=record.noise_assumed,
         requirement=record.requirement, earlier=(*record.earlier, last), reading=record.reading, terms=record.terms,
     )  # fmt: skip
-    return Update(
-        replace(updated, record=record),
-        before,
-        after,
-        tuple(changes),
-        first,
-        _moved(result, updated, released, changes),
-        len(data),
-        elsewhere,
-    )
+    updated = replace(updated, record=record)
+    moved = _moved(result, updated, released, changes)
+    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), elsewhere)
 
 
 def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:
@@ -282,7 +274,8 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     if not base or not displaced(result, problem.data, compared(result, problem.data))[0]:
         return ""
     registered = _recalibrated(result, problem, base, inflation, None)
-    was, now = (np.array([_values(each)[BASE + axis] for axis in FRAME]) for each in (result, registered))
+    values = [each.problem.parameters.by_name(each.x) for each in (result, registered)]
+    was, now = (np.array([of[BASE + axis] for axis in FRAME]) for of in values)
     if same_place(was, now):
         return ""
     return (
@@ -332,7 +325,8 @@ def _moved(
     free = updated.problem.parameters.free
     changed = [name for cause in changes if cause.kind != "reading" for name in cause.members]
     reset = [name for name in released if name not in changed]
-    was, now = _values(result), _values(updated)
+    # deviations of a frame registered again refer to another orientation: values do not
+    was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
     moved = []
     for name in [name for name in reset if name in result.problem.parameters.free.names]:
         i = free.names.index(name)
@@ -358,12 +352,6 @@ def penalty_of(formulation: Formulation, n: int) -> Quadratic:
     """Return the quadratic form of n deviations that a formulation penalizes."""
     form: Quadratic | None = getattr(formulation.penalty, "quadratic", None)
     return form or identity(n)
-
-
-def _values(result: Calibration) -> dict[str, float]:
-    """Return all parameters' values [SI]; deviations of a frame registered again refer to another orientation."""
-    p = result.problem.parameters
-    return dict(zip(p.names, p.values_at(result.x).tolist(), strict=True))
 
 
 # --- the previous result as a prior ------------------------------------------------------------------------

@@ -224,7 +224,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]
     robot = _robot({"name": path.stem, "joint": joints}, path)
     if known == {"modified"}:
-        return RobotSetup(robot, np.zeros(6), np.zeros(6))
+        return RobotSetup(robot)
     if robot.gravity.masses:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
     return _from_standard(robot)
