@@ -169,13 +169,13 @@ class Compensation:
 
     def content(self) -> dict[str, Any]:
         """Return the errors [mm, mrad], and a row for every target as in `csv`."""
-        of = {
-            "nominal": (self.position_before, self.orientation_before),
-            "corrected": (self.position_error, self.orientation_error),
-        }
-        errors = {k: {"position": statistics(p), "orientation": statistics(o, "mrad")} for k, (p, o) in of.items()}
+
+        def errors(position: Array, orientation: Array) -> dict[str, Any]:
+            return {"position": statistics(position), "orientation": statistics(orientation, "mrad")}
+
         return {
-            **errors,
+            "nominal": errors(self.position_before, self.orientation_before),
+            "corrected": errors(self.position_error, self.orientation_error),
             "largest_corrections": self._largest_corrections(),
             "missed": self.missed,
             "outside": [self.label[i] for i in self.outside.rows],
@@ -304,34 +304,30 @@ def compensate(
 
 
 def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool | None) -> tuple[dict[str, Any], str]:
-    """Return what `_Cell.compensated` does for all rows, and why orientations are not corrected, where they are not.
+    """Return the fields of all rows, and why orientations are not corrected, where they are not."""
 
-    They are corrected first: only that tells by how much, and how well they are known where the commands end.
-    """
+    def begun(start: int) -> _Begun:
+        return cell.begun(Targets._make(None if each is None else each[start : start + BLOCK] for each in targets))
 
-    def compensated(turning: bool) -> dict[str, Any]:
-        def part(start: int) -> dict[str, Array]:
-            rows = Targets._make(None if each is None else each[start : start + BLOCK] for each in targets)
-            return cell.compensated(rows, largest, turning)
-
-        parts = on_all_cores(part, range(0, len(targets.label), BLOCK))
-        return {name: np.concatenate([each[name] for each in parts]) for name in parts[0]}
-
-    whole = compensated(turning=True)
-    turn, of_turn = (1e3 * np.sqrt(np.mean(whole[f"orientation_{of}"] ** 2)) for of in ("before", "std"))
-    if orientation is not None or not turn < of_turn < np.inf:
-        return whole, ""
-    return compensated(turning=False), (
-        f" Orientation is not corrected: the correction, {turn:.2f} mrad, is smaller than its standard uncertainty, "
-        f"{of_turn:.2f} mrad (RMS; --orientation corrects it all the same)."
-    )
+    parts = on_all_cores(begun, range(0, len(targets.label), BLOCK))
+    why = ""
+    if orientation is None and cell.kind is pose:
+        turns = [(cell.norms(each.before)[1], cell.uncertainty(each.commands, each.targets)[1]) for each in parts]
+        turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
+        if turn < of_turn < np.inf:
+            why = (
+                f" Orientation is not corrected: the correction, {turn:.2f} mrad, is smaller than its standard "
+                f"uncertainty, {of_turn:.2f} mrad (RMS; --orientation corrects it all the same)."
+            )
+    ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
+    return {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}, why
 
 
 def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
     """Say why a stated tool is known less than the reflector, where it is known least; empty where it is not."""
-    row = [int(np.argmax(found.std))]
-    loads = (None if each is None else each[row] for each in (targets.torque, targets.payload))
-    known, of_tool = reflector.uncertainty(found.q[row], *loads)[0][0], found.std[row[0]]
+    row = int(np.argmax(found.std))
+    there = Targets._make(None if each is None else each[row : row + 1] for each in targets)
+    known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
     if not of_tool > LESS_KNOWN * known:
         return ""
     last = {f"{name}{found.robot.dof}" for name in ("d", "theta")} & set(reflector.problem.parameters.free.names)
@@ -342,7 +338,7 @@ def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
             "flange (`known` in [prior]), or do not identify these parameters."
         )
     of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
-    return f" In row {found.label[row[0]]} the U of the tool is {of_tool}, the reflector's {known}. {advice}"
+    return f" In row {found.label[row]} the U of the tool is {of_tool}, the reflector's {known}. {advice}"
 
 
 def tool_uncertainty(
@@ -350,7 +346,7 @@ def tool_uncertainty(
 ) -> tuple[Array, Array]:
     """Return ``std`` and ``orientation_std`` of a `Compensation` (N,) at commands q (N, dof)."""
     cell = _Cell.of(result, robot, result.problem.arms[robot], pose, tool, marker, False, False)
-    return cell.uncertainty(q, None, None)
+    return cell.uncertainty(q, Targets((), q, None, None))
 
 
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
@@ -399,10 +395,6 @@ def _tooled(
     every = np.zeros(len(whole))
     every[whole.identified] = result.x
     x = every[places]
-    C = result.known_covariance
-    if C is not None:
-        own = whole.free.places_of(robot)
-        C = C[np.ix_(own, own)]
     known = reflectors(p.names)
     if tool is not None:
         marker = known[0]
@@ -421,12 +413,26 @@ def _tooled(
             raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
         nominal[at] = frame
         identified[at] = False
-        if C is not None:
-            still = identified[p.identified]
-            C = C[np.ix_(still, still)]
         point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
     x[at] = 0.0
+    C = result.known_covariance
+    if C is not None:
+        own = whole.free.places_of(robot)[identified[p.identified]]
+        C = C[np.ix_(own, own)]
     return replace(p, nominal=nominal, identified=identified), x, C, marker, point
+
+
+class _Begun(NamedTuple):
+    """Commands of the controller for some targets before they are corrected, and where they bring both robots."""
+
+    targets: Targets
+    load: Array  # what the joints of the model bear, as `Arm.at` takes it
+    commands: Array  # (N, dof)
+    wanted: Array  # poses (N, c)
+    missed: Array  # error (N, k) of the controller's robot
+    before: Array  # error (N, k) of the identified robot,
+    J: Array  # and its Jacobian (N, k, dof)
+    beside: Array  # as in a `Compensation`
 
 
 class _Cell(NamedTuple):
@@ -463,8 +469,7 @@ class _Cell(NamedTuple):
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
         stated, located = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
         moved = np.linalg.inv(stated) @ located if base else np.eye(4)
-        measured = result.problem.sample()
-        measured = measured.alone(which) if which else measured
+        measured = result.problem.sample().alone(which)
         repeatability = measured.repeatability
         if repeatability is not None and tool is not None:
             repeatability = replace(repeatability, at=values)
@@ -491,11 +496,10 @@ class _Cell(NamedTuple):
             raise InputError("payload", f"{stated}", f"a mass [kg] that is not negative, one or {count}")
         return np.broadcast_to(mass, count)
 
-    def compensated(self, targets: Targets, largest: float, turning: bool) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets; ``turning`` corrects orientations, too."""
+    def begun(self, targets: Targets) -> _Begun:
+        """Return the commands for some targets, which the controller's robot reaches by them where it can."""
         _, q, poses, torque, payload = targets
         N = len(targets.label)
-        # what the joints of the model bear, as `Arm.at` takes it
         borne = [] if torque is None else [torque @ np.linalg.inv(self.robot.joint_map)]
         load = np.hstack([np.empty((N, 0)), *borne, *([] if payload is None else [payload[:, None]])])
         beside = np.full(N, np.nan)
@@ -507,8 +511,12 @@ class _Cell(NamedTuple):
             commands, target = self._commands(poses, q, load), poses
             missed = self.nominal.at(commands, load, poses)[1]
             if q is not None:
-                beside = self._norms(self.nominal.at(q, load, poses)[1])[0]
-        _, before, J = self.identified.at(commands, load, target)
+                beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
+        return _Begun(targets, load, commands, target, missed, *self.identified.at(commands, load, target)[1:], beside)
+
+    def ended(self, begun: _Begun, largest: float, turning: bool) -> dict[str, Array]:
+        """Return the fields of a `Compensation` for some targets; ``turning`` corrects orientations, too."""
+        targets, load, commands, wanted, missed, before, J, beside = begun
         reached = self._reached(missed, attainable(J))
         W = attainable(J) if turning else POSITION
         due = np.where(reached[:, None], before - missed, 0.0)
@@ -516,29 +524,30 @@ class _Cell(NamedTuple):
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
-        corrected, left, active = nearest(self.identified, load, target, commands, limits, W, P)
+        corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
         cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
-        fields["position_before"], fields["orientation_before"] = self._norms(before)
-        fields["position_error"], fields["orientation_error"] = self._norms(left)
-        fields["std"], fields["orientation_std"] = self.uncertainty(corrected, torque, payload)
+        fields["position_before"], fields["orientation_before"] = self.norms(before)
+        fields["position_error"], fields["orientation_error"] = self.norms(left)
+        fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
 
-    def uncertainty(self, q: Array, torque: Array | None, payload: Array | None) -> tuple[Array, Array]:
-        """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached; R is the repeatability's."""
+    def uncertainty(self, q: Array, targets: Targets) -> tuple[Array, Array]:
+        """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached at q, under their loads."""
         k = len(self.kind.components)
         if self.covariance is None:
-            return self._norms(np.full((len(q), k), np.inf))
-        problem = self.problem.measuring(q, self.kind, self.marker, torque, payload, covariance=self.noise)
+            return self.norms(np.full((len(q), k), np.inf))
+        loads = targets.torque, targets.payload
+        problem = self.problem.measuring(q, self.kind, self.marker, *loads, covariance=self.noise)
         J = problem.jacobian(self.x)
         known = np.isfinite(np.diag(self.covariance))
         C = np.where(np.outer(known, known), self.covariance, 0.0)
         variance = np.sum((J @ C) * J, axis=1).reshape(len(q), k)
         variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
         variance[(np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), k)] = np.inf
-        return self._norms(np.sqrt(np.maximum(variance, 0.0)))
+        return self.norms(np.sqrt(np.maximum(variance, 0.0)))
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
@@ -587,12 +596,12 @@ class _Cell(NamedTuple):
         order = np.argsort(np.take_along_axis(distance, closest, axis=1), axis=1)
         return bank[np.take_along_axis(closest, order, axis=1)]
 
-    def _norms(self, error: Array) -> tuple[Array, Array]:
+    def norms(self, error: Array) -> tuple[Array, Array]:
         """Return the norms of position and orientation errors; NaN where there is no orientation."""
         lengths = np.array([dimension == "length" for dimension in self.kind.components.values()])
         angle = np.full(len(error), np.nan) if lengths.all() else np.linalg.norm(error[:, ~lengths], axis=1)
         return np.linalg.norm(error[:, lengths], axis=1), angle
 
     def _reached(self, error: Array, W: Array) -> np.ndarray:
-        distance, angle = self._norms(times(W, error))
+        distance, angle = self.norms(times(W, error))
         return (distance <= REACHED) & ~(angle > REACHED)
