@@ -44,9 +44,9 @@ GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 BEYOND = {"angle": 20 * math.pi, "length": 50.0}
 """Joint values and coordinates [SI] that no table has: ten turns, and farther than instruments stand."""
 PARTS = re.compile(r"(?=.)(?:(j|a|q|joint_?|axis_?)1(?: \1\d)+)?(?:(?:^| )x y z)?")
-"""What tables with a row a coordinate, or a joint, or both, name in that row, sorted."""
+"""What tables with one row per coordinate, joint, or both, name in that row, sorted."""
 VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.IGNORECASE)
-"""What the column is called that holds the coordinates of a table with a row a coordinate."""
+"""What the column is called that holds the coordinates of a table with one row per coordinate."""
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
 UNITS_WORD = re.compile(r"\b(?:units?|einheit(?:en)?|unités?|unidades|unità)\b", re.IGNORECASE)
@@ -151,7 +151,7 @@ def read_table(
     columns: Columns | None = None,
     turned: Callable[[Grid], bool] = lambda grid: False,
 ) -> RawTable:
-    """Return the table of a raw file, or of columns of texts, with a number a cell and a row a point.
+    """Return the table of a raw file, or of columns of texts, with one number per cell and one row per point.
 
     A grid that is ``turned`` has in its rows what others have in their columns.
     """
@@ -500,7 +500,7 @@ def _parts(stem: str, count: int) -> Sequence[str]:
 
 
 def _one_row_each(table: RawTable) -> RawTable:
-    """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint with a row a point; others as is."""
+    """Return a table whose rows hold a coordinate, ``P1, X, 1.5``, or a joint and one per point; others as is."""
     axis = next((name for name, cells in table.columns.items() if _names_parts(cells)), "")
     if not axis:
         return table

@@ -66,7 +66,7 @@ def _estimate(problem: Source, estimator: Estimator, model: str, start: Array | 
         fall = without.point.value - whole.point.value
         if fall < REQUIRED_GAIN:
             estimator, whole = plain, without
-            reason = f"it lowers -2 ln L by {fall:.1f}; {REQUIRED_GAIN:g} are required."
+            reason = f"its likelihood-ratio statistic is {fall:.1f}; {REQUIRED_GAIN:g} is required."
             notes = (f"The population prior is not used: {reason}",)
     contradicted = tuple(_contradicted(every, estimator, whole, start))
     fit, trials, gain, outliers = _without_outliers(every, estimator, whole, model)
@@ -115,7 +115,7 @@ def _contradicted(every: CalibrationProblem, estimator: Estimator, whole: Fit, s
             unit, si = display(free.dimensions[int(np.argmax(np.abs(own)))])
             off = float(values[0] - own @ without.x) / np.abs(own).max() / si
             yield (
-                f"The data contradict {statement.where}, by {off:+.3g} {unit}: without it -2 ln L falls by {fall:.0f}. "
+                f"The data contradict {statement.where}, by {off:+.3g} {unit} (likelihood-ratio statistic {fall:.0f}). "
                 "Correct it, or take it out of the prior."
             )
 

@@ -172,7 +172,7 @@ class Prior:
         return Prior(**both)
 
     def stated(self, parameters: Parameters, *, widened: bool = True) -> ScaledPrior:
-        """Return the prior of a problem's identified parameters, in units of their scales; given is the whole table.
+        """Return the prior of the identified parameters of a whole table, in units of their scales.
 
         Unless ``widened``, ``joint_offset`` and ``frames`` do not count: a penalty over the scales then stays what it
         is where nothing is stated. InputError for names or patterns that the table has not, units that do not fit,

@@ -205,8 +205,8 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     if found is None or not (of_positions(result) and result.verdict.delivered and found.typical > nominal):
         return ""
     advice = (
-        "Measure more configurations (command design, --augment), with larger wrist rotations, or state what is known "
-        'of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
+        "Measure more configurations (`rpim-opt design --augment`), with larger wrist rotations, or state what is "
+        'known of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
     if any(map(of_session, result.problem.parameters.free.names)):
         advice = _missing(result, nominal, found.largest, 0.0)
@@ -333,7 +333,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     held_out, missed, unheld = _held_out(result, region, requirement, data)
     lacking = [*_unmodelled(result, region), *unheld]
     if result.contradiction:
-        lacking.append("Missing: constraints that the data do not contradict, on which the bound rests.")
+        lacking.append("Missing: constraints that agree with the data; the bound depends on them.")
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]
@@ -384,9 +384,9 @@ def _missing(result: Calibration, limit: float, bound: float, repeatability: flo
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     return (
-        f"Missing: measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the "
-        f"robot's repeatability would still contribute {1e3 * repeatability:.3f} mm. The command design with "
-        "--augment names the configurations that help most."
+        f"Missing: more measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's "
+        f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "
+        "configurations that help most."
     )
 
 

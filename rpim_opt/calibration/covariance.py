@@ -180,7 +180,7 @@ def noise_test(squares: float, freedom: float, learned: bool = False, factor: fl
     probability = 2 * min(upper, 1 - upper)
     if probability >= UNLIKELY:
         low, high = np.sqrt(chdtri(freedom, [1 - UNLIKELY / 2, UNLIKELY / 2]) / freedom)
-        found = f"ratio {ratio:.2f}; by chance {low:.2f} to {high:.2f}"
+        found = f"ratio {ratio:.2f}; by chance {low:.2f} to {high:.2f} in {100 * (1 - UNLIKELY):g} % of fits"
         return NoiseTest(ratio, probability, f"Residuals agree with the measurement noise ({found}).")
     cause = "the noise is larger than stated, rows are wrong, or the model lacks an effect (backlash, compliance)"
     if upper >= 0.5:

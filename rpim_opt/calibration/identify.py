@@ -213,12 +213,12 @@ def ending(ended: Ended, most: int) -> str:
     diverges = DIVERGES_PENALIZED if state.choice.weight else DIVERGES
     exceeded = f"eviations exceed {FAR:g} prior standard deviations: {diverges}"
     if not ended.settled:
-        what = "the predicted positions in the constraints still change; use a larger weight"
-        return f"Not converged: after {ROUNDS} rounds {what}."
+        what = "the positions predicted in the constraints still change; use a larger weight"
+        return f"Not converged: after {ROUNDS} linearizations {what}."
     if ended.converged and ended.rounds > 1:
         return (
-            f"Converged after {iterations} in {ended.rounds} rounds; positions in the constraints are "
-            "linearized at the solution."
+            f"Converged after {iterations}; positions in the constraints were linearized {ended.rounds} times, "
+            "at last at the solution."
         )
     if ended.converged:
         text = f"Converged after {iterations}."

@@ -132,7 +132,7 @@ class LackOfFit:
 
     def sentences(self) -> list[str]:
         """Return the paragraph, sentence by sentence."""
-        rms = f"Residual RMS {_size(self, self.left)}"
+        rms = f"Residual RMS per reading {_size(self, self.left)}"
         if not self.instrument:
             count = max(round(self.spare), 0)
             degrees = "1 degree of freedom is" if count == 1 else f"{count} degrees of freedom are"
@@ -146,20 +146,22 @@ class LackOfFit:
                 parts[-1] += f", including {_size(self, self.joint)} from the joints"
         lines = [f"{rms} ({', '.join(parts)})."]
         for extension, gain in self.present.items():
-            lines.append(f"{EXTENSIONS[extension].effect}: -2 ln L falls by {gain:.0f}.")
+            lines.append(f"{EXTENSIONS[extension].effect} (likelihood-ratio statistic {gain:.0f}).")
         if self.missing:
             what = joined([EXTENSIONS[extension].name for extension in self.missing])
             lines.append(
-                f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (-2 ln L "
-                f'falls by {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
+                f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual "
+                f"(likelihood-ratio statistic {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or "
+                'model = "auto".'
             )
         if self.upward:
             joints = f"Compliance of joint {self.upward[0]} is"
             if len(self.upward) > 1:
                 joints = f"Compliances of joints {joined([str(joint) for joint in self.upward])} are"
             lines.append(
-                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, and whether the "
-                "controller compensates sag. Do not use this fit outside the measured joint ranges."
+                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, whether the controller "
+                "compensates sag, and what else pulls the arm (hose, spring, counterweight). Do not use this fit "
+                "outside the measured joint ranges."
             )
         lines += filter(None, [_limit(self)])
         if self.repeated is not None:

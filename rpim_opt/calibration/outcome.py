@@ -374,7 +374,7 @@ class Outcome:
         InputError for a penalty that is no squared norm, or a loss that no squared one stands for.
         """
         if not self.program.linear_penalty:
-            raise self.no_covariance("`forward` and monte_carlo serve any")
+            raise self.no_covariance("`forward` and monte_carlo work with any")
         form = ridge(self.squares, self.program.penalty_form)
         moves = self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
         if moves is not None:  # conditional on the active constraints
@@ -389,7 +389,7 @@ class Outcome:
         if not self.program.linear_penalty:
             return f"the penalty {of} is not quadratic; only a normal prior has a posterior covariance"
         if self.known_covariance is None:
-            return f"the loss {of} rests on a few equations and has no quadratic model"
+            return f"the loss {of} depends on a few equations and has no quadratic model"
         return ""
 
     def no_covariance(self, instead: str) -> InputError:
@@ -414,7 +414,7 @@ class Outcome:
 
         >>> import rpim_opt as ro
         >>> ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml).noise_test().verdict
-        'Residuals agree with the measurement noise (ratio 1.02; by chance 0.81 to 1.19).'
+        'Residuals agree with the measurement noise (ratio 1.02; by chance 0.81 to 1.19 in 99 % of fits).'
         """
         linear = self.squares
         repeatability = self.problem.repeatability

@@ -136,7 +136,7 @@ class TransmissionError(NamedTuple):
 
 
 def transmission_errors(result: Outcome) -> list[TransmissionError]:
-    """Return the transmission errors of the joints, with four values a period of the finest harmonic; empty if none."""
+    """Return the transmission errors of the joints at four values per period of the finest harmonic; empty if none."""
     free = result.problem.parameters.free
     if not free.of_curves.any():
         return []

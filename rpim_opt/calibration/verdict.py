@@ -55,7 +55,7 @@ LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot devi
 BENDS = ("compliance", "bend")  # beginnings of the names of parameters with which gravity bends an arm
 NOTHING = (
     "None of the tested input mistakes explains it. Check the nominal parameters; the arm may be compliant,"
-    " or less repeatable than stated. See rpim-opt inspect."
+    " or less repeatable than stated. Run `rpim-opt inspect`."
 )
 
 
@@ -192,7 +192,7 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     share = size / arm_length(result.problem)
     for each, ratio_of in residuals.values():
         if each > COMPUTED_RMS and 0 < ratio_of < OVERSTATED:  # 0 where the dimension was not measured
-            yield f"Residuals are {ratio_of:.2g} times the measurement noise: it is in another unit, or far too large."
+            yield f"Residuals are {ratio_of:.2g} times the stated noise, which is in another unit or far too large."
     if ratio > NOISY and share > REACH:
         yield (
             f"Residual RMS {three_digits(1e3 * size)} mm: {three_digits(ratio)} times the measurement noise and "
@@ -417,7 +417,7 @@ def _large_residuals(result: Outcome, residuals: Mapping[str, tuple[float, float
         yield f"transmission errors of {three_digits(1e3 * size)} mrad (1 sigma)"
     if ratio > NOISY:
         noise = f"{three_digits(ratio)} times the measurement noise"
-        yield f"residuals {noise}, counting the degrees of freedom of transmission errors"
+        yield f"residuals {noise}, corrected for the degrees of freedom of transmission errors"
 
 
 def _large_deviations(result: Outcome) -> Iterator[str]:
@@ -506,8 +506,9 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     if not joints:
         return []
     return [
-        f"joint{'s' * (len(joints) > 1)} {joined([str(joint) for joint in joints])} bend against gravity: check "
-        "`mounting` and the payload, and whether something else pulls the arm (a hose, a spring, a counterweight)."
+        f"negative compliance of joint{'s' * (len(joints) > 1)} {joined([str(joint) for joint in joints])}, which "
+        "gravity cannot cause: check `mounting`, the payload, whether the controller compensates sag, and what else "
+        "pulls the arm (hose, spring, counterweight)."
     ]
 
 

@@ -209,7 +209,7 @@ def _estimates(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, 
             groups.append(f"{name} {_figure(size, 1.0, 'x' if groups else 'x the stated one')}")
     if learned.curves is not None:
         ripple = _figure(learned.curves.size, 1e3, "mrad")
-        curves.append(f"ripple {ripple}, length scale {learned.curves.length.value:.2g} rad")
+        curves.append(f"{ripple}, correlation length {learned.curves.length.value:.2g} rad")
     robot = {kind: size for kind, size in learned.noise.items() if kind != "instrument"}
     largest = max((size.value for size in robot.values()), default=0.0)
     parts = []
@@ -247,7 +247,7 @@ def _model_lines(learned: Learned) -> list[str]:
         return []
     gains = {extension: learned.gain(extension) for trial in learned.trials for extension in trial.extensions}
     supported = [f"{extension} {gain:.0f}" for extension, gain in gains.items() if gain is not None and gain >= 0.5]
-    evidence = f" (-2 ln L falls by {joined(supported)})" if supported else ""
+    evidence = f" (likelihood-ratio statistic: {joined(supported)})" if supported else ""
     if not learned.extensions:
         return [f"Model: the data support no extension{evidence}."]
     return [

@@ -268,7 +268,7 @@ def in_ball(radius: float, *patterns: str) -> Constraint:
     2.0
     """
     if not (np.isfinite(radius) and radius >= 0):
-        raise InputError("in_ball", f"radius {radius}", "a finite number of scales, zero or more")
+        raise InputError("in_ball", f"radius {radius}", "a finite number of prior scales, zero or more")
     return Ready("in_ball", _in_ball, (radius, *patterns))
 
 
@@ -505,7 +505,7 @@ class Parsed:
                 if found.nominal:
                     continue
                 if table.of_frames[i] and table.periodic[i] and table.nominal[i] != 0:  # its deviations are rotations
-                    what = f"the value of '{name}', an angle of a turned frame"
+                    what = f"the value of '{name}', an angle of a rotated frame"
                     raise self._wrong(what, "its deviation: '= nominal +- 0.1 mrad'")
                 constant += factor * table.nominal[i]
             yield row, constant

@@ -24,7 +24,7 @@ NAMED = (*ATOMS, by_link, by_kind)
 
 @dataclass(frozen=True, repr=False)
 class Formulation(Brief):
-    """A convex way to identify the scaled total deviation z from whitened equations A z ~ b.
+    """Loss, penalty and constraints that identify the scaled total deviation z from whitened equations A z ~ b.
 
     ::
 
@@ -99,7 +99,7 @@ class Formulation(Brief):
         for key in ("loss", "penalty", "penalty_over"):
             function = getattr(self, key)
             if not callable(function) and (key == "loss" or function is not None):
-                raise InputError(key, f"{function!r}", "a function, as cp.norm1 is one")
+                raise InputError(key, f"{function!r}", "a function, such as cp.norm1")
         for constraint in self.constraints:
             if not callable(constraint):
                 raise InputError("constraints", f"{constraint!r}", "functions of z and the parameters")

@@ -105,7 +105,7 @@ def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: 
         raise InputError(found, "a loss without gradient", accepted)
     factor = float(np.median(np.abs(slope[: len(v)]) / (2 * v))) if len(v) else 0.0
     if not factor > 0:
-        raise InputError(found, "a loss that rests on a few equations", accepted)
+        raise InputError(found, "a loss that depends on a few equations", accepted)
     return Inliers(noise, len(norms), factor)
 
 
@@ -135,7 +135,7 @@ class QuadraticModel:
     before: Array | None = None
 
     def after(self, z: Array) -> QuadraticModel:
-        """Return the squares for the pass after one at z (n,)."""
+        """Return the squares for the iteration after z (n,)."""
         return replace(self, before=z)
 
     def __call__(self, model: LinearModel, z: Array) -> tuple[LinearModel, float]:

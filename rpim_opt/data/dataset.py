@@ -374,7 +374,7 @@ def _names(names: Sequence[Any] | np.ndarray, what: str, N: int, points: int = 1
 
 
 def _beside(values: ArrayLike | None, what: str, like: np.ndarray) -> Any:
-    """Return what a row states besides, in the shape of the joint values or with one number a row."""
+    """Return what a row states besides, in the shape of the joint values or with one number per row."""
     if values is None:
         return None
     numbers = np.asarray(values, dtype=float)

@@ -109,7 +109,7 @@ class PartitionedProblem(RobotModel):
         return replace(self, dropped=self.dropped | frozenset(labels))
 
     def rows(self) -> Iterator[CalibrationProblem]:
-        """Yield one problem a block, read in this process; no two blocks share the number of a configuration."""
+        """Yield one problem per block, read in this process; no two blocks share the number of a configuration."""
         configurations = 0
         for number, part in enumerate(self.parts, start=1):
             data = _read(self.parameters, self.dropped, (number, part))

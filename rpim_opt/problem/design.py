@@ -292,7 +292,7 @@ class Observability(Brief):
         raw = f", {self.raw_condition:.3g} in mm and rad" if np.isfinite(self.raw_condition) else ""
         lines = [
             f"{self.rank} of {len(self.names)} parameter combinations are identifiable{weak}.",
-            f"Condition number {self.condition:.3g} in prior scales and standard deviations{raw}; {indices}.",
+            f"Condition number {self.condition:.3g} in prior scales and noise{raw}; observability {indices}.",
         ]
         if self.unidentifiable:
             lines.append(f"Unidentifiable: {', '.join(self.unidentifiable)}.")

@@ -158,7 +158,7 @@ class Inspection(Tabled):
         notes = self._notes()
         parts = [
             table(["joint", "unit", "from", "to", "span", "limits", "covered"], joints),
-            table(["measured", "unit", "from", "to", "typical sigma"], measured),
+            table(["measured", "unit", "from", "to", "noise (1 sigma)"], measured),
             "\n".join(lines),
             str(self.observability),
             "\n".join(self.contact),
@@ -307,9 +307,9 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
     if turning.any():
         largest = np.abs(q[:, turning]).max()
         if largest > 4 * np.pi:
-            yield f"joints reach {np.degrees(largest):.0f} deg: degrees given as radians?"
+            yield f"joints reach {np.degrees(largest):.0f} deg: degrees read as radians?"
         if largest < np.radians(2 * np.pi):
-            yield "no joint exceeds 6.3 deg: radians given as degrees?"
+            yield "no joint exceeds 6.3 deg: radians read as degrees?"
     for block in problem.data.blocks:
         if block.y.shape[1] < 3:
             continue

@@ -69,7 +69,7 @@ class LinearModel(Brief):
 
     @cached_property
     def triangle(self) -> Array:
-        """Upper triangle R (n+1, n+1) of [A b] = QR: |A z - b| = |R [z; -1]| for every z."""
+        """QR factor R (n+1, n+1) of [A b], upper triangular: |A z - b| = |R [z; -1]| for every z."""
         return triangle_of(self.A, self.b)
 
     @cached_property
@@ -124,7 +124,7 @@ def reduced_rows(rows: Array, R: Array | None = None) -> Array:
 
 
 def triangle_of(A: Array, b: Array) -> Array:
-    """Return R (n+1, n+1) of [A b] from that of every `BLOCK`: which they are depends on the shape of A alone."""
+    """Return the QR factor R (n+1, n+1) of [A b] by blocks of rows, which depend on the shape of A alone."""
     columns = A.shape[1] + 1
     most = max(8 * columns, BLOCK // columns)
 

@@ -287,7 +287,7 @@ class CalibrationProblem(RobotModel):
         return self
 
     def rows(self) -> Iterator[CalibrationProblem]:
-        """Yield problems that together have all the rows: here this one, of measurements in blocks one a block."""
+        """Yield problems that together have all the rows: here this one, of measurements in blocks one per block."""
         yield self
 
     @property

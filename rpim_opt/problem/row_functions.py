@@ -190,7 +190,7 @@ COLUMN = "column "  # before the name of a further column among what a row state
 
 
 class Loads(NamedTuple):
-    """What rows state of their joints; ``gravity`` where it is asked for, ``weighs`` where it stands for torques."""
+    """Joint loads in the rows; ``gravity`` where a term needs it, ``weighs`` where it replaces measured torques."""
 
     stated: tuple[str, ...] = ()
     gravity: Gravity | None = None

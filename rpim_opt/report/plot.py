@@ -295,7 +295,7 @@ def _dots(ax: Axes, x: Any, y: Any, role: str, label: str = "", ms: float = 5.0)
 
 
 def logarithmic(ax: Axes, which: str) -> None:
-    """Make an axis logarithmic, with as many ticks a power of ten as it has room for."""
+    """Make an axis logarithmic, with as many ticks per power of ten as it has room for."""
     from matplotlib.ticker import LogLocator, MaxNLocator
 
     ax.set(**{f"{which}scale": "log"})

@@ -157,7 +157,7 @@ def identifiability(result: Calibration) -> str:
     s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
     rank, count = int(np.sum(s > RANK_TOLERANCE * s[0])), int(parameters.sum())
     apart = "" if parameters.all() else ", without the transmission errors of the joints"
-    others = " Standard deviations of parameters include the others; the position's uncertainty does not."
+    others = " Parameter standard deviations include the unidentifiable ones; position uncertainties do not."
     others = others if rank < count else ""
     return f"{rank} of {count} parameter combinations are identifiable from {model.equations} equations{apart}.{others}"
 
@@ -189,9 +189,7 @@ def nominal_note(result: Calibration) -> str:
     if not (result.problem.parameters.placed & result.problem.parameters.identified).any():
         return "Nominal: the nominal robot."
     frames = "its base, tool and other frames fitted to the identification data"
-    return (
-        f"Nominal: the nominal robot, {frames}. Uncorrected commands (`compensate`) are in the identified base instead."
-    )
+    return f"Nominal: the nominal robot, {frames}. Uncorrected errors of `compensate` refer to the identified base."
 
 
 def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -> dict[str, Any]:

@@ -167,7 +167,7 @@ def joint_values(robot: Robot, joint_map: Array, file: Path) -> list[str]:
 
 
 def without_beta(robot: Robot) -> Robot:
-    """Return the same arm in four numbers a joint: every Hayati parameter zero, common normals throughout.
+    """Return the same arm in four numbers per joint: every Hayati parameter zero, common normals throughout.
 
     Where axes are nearly parallel the common normal, and with it d of both joints, may be hundreds of metres away.
     Refused are a beta after the last joint, and axes so parallel that the four numbers lose more than 1e-9 m or rad.

@@ -201,7 +201,7 @@ def model_extensions(robot: Robot) -> dict[str, tuple[str, ...]]:
 
 
 def extension_scales(robot: Robot, names: Iterable[str]) -> Array:
-    """Return the expected sizes (n,) [SI] of parameters beyond the table: a deflection of 0.1 mrad where it is largest.
+    """Return the prior scales (n,) [SI] of model extensions: a deflection of 0.1 mrad where it is largest.
 
     Largest over random joint values, not over measured ones: what an extension may do does not depend on the data. One
     that moves nothing, the compliance of a vertical axis for instance, has the usual size of its kind.

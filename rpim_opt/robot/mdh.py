@@ -125,7 +125,7 @@ class Robot(Brief):
     of the controller [rad or m], infinite where unknown; ``source`` says where the table comes from. ``model`` are
     terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone. InputError for shapes
     that do not fit, numbers that are not finite, a singular joint map, limits that are not in order, masses that are
-    not one a joint.
+    not one per joint.
 
     >>> import numpy as np
     >>> import rpim_opt as ro

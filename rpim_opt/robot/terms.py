@@ -274,7 +274,7 @@ def _require_still(term: Term, moves: ca.SX, symbols: Sequence[ca.SX]) -> None:
     left = float(ca.norm_inf(ca.Function("still", seen, [still]).call([ca.DM(SOMEWHERE)] * len(seen))[0]))
     if left > ROUNDING:
         found = f"a motion of {left:.2g} rad or m with all parameters zero"
-        raise InputError(f"term '{term.name}'", found, "none: its constant part belongs into the nominal robot")
+        raise InputError(f"term '{term.name}'", found, "none: its constant part belongs to the nominal robot")
 
 
 class Curve(NamedTuple):

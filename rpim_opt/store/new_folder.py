@@ -180,7 +180,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, noise:
     there = "the flange's origin"
     if placed(arm.tool) != placed(np.zeros(6)):  # of a URDF, or a DH table in another convention than the modified one
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
-        there = f"{frame}, {placed(arm.tool)} (transform points of {frame} by it)"
+        there = f"{frame}, {placed(arm.tool)} in the flange frame"
     yield (
         f"{understanding.kind.words.thing_at} starts at {there}: state its place in [tool] if it is known. [tool], "
         "`known` and --tool refer to the flange frame after the last joint."

@@ -42,7 +42,7 @@ class SimulatedArm(NamedTuple):
 def simulated_arm(
     seed: int, count: int, noise: float = 3e-5, offset: float = 0.0, effects: float = 0.0
 ) -> SimulatedArm:
-    """Return a simulated arm; the seeds 0, 1, 2, ... take turns between three robots.
+    """Return a simulated arm; successive seeds cycle through three robots.
 
     Behind every link there is a small transform. Its lengths are normal with a standard deviation of 0.05 to 1 mm
     (log-uniform, one an arm), its angles with 1 to 30 mrad a mm of that (at most 5 mrad), each times exp(N(0, 1)) of
@@ -92,7 +92,7 @@ def simulated_arm(
 
 
 def flange(robot: Robot, q: Array, errors: Array) -> Array:
-    """Return the frames (N, 4, 4) behind the last of revolute joints, each with a small transform behind it."""
+    """Return the frames (N, 4, 4) after the last of revolute joints, each followed by a small transform."""
     T = np.broadcast_to(np.eye(4), (len(q), 4, 4))
     for (alpha, a, theta, d, beta), angle, error in zip(robot.mdh, (q @ robot.joint_map.T).T, errors, strict=True):
         turn = np.tile(np.eye(4), (len(q), 1, 1))

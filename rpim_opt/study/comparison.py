@@ -221,7 +221,7 @@ class Comparison:
         return tuple(dict.fromkeys(row["problem"] for row in self.rows))
 
     def to_frame(self) -> Any:
-        """Return the rows as a data frame (pandas, or polars where that is missing), one row a replicate."""
+        """Return the rows as a data frame (pandas, or polars where that is missing), one row per replicate."""
         return frame_of(self.rows)
 
     def summary(self, metric: str | None = None, against: str | None = None) -> Summary:

@@ -103,7 +103,7 @@ class Compensation:
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
-            "Uncorrected commands err otherwise than the nominal robot of a report, whose base and tool are fitted.",
+            "Uncorrected errors refer to the identified base, nominal errors of a report to refitted base and tool.",
         ]
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():

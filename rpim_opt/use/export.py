@@ -127,7 +127,7 @@ def export_files(
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
     ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
     a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
-    numbers a joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
+    numbers per joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
     ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
     ``marker`` is the reflector, ``robot`` which of several (`together`).
 

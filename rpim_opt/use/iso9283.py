@@ -29,7 +29,7 @@ ACCEPTED = "pose, x_mm, y_mm, z_mm; with a command command_x_mm, ...; with an or
 class Performance(Tabled):
     """Accuracy and repeatability at the poses of a table.
 
-    ``poses`` has a row a pose: its name ``pose``, its ``cycles`` (approaches), and by name [mm, mrad] the distance of
+    ``poses`` has one row per pose: its name ``pose``, ``cycles`` (approaches), and by name [mm, mrad] the distance of
     the barycentre of the attained positions from the command, ``AP_p_mm``, its parts ``AP_x_mm``, ..., None where no
     command is known, and the positioning repeatability ``RP_l_mm``. Where orientations were measured, it has of each
     angle, as the table calls it, mean less command and 3 standard deviations, ``AP_a_mrad`` and ``RP_a_mrad``.

@@ -129,7 +129,7 @@ class Monitoring:
             lines.append("No single parameter or frame explains it.")
         worst = int(np.argmax(self.sigmas / self.allowed))
         lines.append(
-            f"Largest innovation: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
+            f"Largest residual: {self._named(worst)}, {self.sigmas[worst]:.1f} standard deviations of a new reading "
             f"({self.allowed[worst]:.1f} allowed), {1e3 * self.error[worst]:.3f} mm. "
             f"Largest cumulative sum: {self.sums.max():.1f} ({self.limit:.1f} allowed)."
         )

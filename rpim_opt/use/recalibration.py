@@ -148,7 +148,7 @@ class Update:
         elif self.before.likely:
             lines = [f"No change of the robot is detectable from {count}: {self.before}."]
         else:
-            lines = [f"{count} lie outside the prediction intervals of the previous calibration: {self.before}."]
+            lines = [f"{count} contradict the previous calibration: {self.before}."]
         lines = [*filter(None, [self.registered]), *lines]
         for cause in self.changes:
             end = ", excluded" if cause.kind == "reading" else ""

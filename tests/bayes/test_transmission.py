@@ -64,7 +64,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     floor = np.sqrt(3) * NOISE
     assert rms(result.errors(others)) < 1.4 * floor < rms(ro.calibrate(result.stated).errors(others)) / 2
     assert 0.90 < ro.use.validate(result, others).coverage <= 0.99
-    said = f"Transmission error of joints (1 sigma): ripple {1e3 * result.learned.curves.size.value:.2g} mrad (95 % CI "
+    said = f"Transmission error of joints (1 sigma): {1e3 * result.learned.curves.size.value:.2g} mrad (95 % CI "
     assert said in str(result)
     text = words.parameter_table(result)
     assert "transmission2_c1" not in text

@@ -122,7 +122,7 @@ def test_the_three_verdicts(result) -> None:
     assert accept(result, Requirement(1.001 * bound)).verdict == "accepted"
     between = accept(result, Requirement(0.8 * bound))
     assert between.verdict == "inconclusive"
-    assert "The command design with --augment" in between.reasons[0]
+    assert "`rpim-opt design --augment`" in between.reasons[0]
     few = accept(result, Requirement(0.1 * bound))
     assert few.verdict == "inconclusive"  # nothing shows that a better calibration would not do
     assert "repeatability" in few.reasons[0]

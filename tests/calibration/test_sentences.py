@@ -78,8 +78,8 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
     "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 degrees of freedom are too few", "measurement noise"),
     "effects": (
         left(1e-4, instrument=1e-4, present={"gravity": 30.0, "first harmonic": 9.0}),
-        "gravity: -2 ln L falls by 30. Encoders or gears of joints are eccentric (errors once a turn): -2 ln L "
-        "falls by 9.",
+        "gravity (likelihood-ratio statistic 30). Encoders or gears of joints are eccentric (errors once a turn) "
+        "(likelihood-ratio statistic 9).",
         "would explain",
     ),
     "alike": (
@@ -181,7 +181,9 @@ def test_extensions_are_compared_with_the_best_model_without_them() -> None:
     assert found.gain("moments") == -2.0
     assert found.gain("compliance") is None
     (text,) = said(found)
-    assert text.startswith("Model: geometry with gravity (-2 ln L falls by gravity 30). `compensate` uses the whole")
+    assert text.startswith(
+        "Model: geometry with gravity (likelihood-ratio statistic: gravity 30). `compensate` uses the whole"
+    )
     assert "files for controllers hold geometry only" in text
     alone = learned(trials=(Trial((), 40.0), Trial(("gravity",), 40.2)))
     assert said(alone) == ["Model: the data support no extension."]

@@ -198,7 +198,7 @@ def test_a_name_that_is_none_is_refused() -> None:
         ("a3 = alpha3", "a sum of angle and length"),
         ("beta5 = 0 deg", "no identified parameter"),
         ("a? = d?", "patterns a? and d?"),
-        ("base_rx = 0 deg", "an angle of a turned frame"),
+        ("base_rx = 0 deg", "an angle of a rotated frame"),
         ("move at most 1 mm: nowhere", "place 'nowhere'"),
     ],
 )
@@ -217,7 +217,7 @@ def test_a_bound_on_positions_holds_of_the_identified_robot() -> None:
     below = replace(ro.tikhonov, constraints=(lambda _, p: p.positions(q)[:, 2] <= highest,))
     result = ro.calibrate(problem, below, 1.0)
     assert result.converged, result.message
-    assert "rounds" in result.message
+    assert "linearized" in result.message
     assert result.forward(q)[:, 2, 3].max() == pytest.approx(highest, abs=1e-8)
 
 

@@ -149,7 +149,7 @@ def test_other_forms_of_a_rotation_are_the_same_rotation() -> None:
         from_matrices(np.hstack([xyz, R.as_matrix().reshape(20, 9)])),
     ):
         assert np.abs(np.abs(np.sum(got[:, 3:] * want, axis=1)) - 1).max() < 1e-14
-    with pytest.raises(ro.InputError, match="row 1: found a matrix that violates R R' = 1 by"):
+    with pytest.raises(ro.InputError, match="row 1: found a matrix that violates R R' = I by"):
         from_matrices(np.hstack([xyz, 1.01 * R.as_matrix().reshape(20, 9)]))
 
 

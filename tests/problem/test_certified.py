@@ -249,7 +249,7 @@ def test_three_poses_with_two_answers_are_not_certified() -> None:
         ({"loss": "l1"}, "loss: found 'l1', accepted: squares, truncated"),
         ({"sigma": (0.0, 1.0)}, "sigma: found a number that is not positive"),
         ({"measured": np.zeros((12, 2))}, "transforms: found shapes"),
-        ({"measured": np.zeros((12, 4, 4))}, "pose 1: found a matrix that violates R R' = 1 by 1"),
+        ({"measured": np.zeros((12, 4, 4))}, "pose 1: found a matrix that violates R R' = I by 1"),
         ({"measured": np.full((12, 3), np.nan)}, "transforms: found numbers that are not finite"),
     ],
 )

@@ -124,7 +124,7 @@ def test_the_command(monkeypatch, capsys) -> None:
         "Unidentifiable",
         "Redundant combinations",
         "O1",
-        "typical sigma",
+        "noise (1 sigma)",
     ):
         assert part in out
 

@@ -282,13 +282,11 @@ def required(result: ro.calibration.Calibration, limit: float) -> ro.calibration
 def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) -> None:
     read = Reader(page(required(result_of("position"), limit)))
     words = " ".join(read.words.split())
-    said = (
-        "limit 0.07 mm with 95 % confidence at every configuration of the region. Missing: measurements. The bound is"
-    )
+    said = "limit 0.07 mm with 95 % confidence at every configuration of the region. Missing: more measurements. The"
     if verdict == "Accepted":
         said = "expanded uncertainty of the position reached (U, 95 %) at most"
     assert 0 <= words.index(f"{verdict}: {said}") < words.index("Mean error, nominal")
-    assert words.count("Missing: measurements.") == (verdict != "Accepted")
+    assert words.count("Missing: more measurements.") == (verdict != "Accepted")
     assert "A. <b>Person</b>" in words
     assert not read.all("b")
     assert "The maximum U is at joints" in words

@@ -77,7 +77,7 @@ def test_an_update_says_what_came_out() -> None:
     assert str(found).startswith("No change of the robot is detectable from 8 readings: chi-squared")
     assert found.explained
     lost = replace(found, before=unlikely(found.before), after=unlikely(found.after), changes=())
-    assert "8 readings lie outside the prediction intervals of the previous calibration" in str(lost)
+    assert "8 readings contradict the previous calibration" in str(lost)
     assert "No small set of changed parameters, frames or readings explains the rest." in str(lost)
     wrong = replace(found, before=unlikely(found.before), changes=(READING,), causes=(READING,))
     assert str(wrong).startswith(

@@ -52,8 +52,8 @@ def l_curve(program: Program) -> Selection:
     if not score[best] > 0:
         best = 0
     no_corner = (
-        f"the L-curve has no corner: the weight is the {'lower' if best == 0 else 'upper'} edge of "
-        f"{weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a weight of your own, may serve better"
+        f"the L-curve has no corner: the weight is at the {'lower' if best == 0 else 'upper'} edge of "
+        f"{weights[0]:.1e} to {weights[-1]:.1e}; another selector, or a fixed weight, may be better"
     )
     chosen = choice("l_curve", weights, score, best, "corner of the L-curve" + failed, no_corner + failed)
     if chosen.interior and program.closed_form:

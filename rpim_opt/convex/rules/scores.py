@@ -17,7 +17,7 @@ def require_linear(program: Program, name: str) -> None:
     """Refuse a program whose solutions are not linear in the data."""
     if program.penalty_form is None:
         found = f"formulation '{program.formulation.name}'"
-        accepted = "a quadratic penalty, whose solutions are linear in the data; l_curve, corner or k_fold serve any"
+        accepted = "a quadratic penalty, so that solutions are linear in the data; l_curve, corner and k_fold take any"
         raise InputError(f"selector {name}", found, accepted)
     if program.loss_form is None:
         program.inlier_model(np.zeros(program.model.A.shape[1]))  # says why there is no linear estimator
@@ -44,7 +44,7 @@ def reml(program: Program) -> Selection:
     """Choose by restricted maximum likelihood (REML), with the noise level profiled out.
 
     The penalty is read as a normal prior of variance sigma^2 / weight on the robot's parameters and sigma^2 as
-    unknown, so that declared noise that leaves out backlash or gravity does no harm. Frames (base, reflectors,
+    unknown, so that stated noise that leaves out backlash or gravity does no harm. Frames (base, reflectors,
     anchors) are fixed effects: the m equations are projected off their columns, because how far a tripod stands
     says nothing about a gear. Minimizes, with g_i = w / (s_i^2 + w) (Patterson and Thompson 1971, Biometrika
     58:545; Wahba 1985, Annals of Statistics 13:1378)::
@@ -52,7 +52,7 @@ def reml(program: Program) -> Selection:
         m ln(sum beta_i^2 g_i + |r_perp|^2) - sum ln g_i
 
     Points on a plane or sphere are met by a robot shrunk to nothing, so that their fit tells no noise level: the
-    weight is 1, declared noise and scales at their word. With few data a second maximum may lie at infinite
+    weight is 1, stated noise and scales at their word. With few data a second maximum may lie at infinite
     weight, where everything is noise: it counts only if there is no other, and then the weight is 1 too. A choice
     at the lower edge means that the data support no penalty. Constraints are left out of the likelihood.
 
@@ -108,12 +108,12 @@ def gcv(program: Program) -> Selection:
 
 
 DISCREPANCY = 1.1
-"""Discrepancy principle: by how much the residual norm may exceed what the declared noise promises."""
+"""Discrepancy principle: by how much the residual norm may exceed what the stated noise implies."""
 
 
 @on_inliers
 def discrepancy(program: Program) -> Selection:
-    """Choose the largest weight whose misfit agrees with the declared noise (Morozov 1966).
+    """Choose the largest weight whose misfit agrees with the stated noise (Morozov 1966).
 
     rho(w) <= tau^2 (m - dof(w)), with tau = 1.1: without that room one data set in two would fit at no weight.
     InputError for another penalty than a quadratic.
@@ -121,7 +121,7 @@ def discrepancy(program: Program) -> Selection:
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.discrepancy)
     >>> f"{result.weight:.2g}", result.selection.note
-    ('28', 'residual norm 1.1 times that of the declared noise')
+    ('28', 'residual norm 1.1 times that of the stated noise')
     """
 
     def score(weights: Array) -> Array:  # ln(rho / (tau^2 (m - dof)))
@@ -129,7 +129,7 @@ def discrepancy(program: Program) -> Selection:
         left = program.squared.factor * DISCREPANCY**2 * np.maximum(program.squared.equations - freedom, 1e-9)
         return np.log(np.maximum(rho, np.finfo(float).tiny) / left)
 
-    note = f"residual norm {DISCREPANCY:g} times that of the declared noise"
+    note = f"residual norm {DISCREPANCY:g} times that of the stated noise"
     chosen = linear_rule(program, "discrepancy", score, note)
     fits = np.flatnonzero(chosen.score <= 0)
     weights = chosen.weights

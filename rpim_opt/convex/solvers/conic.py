@@ -635,7 +635,7 @@ TRTRS: Any = get_lapack_funcs("trtrs", dtype=float)
 
 
 def by_triangle(T: Array, b: Array, transposed: bool = False) -> Array:
-    """Return T^-1 b, or T'^-1 b, of an upper triangle T: SciPy's `solve_triangular` takes five times as long."""
+    """Return T^-1 b, or T'^-1 b, of an upper triangular T: SciPy's `solve_triangular` takes five times as long."""
     return TRTRS(T, b, trans=int(transposed))[0]
 
 

@@ -83,7 +83,7 @@ def from_matrices(y: Array) -> Array:
     R = y[:, 3:].reshape(-1, 3, 3)
     off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     for row in np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0)).tolist():
-        found = f"a matrix that violates R R' = 1 by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
+        found = f"a matrix that violates R R' = I by {off[row]:.2g}, determinant {np.linalg.det(R[row]):.3g}"
         raise RowError(row, found, "a rotation within 0.001, determinant 1")
     return _posed(y, scipy.spatial.transform.Rotation.from_matrix(R))
 

@@ -173,7 +173,7 @@ def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, n
         off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
         wrong = np.flatnonzero((off > 1e-3) | (np.linalg.det(R) < 0))
         if len(wrong):
-            found = f"a matrix that violates R R' = 1 by {off[wrong[0]]:.2g}"
+            found = f"a matrix that violates R R' = I by {off[wrong[0]]:.2g}"
             raise InputError(f"pose {wrong[0] + 1}", found, "a rotation")
     return flange, poses, turned
 

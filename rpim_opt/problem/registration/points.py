@@ -224,7 +224,7 @@ def misfit(points: Points) -> float:
 
 
 def misfits(tries: Sequence[Points], zeros: bool = True) -> Array:
-    """Return the same (B,) of many readings of a table, joint zeros fitted by default."""
+    """Return the same (B,) of many interpretations of a table, joint zeros fitted by default."""
     errors = np.full(len(tries), np.inf)
     kinds = [(id(points.robot), len(points.row)) for points in tries]
     for kind in dict.fromkeys(kinds):

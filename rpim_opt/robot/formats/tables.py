@@ -218,7 +218,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     if len(known) != 1 or not known <= set(CONVENTIONS.values()):
         accepted = (
             "--dh modified (Craig, alpha and a before theta and d) or --dh standard (Paul, Hayati: theta and d first), "
-            "or a column convention with one of the words"
+            "or a column `convention` with one of these words"
         )
         raise InputError("the convention of the table", " and ".join(sorted(known)) or "not stated", accepted)
     joints = [_joint(dict(zip(columns, cells, strict=True))) for cells in zip(*columns.values(), strict=True)]

@@ -1,4 +1,4 @@
-"""MATLAB's matrices as text, ``Q = [0 -90; 10 -80];``, with a row a configuration and their units in comments."""
+"""MATLAB's matrices as text, ``Q = [0 -90; 10 -80];``, with one row per configuration and units in comments."""
 
 from __future__ import annotations
 
