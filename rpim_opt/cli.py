@@ -33,7 +33,7 @@ HELP = """Robot calibration by convex optimization.
 From a table of measurements to a corrected robot: new, calibrate, export, report.
 
 Exit codes: 0 done; 1 a limit or gate failed, or a robot is not delivered; 2 invalid input; 3 no solution found; 4
-inconclusive: acceptance, or a robot no more certain than the nominal one errs.
+inconclusive: acceptance, or an uncertainty above the nominal robot's error.
 """
 
 

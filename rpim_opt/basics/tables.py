@@ -220,7 +220,7 @@ def read_grid(path: Path, sheet: str = "", encoding: str = "", separator: str = 
         raise InputError("--separator", f"'{separator}'", choices(separator, SEPARATORS))
     if mark != ",":
         spelled = next((word for word, sign in SEPARATORS.items() if sign == mark), repr(mark))
-        why = "as requested" if separator else "it separates most numbers"
+        why = "as requested" if separator else "this separates most numbers"
         notes = (*notes, f"cells are separated by {spelled}: {why}.")
     return Grid(*_split(text, mark), notes, mark == " ")
 

@@ -115,7 +115,7 @@ def _common(
                     raise InputError(where, found, "the same in all")
             apart = abs(p.nominal[i] - other.nominal[k])
             if apart > FAR * p.scale[i]:
-                found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} scales"
+                found = f"nominal values {apart:g} apart in '{first}' and '{key}', more than {FAR:g} prior scales"
                 raise InputError(where, found, "one nominal value in all")
             common[first].add(name)
             common[key].add(name)

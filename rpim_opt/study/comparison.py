@@ -458,7 +458,7 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
 
 def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], reference: str) -> Iterator[str]:
     """Yield the notes below the table: of what the ratios and intervals speak, and what has no results."""
-    yield f"Ratios are of the same replicates in pairs, geometric mean over problems; a tie is within {TIE:.0%}."
+    yield f"Ratios compare the same replicates in pairs; geometric mean over problems; a tie is within {TIE:.0%}."
     compared = sum(each.low is not None and each.method != reference for each in standings)
     problems = {row["problem"] for row in rows}
     if len(problems) >= ENOUGH:

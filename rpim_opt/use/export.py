@@ -136,7 +136,7 @@ def export_files(
     origin, which goes to its identified place. Where origins were identified, those of all chains are written, and ends
     of one are refused.
 
-    A robot that is neither accepted nor rejected, or no more certain than the nominal one errs, is written with the
+    A robot that is neither accepted nor rejected, or less certain than the nominal one is accurate, is written with the
     note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
     requirement of its record, unless ``despite_verdict``, which every file says then; InputError where there is nothing
     to write, or a file cannot hold what was identified.

@@ -143,7 +143,7 @@ class JointMapping:
             if other.mirror:
                 first = described(self.joint_types, self.sign, self.zero)
                 sentences.append(
-                    f"{what}, fits as well as {first}: lengths do not distinguish an arm from its mirror image. "
+                    f"{what} fits as well as {first}: lengths do not distinguish an arm from its mirror image. "
                     f"Measure a few positions to decide, or {WRITE}, as the set-up confirms."
                 )
                 continue
@@ -154,7 +154,7 @@ class JointMapping:
             )
         more = len(alternatives) - TOLD
         if more > 0:
-            sentences.append(f"So do {more} more: joints that moved little, or wrong data, decide nothing.")
+            sentences.append(f"{more} more fit as well: joints moved too little, or data are wrong.")
         return tuple(sentences)
 
 
