@@ -529,9 +529,7 @@ def export(
     camera_info: Annotated[File, Option(help="A camera's YAML of ROS; its intrinsics go to --out.")] = None,
     mdh: Annotated[File, Option(help="DH table to write: .csv, .json or .toml, in the convention of --dh.")] = None,
     dh: Convention = "modified",
-    robodk: Annotated[
-        File, Option(help="CSV file to write with RoboDK's four numbers per joint (modified DH).")
-    ] = None,
+    robodk: Annotated[File, Option(help="CSV file to write: RoboDK's four numbers per joint (modified DH).")] = None,
     corrections: Annotated[File, Option(help="CSV file for transmission errors, to subtract from commands.")] = None,
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,

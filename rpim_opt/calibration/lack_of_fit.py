@@ -150,18 +150,16 @@ class LackOfFit:
         if self.missing:
             what = joined([EXTENSIONS[extension].name for extension in self.missing])
             lines.append(
-                f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual "
-                f"(likelihood-ratio statistic {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or "
-                'model = "auto".'
+                f"{what[0].upper()}{what[1:]} would explain {self.share:.0%} of the mean square residual (likelihood-"
+                f'ratio statistic {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
             )
         if self.upward:
             joints = f"Compliance of joint {self.upward[0]} is"
             if len(self.upward) > 1:
                 joints = f"Compliances of joints {joined([str(joint) for joint in self.upward])} are"
             lines.append(
-                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, whether the controller "
-                "compensates sag, and what else pulls the arm (hose, spring, counterweight). Do not use this fit "
-                "outside the measured joint ranges."
+                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, sag compensation, hoses, "
+                "springs and counterweights. Do not use this fit outside the measured joint ranges."
             )
         lines += filter(None, [_limit(self)])
         if self.repeated is not None:

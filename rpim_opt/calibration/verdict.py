@@ -507,8 +507,7 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
         return []
     return [
         f"negative compliance of joint{'s' * (len(joints) > 1)} {joined([str(joint) for joint in joints])}, which "
-        "gravity cannot cause: check `mounting`, the payload, whether the controller compensates sag, and what else "
-        "pulls the arm (hose, spring, counterweight)."
+        "gravity cannot cause: check `mounting`, the payload, sag compensation, hoses, springs and counterweights."
     ]
 
 
