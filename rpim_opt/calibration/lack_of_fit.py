@@ -158,8 +158,8 @@ class LackOfFit:
             if len(self.upward) > 1:
                 joints = f"Compliances of joints {joined([str(joint) for joint in self.upward])} are"
             lines.append(
-                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, sag compensation, hoses, "
-                "springs and counterweights. Do not use this fit outside the measured joint ranges."
+                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, sag compensation, "
+                "hoses, springs and counterweights. Do not use this fit outside the measured joint ranges."
             )
         lines += filter(None, [_limit(self)])
         if self.repeated is not None:
