@@ -67,8 +67,7 @@ def write_report(
     write_text(Path(path), page(replace(calibration, record=record), new))
 
 
-FAVOURABLE = ("accepted", "inconclusive", "rejected")
-"""Verdicts of acceptance tests, the most favourable first."""
+FAVOURABLE = ("accepted", "inconclusive", "rejected")  # verdicts of acceptance tests, the most favourable first
 
 
 class Content(NamedTuple):

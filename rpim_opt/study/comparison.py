@@ -261,14 +261,13 @@ class Comparison:
             markdown(["method", *self.problems], medians),
             *(f"{name}: {what}" for name, what in self.asked.items()),
         ])  # fmt: skip
-        names = list(self.rows[0])
-        cells = [["" if row[name] is None else str(row[name]) for name in names] for row in self.rows]
+        replicates = csv_text(self.rows[0], (row.values() for row in self.rows))
         where = ", ".join(self.problems) if len(self.problems) <= 3 else f"{len(self.problems)} problems"
         ratios = {each.method: each.ratio for each in summary.standings if each.ratio is not None}
         report = studies.Report(text, ratios, {"comparison": self.plot(metric, against)})
         made = "\n\n".join(f"{name}: {what}" for name, what in self.made.items())
         title = f"{len(self.methods)} methods on {where}"
-        studies.write(Path(folder), title, report, made, {"replicates.csv": csv_text(names, cells).encode()})
+        studies.write(Path(folder), title, report, made, {"replicates.csv": replicates.encode()})
         return Path(folder) / "README.md"
 
     def __repr__(self) -> str:

@@ -45,8 +45,7 @@ BASELINES: dict[str, Callable[[CalibrationProblem], Any]] = {
 OK = "ok"
 UNDELIVERED = "not delivered"  # but with figures
 Thing = TypeVar("Thing")
-Problem = Instance | Callable[[int], Any]
-"""A problem, or a function of a seed with another problem for every seed."""
+Problem = Instance | Callable[[int], Any]  # a problem, or a function of a seed with another problem for every seed
 
 
 def listed(stated: Any) -> list[tuple[str, Any]]:

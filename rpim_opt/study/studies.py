@@ -35,8 +35,7 @@ from rpim_opt.store.problem_file import problems_folder
 NEEDED = ("QUESTION", "METRICS", "cases", "run", "report")
 """What a study has; if it has prepare(quick), too, that is called once before the first case."""
 FILE = "study.py"  # the study of a folder
-MOST_FILES = 10_000
-"""Of the files beside a study, each of which is read before its replicates are resumed."""
+MOST_FILES = 10_000  # of the files beside a study, each of which is read before its replicates are resumed
 REPLICATES = "replicates"
 
 

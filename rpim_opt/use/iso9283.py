@@ -60,8 +60,7 @@ class Performance(Tabled):
 
     def csv(self) -> str:
         """Return the rows as CSV."""
-        cells = [["" if value is None else value for value in row.values()] for row in self.poses]
-        return csv_text(self.poses[0], cells)
+        return csv_text(self.poses[0], (row.values() for row in self.poses))
 
     def __str__(self) -> str:
         rows = self.poses

@@ -24,8 +24,7 @@ from rpim_opt.robot.kinematics import frame_numbers, numeric_link
 from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
 READY = Path(__file__).resolve().parents[1] / "ready"
-SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")
-"""Endings of tables with one row per joint."""
+SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")  # endings of tables with one row per joint
 ENDINGS = (".toml", ".json", *SHEETS)
 LIMITS = ("lower", "upper")
 SI = {"angle": "rad", "length": "m"}
@@ -46,8 +45,7 @@ JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # 
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
 """A joint's variable with its offset, ``q2 - 90``."""
 ANGLES = tuple(name for name, dimension in MDH_DIMENSION.items() if dimension == "angle")
-JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)
-"""The name of a joint in a cell."""
+JOINT_NAME = re.compile(r"(?:joint|axis|link|achse|gelenk)[\s_]*\d+", re.IGNORECASE)  # in a cell
 WITHOUT_COLUMN = {
     "coupling": "a coupling of joints",
     "mounting": "a mounting other than on the floor",
