@@ -341,9 +341,7 @@ def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
     return f" In row {found.label[row]} the U of the tool is {of_tool}, the reflector's {known}. {advice}"
 
 
-def tool_uncertainty(
-    result: Calibration, q: Array, tool: Sequence[float] | Array | None = None, marker: str = "", robot: str = ""
-) -> tuple[Array, Array]:
+def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: str, robot: str) -> tuple[Array, Array]:
     """Return ``std`` and ``orientation_std`` of a `Compensation` (N,) at commands q (N, dof)."""
     cell = _Cell.of(result, robot, result.problem.arms[robot], pose, tool, marker, False, False)
     return cell.uncertainty(q, Targets((), q, None, None))

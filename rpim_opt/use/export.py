@@ -149,16 +149,15 @@ def export_files(
     if corrections and any(others) and not transmission_errors(whole):
         without = f"Not written: {Path(corrections).name}, since the calibration has no curves of transmission errors."
         remarks, corrections = [without, *remarks], None
-    which: dict[str, Any] = {"marker": marker, "robot": robot}
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, partial(_write_urdf, result, marker, robot, **frames)),
-        (ur_kinematics, partial(export_ur_kinematics, result, **which)),
-        (ur_calibration, partial(export_ur_calibration, result, robot=robot)),
-        (camera_info, partial(export_camera, result)),
+        (ur_kinematics, partial(_write_ur_kinematics, result, robot, marker)),
+        (ur_calibration, partial(_write_ur_calibration, result, robot)),
+        (camera_info, partial(_write_camera, result)),
     ]
     made: list[tuple[str | Path | None, Callable[[Path], Any]]] = [
-        (mdh, lambda target: _write_table(identified(result, **which), dh, target)),
-        (robodk, lambda target: write_robodk(identified(result, **which).robot, target)),
+        (mdh, lambda target: _write_table(identified(result, marker, robot), dh, target)),
+        (robodk, lambda target: write_robodk(identified(result, marker, robot).robot, target)),
     ]
     writers = _beside([(Path(source), write) for source, write in corrected if source], out)
     writers += [(Path(target), write) for target, write in made if target]
@@ -400,26 +399,23 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
     return [f"The URDF holds origins; {joined(frames)} of the calibration stays in its result."] if frames else []
 
 
-def export_ur_kinematics(
-    result: Calibration, source: str | Path, target: str | Path, marker: str | None = None, robot: str = ""
-) -> list[str]:
-    """Write a ``kinematics.yaml``."""
+def _write_ur_kinematics(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
     arm = identified(result, marker, robot).robot
-    arm, notes = _on_base(arm, result.problem.arms[robot], read_ur_kinematics(source).robot, Path(target))
+    arm, notes = _on_base(arm, result.problem.arms[robot], read_ur_kinematics(source).robot, target)
     return notes + write_ur_kinematics(source, arm, target)
 
 
-def export_ur_calibration(result: Calibration, source: str | Path, target: str | Path, robot: str = "") -> list[str]:
+def _write_ur_calibration(result: Calibration, robot: str, source: Path, target: Path) -> list[str]:
     """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
     nominal = result.problem.arms[robot]
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
     catalogued = _catalogued(nominal)
-    arm, notes = _on_base(identified(result, robot=robot).robot, nominal, catalogued, Path(target))
+    arm, notes = _on_base(identified(result, robot=robot).robot, nominal, catalogued, target)
     mdh = arm.mdh.copy()
     mdh[0, :2] = 0.0
     notes += write_ur_calibration(source, replace(arm, mdh=mdh), catalogued, target)
-    if b"joint_checksum" in read_bytes(Path(source)):
+    if b"joint_checksum" in read_bytes(source):
         notes.append(
             "joint_checksum is copied from the source: its algorithm is not published, so a controller may refuse "
             "the file. Keep the original."
@@ -457,31 +453,29 @@ def _on_base(arm: Robot, nominal: Robot, of_file: Robot, file: Path) -> tuple[Ro
     return replace(arm, mdh=mdh), [f"{file.name}: its base is {apart} from the base of the calibration's DH table."]
 
 
-def export_camera(result: Calibration, source: str | Path, target: str | Path) -> list[str]:
+def _write_camera(result: Calibration, source: Path, target: Path) -> None:
     """Write a camera's YAML of ROS with the calibrated intrinsics, everything else as in ``source``.
 
     The projection matrix keeps its rectification: focal lengths are multiplied, and the centre moved, as those of the
     camera matrix. Refused are calibrations of no camera, or of several, and files without one of the three lists.
     """
-    path = Path(source)
     p = result.problem.parameters
     cameras = {name.rpartition("_")[0] for name in p.names if own_name(name).startswith("camera_")}
     if len(cameras) != 1:
         raise InputError("the calibration", counted(len(cameras), "camera"), "one camera")
     values = p.by_name(result.x)
     fx, fy, cx, cy, *distortion = (values[f"{min(cameras)}_{name}"] for name in INTRINSICS)
-    text = read_bytes(path).decode()
-    before = _yaml_list(text, "camera_matrix", (3, 3), path)[0]
+    text = read_bytes(source).decode()
+    before = _yaml_list(text, "camera_matrix", (3, 3), source)[0]
     K = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
-    P = _yaml_list(text, "projection_matrix", (3, 4), path)[0]
+    P = _yaml_list(text, "projection_matrix", (3, 4), source)[0]
     P[[0, 1], [0, 1]] *= np.diag(K)[:2] / np.diag(before)[:2]
     P[:2, 2] += K[:2, 2] - before[:2, 2]
     lists = {"camera_matrix": K, "distortion_coefficients": np.array([distortion]), "projection_matrix": P}
     for key, numbers in lists.items():
-        _, start, end = _yaml_list(text, key, numbers.shape, path)
+        _, start, end = _yaml_list(text, key, numbers.shape, source)
         text = text[:start] + ", ".join(map(repr, numbers.ravel().tolist())) + text[end:]
-    write_text(Path(target), text)
-    return []
+    write_text(target, text)
 
 
 def _yaml_list(text: str, key: str, shape: tuple[int, ...], path: Path) -> tuple[Array, int, int]:

@@ -362,16 +362,17 @@ class _Joint:
         if not new:
             return {}
         element = self._only(tag)
+        start = self.element.start if element is None else element.start
+        end = next(TAG.finditer(data, start)).end()
         if element is None:
-            end = _tag_end(data, self.element.start)
             return {(end, end): f"<{tag}{_attributes(new)}/>"}
         edits = {}
-        for match in ATTRIBUTE.finditer(data, element.start, _tag_end(data, element.start)):
+        for match in ATTRIBUTE.finditer(data, start, end):
             text = new.pop(match[1].decode(errors="replace"), None)
             if text is not None:
                 edits[match.start(2) + 1, match.end(2) - 1] = text
         if new:
-            after_name = element.start + len(f"<{tag}")
+            after_name = start + len(f"<{tag}")
             edits[after_name, after_name] = _attributes(new)
         return edits
 
@@ -386,12 +387,6 @@ def _numbers(text: str, count: int, largest: float = LARGEST_NUMBER) -> Array | 
 
 def _attributes(values: Mapping[str, str]) -> str:
     return "".join(f' {name}="{value}"' for name, value in values.items())
-
-
-def _tag_end(data: bytes, start: int) -> int:
-    """Return where the tag that begins at ``start`` is over."""
-    match = TAG.match(data, start)
-    return match.end() if match else start
 
 
 @dataclass(frozen=True, eq=False)
