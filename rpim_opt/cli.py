@@ -585,8 +585,7 @@ def compensate(
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
             limit=None if limit is None else 1e-3 * limit,
         )  # fmt: skip
-    code = int(bool(compensation.missed))
-    more = {"code": code, "left_out": understood.left_out, "notes": understood.notes}
+    more = {"code": int(bool(compensation.missed)), "left_out": understood.left_out, "notes": understood.notes}
     return _with_table(compensation, compensation.csv(), out, compensation.content(), **more)
 
 

@@ -355,8 +355,7 @@ def _residuals(result: Calibration, composition: list[str]) -> Iterator[Block]:
             means = [f"{v[:, i].mean():+z.3f} ± {v[:, i].std():.3f}" for v in vectors.values()]
             rows.append([f"{name}, {axis}", *means])
     if rows:
-        caption = f"{what}, mean ± standard deviation [mm]"
-        yield "table", Table(caption, ["data, axis", "nominal", "identified"], rows)
+        yield "table", Table(f"{what}, mean ± standard deviation [mm]", ["data, axis", "nominal", "identified"], rows)
 
 
 def _identifiability(result: Calibration) -> Iterator[Block]:

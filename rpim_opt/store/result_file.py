@@ -121,8 +121,7 @@ def load_result(path: str | Path, measurements: Sequence[Measurement] = (), mode
         raise _refusal(error).within(path) from None
     except (TypeError, ValueError, LookupError, ArithmeticError, RuntimeError) as error:
         # well-formed parts that somebody put together by hand
-        found = f"inconsistent content ({error})"
-        raise InputError("the file", found, "an unmodified file", path) from None
+        raise InputError("the file", f"inconsistent content ({error})", "an unmodified file", path) from None
     return result
 
 
@@ -361,8 +360,7 @@ def _calibration(file: Stored, known: Mapping[str, Measurement], models: Models)
     if validation is not None:
         problem.on(validation)  # refuses rows that the problem's robot or reflectors cannot have
     formulation = formulation_of(file.formulation, file.definition)
-    model = around(problem.linearize(file.x), file.x)
-    program = pose(formulation, model, file.forms)
+    program = pose(formulation, around(problem.linearize(file.x), file.x), file.forms)
     learned = file.learned if not file.record.earlier else None
     weight: float | Selector | None = None  # estimated, as it was
     if learned is None:

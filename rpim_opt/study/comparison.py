@@ -118,8 +118,7 @@ def compare(
     figured = metrics_of(metrics)
 
     def work(case: Mapping[str, Any]) -> Callable[[], Row]:  # which takes no more along than it needs
-        method = compared[case["method"]]
-        return partial(replicate, asked[case["problem"]], ways[case["split"]], method, figured, case)
+        return partial(replicate, asked[case["problem"]], ways[case["split"]], compared[case["method"]], figured, case)
 
     made = studies.provenance()
     drawn = {label for label, problem in asked.items() if not isinstance(problem, Instance)}

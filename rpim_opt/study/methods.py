@@ -248,8 +248,7 @@ def _weight(label: str, each: Any) -> tuple[str, dict[str, Any]]:
         ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
         return label or ready, {"weight": each}
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
-        accepted = f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}"
-        raise InputError("selectors", f"{each!r}", accepted)
+        raise InputError("selectors", f"{each!r}", f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}")
     if isinstance(each, int):
         each = number(each, "selectors")
     weight = require_weight(float(each), "selectors")

@@ -290,8 +290,7 @@ def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple
     That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
     """
     moved = displaced(result, data, held)
-    p = result.problem.parameters
-    placed_by = {BASE + axis for axis in FRAME} <= set(p.free.names)
+    placed_by = {BASE + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
     if not any(moved) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
         return moved
     causes, fit = _changes(result, data)
