@@ -138,17 +138,17 @@ def required(limit: float | None, box: str | None, stated: Requirement | None) -
     from rpim_opt.data.record import Requirement
 
     require_positive("--limit", limit)
-    if limit is None and stated is None:
-        if box is not None:
-            raise InputError("--box", "no limit", "--limit with it [mm]")
-        return None
-    sides = None
+    if box is not None and limit is None and stated is None:
+        raise InputError("--box", "no limit", "--limit with it [mm]")
+    changes: dict[str, Any] = {}
+    if limit is not None:
+        changes["limit"] = 1e-3 * limit
     if box is not None:
-        x0, x1, y0, y1, z0, z1 = _numbers("--box", box, (6,), "six numbers: x0,x1,y0,y1,z0,z1 [mm]")
-        sides = ((1e-3 * x0, 1e-3 * x1), (1e-3 * y0, 1e-3 * y1), (1e-3 * z0, 1e-3 * z1))
-    if stated is None:
-        return Requirement(1e-3 * (limit or 0.0), sides)
-    return replace(stated, limit=stated.limit if limit is None else 1e-3 * limit, box=sides or stated.box)
+        ends = [1e-3 * end for end in _numbers("--box", box, (6,), "six numbers: x0,x1,y0,y1,z0,z1 [mm]")]
+        changes["box"] = tuple(zip(ends[::2], ends[1::2], strict=True))
+    if stated is not None:
+        return replace(stated, **changes)
+    return Requirement(**changes) if changes else None
 
 
 def listed_words(text: str) -> list[str]:

@@ -168,19 +168,19 @@ def _rows(data: Dataset, labels: Any, where: str = "") -> Array:
 class PriorTable(Table):
     """The keys of ``[prior]``; tails may be infinite."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=True)
+    model_config = ConfigDict(allow_inf_nan=True)
 
     known: list[str] = Field(default_factory=list)
     earlier: str = Field(default="", alias="from")
     without: list[str] = Field(default_factory=list)
-    inflate: float | int = 1.0
+    inflate: float = 1.0
     population: list[str] = Field(default_factory=list)
-    tails: float | int = 3.0
+    tails: float = 3.0
     groups: list[str] = Field(default_factory=list)
-    joint_offset: float | int = FACTOR
-    frames: float | int = FRAMES
-    centre: dict[str, float | int] = Field(default_factory=dict)
-    scale: dict[str, float | int] = Field(default_factory=dict)
+    joint_offset: float = FACTOR
+    frames: float = FRAMES
+    centre: dict[str, float] = Field(default_factory=dict)
+    scale: dict[str, float] = Field(default_factory=dict)
 
     def files(self, path: Path) -> dict[str, Path]:
         """Return the files of the prior in the problem's folder, by their names in the problem file."""
@@ -466,10 +466,9 @@ def stated_prior(
         matches = [name for name in parameters.names if fits(name, stem)]
         if stem == JOINT_OFFSET or stem in parameters.names or (matches and all(map(is_joint_offset, matches))):
             offsets[key] = value
-    numbers: Any = {name: float(getattr(table, name)) for name in ("tails", "joint_offset", "frames")}
     groups = tuple(tuple(group.split()) for group in table.groups)
     try:
-        prior = Prior(centre=table.centre, scale={**offsets, **table.scale}, groups=groups, **numbers)
+        prior = Prior(table.centre, {**offsets, **table.scale}, table.tails, groups, table.joint_offset, table.frames)
     except InputError as error:
         raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
     files = table.files(path)
