@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
@@ -15,6 +16,7 @@ Mass = Annotated[float, "mass"]
 Name = Annotated[str, Field(max_length=200)]
 """A name or a pattern of names: long ones would take for ever to be matched."""
 Model = TypeVar("Model", bound=BaseModel)
+OF_UNION = re.compile(r"(str|float|dict|list)(\[.*])?")  # in pydantic's places the one of several types, and no key
 
 
 class Misfit(InputError, ValueError):
@@ -61,7 +63,7 @@ def validate(model: type[Model], content: dict[str, Any], file: object, table: s
         for part in first["loc"]:  # joint 3.a, as a person counts
             if isinstance(part, int):
                 where += f" {part + 1}"
-            elif not part.startswith("list["):  # which of several types, and no key
+            elif not OF_UNION.fullmatch(part):
                 where += f".{part}" if where else part
         if isinstance(misfit, Misfit):
             where = ".".join(filter(None, (where, misfit.where))) or "the top level"
