@@ -25,7 +25,6 @@ import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
 from rpim_opt.basics.files import inside, refused, sha256_of
 from rpim_opt.basics.text import listed, progress_bar, table
-from rpim_opt.basics.units import parse_units
 from rpim_opt.report import console
 
 HELP = """Robot calibration by convex optimization.
@@ -127,6 +126,8 @@ Result = Annotated[Path, Argument(help="result.json, or its folder.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
 Kind = Annotated[Text, Option(help="Measurement type: position, pose, cable, ...; guessed, or that of the result.")]
 Several = "several files are stacked, or joined as by rpim-opt new."
+NEAREST = "Join files by nearest time, with this largest difference [s]."
+ROTATION = "Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector."
 Tolerance = Annotated[Number, Option(help="Acceptance tolerance [mm]: exit code 1 if rejected, 4 if inconclusive.")]
 Register = Annotated[bool, Option("--register", help="The instrument was moved: register it again before judging.")]
 Box = Annotated[Text, Option(help="Region x0,x1,y0,y1,z0,z1 [mm] in the robot's base; default: measured joint ranges.")]
@@ -188,13 +189,9 @@ class Tables(NamedTuple):
     sheet: Annotated[str, Option(help="Excel sheet, by name or number; several as Joints,Points.")] = ""
     columns: Annotated[str, Option(help="Column names of a table without a header: label,q1_deg,...")] = ""
     key: Annotated[str, Option(help="Column by which several files are joined; row joins by row number.")] = ""
-    time_tolerance: Annotated[Number, Option(help="Join files by nearest time, with this largest difference [s].")] = (
-        None
-    )
+    within: Annotated[Number, Option("--time-tolerance", help=NEAREST)] = None
     quaternion: Annotated[str, Option(help="Order of a quaternion's numbered components, wxyz or xyzw.")] = ""
-    rotation: Annotated[
-        str, Option(help="Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector.")
-    ] = ""
+    rotation: Annotated[str, Option(help=ROTATION)] = ""
     prefix: Annotated[str, Option(help="Prefix of the robot's joint names, where the table has several robots.")] = ""
     constants: Annotated[str, Option(help="Joints without a column: 'torso_lift [m]=0.15,head_pan [deg]=0'.")] = ""
     encoding: Annotated[str, Option(help="Encoding of text files, if not detected: utf-8, cp1252, utf-16.")] = ""
@@ -204,8 +201,7 @@ class Tables(NamedTuple):
     @property
     def options(self) -> "ro.data.TableOptions":
         """The options as functions take them."""
-        stated: dict[str, Any] = self._asdict()
-        stated |= {"units": parse_units(self.units), "within": stated.pop("time_tolerance")}
+        stated = self._asdict()
         stated["columns"] = tuple(map(str.strip, self.columns.split(","))) if self.columns else ()
         return ro.data.TableOptions(**{**stated, "constants": tuple(console.listed_words(self.constants))})
 
