@@ -148,11 +148,10 @@ class Compensation:
         if self.status[row] != "limited" and self.position_error[row] <= REACHED:
             return error
         low, high = self.robot.limits.T
-        at = np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high))
-        units = [display(dimension) for dimension in self.robot.joint_dimensions]
-        return error + "".join(
-            f", joint {i + 1} at its limit of {self.q[row, i] / units[i][1]:.6g} {units[i][0]}" for i in at
-        )
+        for i in np.flatnonzero((self.q[row] <= low) | (self.q[row] >= high)):
+            unit, si = display(self.robot.joint_dimensions[i])
+            error += f", joint {i + 1} at its limit of {self.q[row, i] / si:.6g} {unit}"
+        return error
 
     def _largest_corrections(self) -> dict[str, float]:
         joints = joint_columns(self.robot.joint_dimensions)
