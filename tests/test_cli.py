@@ -32,6 +32,7 @@ def test_calibrate_prints_the_tables_and_writes_the_result(monkeypatch, capsys, 
     assert run(monkeypatch, "calibrate", "paper_arm", "--out", str(tmp_path)) == 0
     out = capsys.readouterr().out
     for expected in (
+        "\nDelivered: the fit gives no reason against using this robot; no acceptance limit is stated. On 16",
         "0.0319",
         "2.6489",
         "published: RPIM",

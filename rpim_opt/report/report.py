@@ -133,14 +133,10 @@ def _headline(content: Content) -> Iterator[Block]:
             U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
-    elif doubt := inconclusive(result, content.map):
-        word, _, text = doubt.partition(": ")
-        yield "verdict", {"kind": "inconclusive", "word": word, "text": text}
     elif result.verdict.delivered:
-        text = "the fit gives no reason against using this robot; no acceptance limit is stated."
-        if result.caution:
-            text = "only for joint values as the table counts them: check the pendant (see below)."
-        yield "verdict", {"kind": "accepted", "word": "Delivered", "text": text}
+        doubt = inconclusive(result, content.map)
+        word, _, text = (doubt or summary.delivered(result)).partition(": ")
+        yield "verdict", {"kind": "inconclusive" if doubt else "accepted", "word": word, "text": text}
     yield "lead", {"text": summary.headline(result, content.errors), "alarm": not result.verdict.delivered}
     yield "notes", [*filter(None, [result.caution]), *reasons, *result.verdict.beside(result.causes)]
     name, nominal, identified = content.errors

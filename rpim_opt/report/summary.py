@@ -150,6 +150,15 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
     return sentence
 
 
+def delivered(result: Calibration) -> str:
+    """Return the verdict on a robot without an acceptance limit as a sentence; empty if it is not delivered."""
+    if not result.verdict.delivered:
+        return ""
+    if result.caution:
+        return "Delivered: only for joint values as the table counts them: check the pendant (see below)."
+    return "Delivered: the fit gives no reason against using this robot; no acceptance limit is stated."
+
+
 def identifiability(result: Calibration) -> str:
     """Return a sentence on the number of identifiable parameter combinations, without coefficients of curves."""
     model = result.program.model
@@ -206,8 +215,8 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
     accepted = None if record.requirement is None else accept(result)
     uncertainty = measured_workspace(result) if accepted is None else None  # an acceptance test states it, too
     doubt = inconclusive(result, uncertainty)
+    verdict = "" if accepted else doubt or delivered(result)
     remarks = [
-        *filter(None, [doubt]),
         *([] if uncertainty is None else [f"{uncertainty.summary}; region: {uncertainty.requirement.where}."]),
         *words.weight_lines(result),
         identifiability(result),
@@ -222,7 +231,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "title": record.title,
         "source": record.source,
         **{key: whole[key] for key in KEYS},
-        "headline": headline(result),
+        "headline": " ".join(filter(None, [verdict, headline(result)])),
         "caution": result.caution or None,
         "errors": errors,
         "orientation": orientation_rows(result),
