@@ -524,6 +524,15 @@ def test_a_robot_that_does_not_stand_upright_is_told_its_mounting(tmp_path, turn
     assert (noted[1] if noted else "") == said
 
 
+def test_new_says_that_the_nominal_robot_does_not_explain_the_data_before_what_is_certified(tmp_path, cell) -> None:
+    q = np.random.default_rng(2).uniform(-2, 2, (20, 6))
+    write_csv(tmp_path / "a.csv", HEADER, np.hstack([urdf_points(cell / "arm.urdf", q) / 25.4, q]))
+    options = TableOptions(units=parse_units("rad,m"))
+    made = ro.store.new_problem(tmp_path / "few", cell / "arm.urdf", tmp_path / "a.csv", options=options)
+    (guessed,) = [note for note in made.notes if note.startswith("Guessed: the base")]
+    assert re.search(r"\(the nominal robot does not explain the data, RMS error \d+ mm; optimum of the regist", guessed)
+
+
 def test_the_links_that_new_was_given_are_those_of_export(monkeypatch, capsys, cell, tmp_path) -> None:
     monkeypatch.chdir(tmp_path)
     beside = (

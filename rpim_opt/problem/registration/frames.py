@@ -32,7 +32,7 @@ from rpim_opt.problem.registration.closed_forms import (
     transformed,
     transforms,
 )
-from rpim_opt.problem.registration.points import Candidates, Points, fit_arms
+from rpim_opt.problem.registration.points import UNEXPLAINED, Candidates, Points, fit_arms
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, numeric_frame, roll_pitch_yaw
 from rpim_opt.robot.library import find_robot, read_arm
@@ -77,7 +77,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         if start.uncertainty > UNKNOWN or (len(count) > 1 and not start.certified):
             raise InputError("the data", start.reason, "rotations about two axes")
     except InputError as error:
-        how = f"by registration of positions: {error.found}"
+        how = f"registration by positions: {error.found}"
         names = list(places)
         number = np.array([names.index(name) for name in marker.tolist()])
         nominal = np.array([place[:3] for place in places.values()])
@@ -89,7 +89,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         for place, fitted in zip(places.values(), fit.tools[0], strict=True):
             place[:3] = fitted
     else:
-        how = f"{'certified' if start.certified else 'not certified'}: {start.reason}"
+        how = f"optimum of the registration {'' if start.certified else 'not '}certified: {start.reason}"
         base = start.base
         places[first][:3] = start.tool[:3, 3]
         for other in places.keys() - {first}:  # where their positions are least off, seen from the base
@@ -103,8 +103,11 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         turn = (base @ flange[own])[:, :3, :3].transpose(0, 2, 1) @ measured[own, :3, :3]
         places[name] = frame_numbers(rigid(proper(turn.sum(axis=0)), places[name][:3]))
     missed = transformed(base @ flange, np.array([places[name][:3] for name in marker.tolist()])) - y
-    error = 1e3 * float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
-    return frame_numbers(base), places, f"{how}; RMS error of the nominal robot {three_digits(error)} mm"
+    error = float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
+    fits = f"RMS error of the nominal robot {three_digits(1e3 * error)} mm"
+    if error > UNEXPLAINED * np.linalg.norm(y.std(axis=0)):
+        fits = f"the nominal robot does not explain the data, {fits.replace(' of the nominal robot', '')}"
+    return frame_numbers(base), places, f"{fits}; {how}"
 
 
 APART = 0.1
@@ -179,6 +182,9 @@ def problem_from(
     if not isinstance(robot, Robot):
         accepted = "a Robot, such as ro.robot.Robot('arm', mdh), a file, or the name of a ready robot"
         raise InputError("robot", type(robot).__name__, accepted)
+    if not isinstance(data, Dataset):
+        accepted = "a Dataset: ro.read_data(table, robot, {'position_mm': 0.03}), or ro.load(folder) of rpim-opt new"
+        raise InputError("data", f"{data!r}" if isinstance(data, str | Path) else type(data).__name__, accepted)
     joints = {block.q.shape[-1] for block in data.blocks}
     if joints - {robot.joint_map.shape[1]}:
         found = f"{', '.join(map(str, sorted(joints)))} joint values per row"

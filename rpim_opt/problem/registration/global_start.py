@@ -24,6 +24,7 @@ from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
 from rpim_opt.problem.registration.frames import ridge_deviations
 from rpim_opt.problem.registration.points import (
+    UNEXPLAINED,
     Candidates,
     Fit,
     Points,
@@ -38,8 +39,6 @@ from rpim_opt.robot.kinematics import FRAME, forward_kinematics, frame_numbers, 
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
-UNEXPLAINED = 0.01
-"""Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
 ACCEPTED = 0.02  # a mapping may leave this part of the extent: an arm's geometric errors are not fitted with it
 EXPLAINED = 3.0
 """A mapping is taken if it leaves less than a third of what the nominal one leaves with zeros fitted near it."""

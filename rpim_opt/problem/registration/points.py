@@ -28,6 +28,8 @@ LONGEST = 3.0  # a reflector farther from the flange [m] is none
 LEVER = 0.3  # length of a pose's axes whose tips are fitted like points, as a part of the extent of its positions
 FULL_WEIGHT = 3.0
 """Rows farther off than so many medians count less, in proportion: gross errors do not decide what a table means."""
+UNEXPLAINED = 0.01
+"""Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
 LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 
 
