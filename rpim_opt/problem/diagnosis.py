@@ -54,6 +54,7 @@ BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
 FOLDED = 0.1  # part of its largest value below which the smallest one of a column without signs is near zero
+MOST_DECIMALS = 4  # that are counted
 ON_GRID = 2e-4  # part of a step by which rounded values may miss it, for their last decimal
 NARROWER, GRID = 0.25, 61
 """Factor by which the grid for a joint's values gets narrower from round to round, and its points."""
@@ -399,7 +400,11 @@ def filled_rows(data: Dataset) -> Iterator[str]:
         order = np.argsort(block.row)
         q, y, labels = block.q[order, 0], block.y[order, :3], np.array(data.label)[block.row[order]]
         moves = np.linalg.norm(np.diff(y, axis=0), axis=1)
-        middle = np.linalg.norm(y[1:-1] - (y[:-2] + y[2:]) / 2, axis=1) < EXACT
+        off = np.linalg.norm(y[1:-1] - (y[:-2] + y[2:]) / 2, axis=1)
+        decimals = decimals_of(1e3 * y)
+        last_digit = 10.0 ** -(MOST_DECIMALS if decimals is None else decimals)  # [mm]
+        # rounding alone: measured points of a grid are nearly half way, the nearer the smaller their unit
+        middle = off < min(EXACT, np.sqrt(3) * 1e-3 * last_digit)
         between = labels[1:-1][middle & (np.minimum(moves[:-1], moves[1:]) > FILLED)].tolist()
         if between:
             yield (
@@ -524,8 +529,8 @@ def _step(values: Array) -> float:
 
 
 def decimals_of(values: Array) -> int | None:
-    """Return how many decimals all values have at most, up to 4; None where they have more."""
-    for decimals in range(5):
+    """Return how many decimals all values have at most, up to `MOST_DECIMALS`; None where they have more."""
+    for decimals in range(MOST_DECIMALS + 1):
         scaled = values * 10.0**decimals
         if np.abs(scaled - scaled.round()).max(initial=0.0) < 1e-6 * np.abs(scaled).max(initial=1.0) ** 0.5:
             return decimals
@@ -1177,14 +1182,17 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         radial = y / np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
         along += np.column_stack([np.sum(of_axis * y, axis=1), np.sum(of_axis * radial, axis=1)])
 
-    def off(column: Array, what: str, remedy: str) -> Addition:
-        return Addition(column[:, None], lambda c: (what.format(100 * c[0], three_digits(1e3 * c[0])), remedy))
+    def scaled(column: Array, what: str, remedy: str, of: str = "too long") -> Addition:
+        return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % {of}", remedy))
 
-    yield off(along[:, 0], "measured lengths are {0:+.2g} % too long", "check the scale of the instrument")
-    too_long = "measured distances are {1} mm too long"
-    yield off(along[:, 1], too_long, "check the instrument's zero and the reflector's radius")
+    def longer(column: Array, what: str, remedy: str) -> Addition:
+        return Addition(column[:, None], lambda c: (f"{what} {three_digits(1e3 * c[0])} mm too long", remedy))
+
+    yield scaled(along[:, 0], "measured lengths are", "check the scale of the instrument")
+    too_long = "measured distances are"
+    yield longer(along[:, 1], too_long, "check the instrument's zero and the reflector's radius")
     for when, share in _shares(problem).items():
-        yield off(along[:, 1] * share, f"{when} {too_long}", "check the reflector and its radius in these rows")
+        yield longer(along[:, 1] * share, f"{when} {too_long}", "check the reflector and its radius in these rows")
     if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
         flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
         radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
@@ -1197,11 +1205,11 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         of_circles = "measure in both faces, and have it checked"
         yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), of_circles))
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
-        what = (f"column {'xyz'[i]} is {{0:+.2g}} % too long", "check its scale")
+        what = (f"column {'xyz'[i]} is", "check its scale")
         if i != j:
-            skew = f"column {'xyz'[i]} contains {{0:+.2g}} % of column {'xyz'[j]}"
-            what = (skew, "check whether the instrument's axes are square")
-        yield off(of_axis[:, i] * y[:, j], *what)
+            square = "check whether the instrument's axes are square"
+            what = (f"column {'xyz'[i]} contains", square, f"of column {'xyz'[j]}")
+        yield scaled(of_axis[:, i] * y[:, j], *what)
 
 
 # What touches say

@@ -213,6 +213,17 @@ def test_a_small_motion_of_the_instrument_is_named_before_calibrating_too(robot:
 
 
 LAST = np.arange(80)[:, None] >= 60
+NEARER = values(lambda y: y * (1 - 0.0127 * (np.arange(80) >= 40) / np.linalg.norm(y, axis=1))[:, None])
+
+
+def braced(change):
+    """Return the change with labels of rows that look like fields of a format."""
+
+    def wrong(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+        data = change(problem).data
+        return problem.on(replace(data, label=tuple(f"{{{label}}}" for label in data.label)))
+
+    return wrong
 
 
 @pytest.mark.parametrize(
@@ -222,11 +233,14 @@ LAST = np.arange(80)[:, None] >= 60
         ("fr3", joints(lambda q: q * np.where(LAST[:, None] & (np.arange(7) == 3), -1, 1)), "P61 on .* joint 4 rev"),
         ("fr3", joints(lambda q: np.where(np.arange(7) < 3, np.radians(q), q)), "joints 1, 2 and 3 read as radians"),
         ("iiwa7", joints(lambda q: q[..., [0, 1, 6, 2, 3, 4, 5]]), "joints in the order q1, q2, q7, q3, q4, q5, q6"),
-        ("iiwa7", values(lambda y: y * (1 - 0.0127 * (np.arange(80) >= 40) / np.linalg.norm(y, axis=1))[:, None]),
-         "from row P4. on measured distances are -12"),
+        ("iiwa7", NEARER, "from row P4. on measured distances are -12"),
+        ("iiwa7", braced(NEARER), "from row {P4.} on measured distances are -12"),
         ("ur5e", of_joint(0, lambda q: (q + np.pi / 2) % np.pi - np.pi / 2), "wrong values of joint 1"),
     ],
-    ids=["rows in metres", "a sign in some rows", "mixed units", "joint 7 third", "a new radius", "half a turn"],
+    ids=[
+        "rows in metres", "a sign in some rows", "mixed units", "joint 7 third", "a new radius", "labels in braces",
+        "half a turn",
+    ],
 )  # fmt: skip
 def test_what_is_wrong_with_some_rows_or_one_place_is_named(robot: str, wrong, said: str) -> None:
     causes = likely_causes(ro.calibrate(wrong(simulated_arm(robot, count=80))))
@@ -418,6 +432,14 @@ def repeated(q: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def test_rows_that_were_filled_in_are_named(wrong, rows: list[int], said: str) -> None:
     found = inspect(wrong(np.array(rows))(simulated_arm("irb120"))).warnings
     assert any(said in text for text in found), found
+
+
+def test_measured_points_of_a_grid_are_not_called_filled_in_whatever_their_unit() -> None:
+    """Those of 60 mm in inches, read as mm, are half way to 5 um, which is the instrument's noise over 25.4."""
+    grid = np.stack(np.meshgrid(*3 * [0.06 * np.arange(4)]), axis=-1).reshape(-1, 3)[:COUNT] / 25.4
+    noisy = grid + 4e-6 * np.random.default_rng(5).normal(size=grid.shape)
+    found = inspect(values(lambda _: noisy)(simulated_arm("irb120"))).warnings
+    assert not any("half way" in text for text in found), found
 
 
 def test_outliers_that_a_joint_explains_by_chance_are_outliers() -> None:
