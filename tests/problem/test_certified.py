@@ -299,7 +299,7 @@ def test_positions_are_fitted_where_nothing_is_determined() -> None:
     problem = ro.load("position").problem
     few = problem.on(problem.data.take([0, 1, 2]))
     base, _, how = locate(few.robot, few.data, {"": np.zeros(6)})
-    assert re.search("; registration by positions: |; optimum of the registration not certified: ", how)
+    assert re.search("; registration of positions: |; optimum of the registration not certified: ", how)
     assert np.isfinite(base).all()
 
 

@@ -149,7 +149,7 @@ def once_each(markers: int, each: int) -> tuple[ro.Dataset, dict[str, np.ndarray
 def test_where_no_marker_tells_the_base_all_are_fitted() -> None:
     data, tools = once_each(24, 3)
     base, _, how = locate(ARM, data, {name: tool + 0.02 for name, tool in tools.items()})
-    assert "; registration by positions: " in how
+    assert "; registration of positions: " in how
     assert base == pytest.approx([0.4, -0.3, 0.2, 0.1, -0.2, 0.5], abs=0.02)
 
 

@@ -77,7 +77,7 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         if start.uncertainty > UNKNOWN or (len(count) > 1 and not start.certified):
             raise InputError("the data", start.reason, "rotations about two axes")
     except InputError as error:
-        how = f"registration by positions: {error.found}"
+        how = f"registration of positions: {error.found}"
         names = list(places)
         number = np.array([names.index(name) for name in marker.tolist()])
         nominal = np.array([place[:3] for place in places.values()])
