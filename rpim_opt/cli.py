@@ -304,7 +304,7 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         document["lack_of_fit"] = {**lacking.content(), "outliers": [row.label for row in outliers]}
         text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"
         if outliers:
-            text += f"\nIt excludes as outliers: {listed([str(row) for row in outliers], 10)}."
+            text += f"\nExcluded outliers: {listed([str(row) for row in outliers], 10)}."
     return Answer(text, document)
 
 

@@ -54,7 +54,7 @@ EXTENSIONS = {
     "first harmonic": Extension(
         ("ecc_cos?", "ecc_sin?"),
         "eccentric encoders or gears (once a turn)",
-        "Encoders or gears of joints are eccentric (errors once a turn)",
+        "Encoders or gears of joints have errors once a turn",
         ("ecc",),
     ),
     "second harmonic": Extension(

@@ -294,7 +294,7 @@ def camera_remarks(result: Outcome) -> list[str]:
 
     before, after = (rms(errors(dimension="pixel")) for errors in (result.nominal_errors, result.errors))
     remarks = [
-        f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; in millimetres, the distance of the "
+        f"Reprojection error (RMS): {before:.3g} px before, {after:.3g} px after; errors in mm are distances of the "
         "line of sight from the point. It measures how well views agree, not how well the robot is identified."
     ]
     lens = improvement(result)
@@ -376,7 +376,7 @@ def contact_remarks(problem: CalibrationProblem) -> list[str]:
     definition = f"Error of a touch: the modelled distance of the tool from {', or '.join(nearest)}"
     reach = "robots reach" if len(problem.arms) > 1 else "robot reaches"
     consistently = f"the error shows how consistently the {reach} them from all sides"
-    remarks = [f"{definition}. These were not measured: {consistently}."]
+    remarks = [f"{definition}. True places were not measured: {consistently}."]
     if not any(tie.kind == "known_distance" for tie in problem.touches.ties):
-        remarks.append("No distance is known: the scale of the robot rests on its nominal lengths alone.")
+        remarks.append("The scale of the robot rests on its nominal lengths: a [[known_distance]] would determine it.")
     return remarks

@@ -1229,7 +1229,4 @@ def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
         "offset of the first joint."
     )
     if all(tie.kind != "known_distance" for tie in touches.ties):
-        yield (
-            "The scale of the robot rests on its nominal lengths: a known distance between two touched points "
-            "([[known_distance]]) would determine it."
-        )
+        yield "The scale of the robot rests on its nominal lengths: a [[known_distance]] would determine it."

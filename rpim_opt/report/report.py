@@ -367,8 +367,8 @@ def _identifiability(result: Calibration) -> Iterator[Block]:
             text += f" Unidentifiable (no measurement depends on them): {', '.join(observability.unidentifiable)}."
         text += (
             " Redundant combinations [mm, mrad], which change no measurement at the nominal parameters; the "
-            "penalty determines them. Predictions of what was measured do not depend on them; those of another point "
-            "on the flange or of its orientation may."
+            "penalty determines them. Predictions of another point on the flange or of its orientation may depend on "
+            "them."
         )
     yield "text", [text]
     yield "bullets", redundant
@@ -387,7 +387,7 @@ def _flagged(result: Calibration) -> Block:
     for row in () if result.learned is None else result.learned.left_out:
         if row.label not in result.record.excluded:
             error = in_unit(row.error, row.dimension)
-            rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} x the median error"])
+            rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} times the median error"])
     if not rows:
         return "text", ["No row is flagged or excluded (one in a hundred good data sets has a flagged row)."]
     head = ["row", "standardized residual", "error", "status"]

@@ -166,7 +166,7 @@ def identifiability(result: Calibration) -> str:
     s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
     rank, count = int(np.sum(s > RANK_TOLERANCE * s[0])), int(parameters.sum())
     apart = "" if parameters.all() else ", without the transmission errors of the joints"
-    others = " Parameter standard deviations include the unidentifiable ones; position uncertainties do not."
+    others = " Parameter standard deviations include the unidentifiable ones; predictions of what was measured do not."
     others = others if rank < count else ""
     return f"{rank} of {count} parameter combinations are identifiable from {model.equations} equations{apart}.{others}"
 
