@@ -70,6 +70,7 @@ class Report:
 Row = dict[str, Any]  # a case with its figures
 Work = Callable[[], Row]  # computation of a replicate; it travels to wherever it is computed
 PACKAGE = Path(__file__).resolve().parents[1]
+STUDIES = PACKAGE.parent / "studies"  # of the checkout; an installed package has none
 LIBRARIES = [Path(sysconfig.get_path(key)).resolve() for key in ("stdlib", "platstdlib", "purelib", "platlib")]
 """Where Python files lie that the versions of packages stand for."""
 SHORT = 12  # digits of a digest that a reader compares by eye
@@ -78,16 +79,9 @@ SHORT = 12  # digits of a digest that a reader compares by eye
 # --- where a study is ------------------------------------------------------------------------------------------------
 
 
-def studies_folder() -> Path | None:
-    """Return the folder ``studies`` of the checkout; an installed package has none."""
-    folder = Path(__file__).resolve().parents[2] / "studies"
-    return folder if folder.is_dir() else None
-
-
 def find_study(name: str | Path) -> Path:
     """Return the file of a path, of a folder with ``study.py``, or of a name in the checkout or the current folder."""
-    own = studies_folder()
-    known = {path.stem: path for path in sorted(own.glob("*.py"))} if own else {}
+    known = {path.stem: path for path in sorted(STUDIES.glob("*.py"))}
     text = str(name)
     places = [text, f"{text}/{FILE}", f"{text}.py", f"studies/{text}.py", f"studies/{text}/{FILE}"]
     for place in [known[text]] if text in known else map(Path, places):
@@ -166,7 +160,7 @@ def _matching(folder: Path, pattern: str) -> set[Path]:
 
 def made_by(path: Path, quick: bool, count: int, files: Mapping[str, str]) -> str:
     """Return a sentence on the command, commit, files and versions that produce the replicates."""
-    name = _label(path) if path.parent == studies_folder() else path.name
+    name = _label(path) if path.parent == STUDIES else path.name
     source = f"`rpim-opt study {name}{' --quick' if quick else ''}`, {file_state(path)}, with {package_state()}"
     digest = sha256(repr(sorted(files.items())).encode()).hexdigest()[:SHORT]
     known = f"{len(files)} files in its folder or named by it have SHA-256 {digest}; others that it reads are not known"

@@ -23,8 +23,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.use import recalibration
 
-FALSE_ALARM = 0.01  # probability that a robot that does not drift is said to
-TESTS = 3  # each check alone, their sum, and every parameter: each test may err by a third of `FALSE_ALARM`
+TESTS = 3  # each check alone, their sum, and every parameter: each may err by a third of `recalibration.FALSE_ALARM`
 MOMENTS = 40  # checks before which a change is looked for; of more so many, evenly
 SMALLEST = 1e-12  # probabilities are taken as no smaller: 7 standard deviations
 ALLOWANCE = 0.5  # CUSUM's reference value k, taken off every deviate: sums answer fastest to a shift of twice as much
@@ -155,7 +154,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
 
     A check is judged by the prediction interval of a new reading, given the calibration and all checks before it; the
     innovations are summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before
-    some check or steadily. A robot that does not drift is said to with probability `FALSE_ALARM` in all.
+    some check or steadily. A robot that does not drift is said to with probability 0.01 in all.
 
     The result has a squared penalty or none. ``data`` are check readings in the instrument's frame of the calibration,
     in the order of ``when`` (N,) [s] if that is stated; ``times`` are N texts that say so.
@@ -187,7 +186,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
     sizes = np.zeros(count, dtype=int)
     for block in data.blocks:
         sizes[block.row] = len(block.measurement.components)
-    level = FALSE_ALARM / TESTS
+    level = recalibration.FALSE_ALARM / TESTS
     sigmas, deviate = _innovations(result, problem, level / count)
     return Monitoring(
         label=data.label, times=times, when=when, error=result.errors(data), sigmas=sigmas,

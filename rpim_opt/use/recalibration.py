@@ -35,7 +35,7 @@ from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.parameters import Parameters, is_joint_offset, of_session
 from rpim_opt.store.result_file import content
 
-FALSE_ALARM = 0.01  # probability with which a robot that did not change is said to have changed, over all causes
+FALSE_ALARM = 0.01  # probability that a robot that did not change, or does not drift, is said to, over all causes
 MULTIPLES = (1.0, 3.0, 10.0, 30.0)  # multiples of a deviation's prior width that a change may have, each as likely
 UNCHANGED = 0.5  # prior probability that nothing changed; the other half is dealt out to the kinds of causes in use
 OUTLIER_WIDTH = 10.0  # standard deviations by which an outlier is off, times `MULTIPLES`

@@ -96,7 +96,7 @@ def test_a_study_without_one_is_a_sentence(place: Path, monkeypatch, capsys) -> 
 
 
 def test_an_installed_package_names_no_studies_of_its_own(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(studies, "studies_folder", lambda: None)
+    monkeypatch.setattr(studies, "STUDIES", place / "nowhere")
     with pytest.raises(ro.InputError, match=r"accepted: a Python file, or a folder with study.py\.$"):
         studies.find_study("paper")
     assert run_study("mine", quick=True)[0].metrics == {"largest": 2}

@@ -49,7 +49,7 @@ def report(rows):
 def toy(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     folder = tmp_path / "studies"
     folder.mkdir()
-    monkeypatch.setattr(studies, "studies_folder", lambda: folder)
+    monkeypatch.setattr(studies, "STUDIES", folder)
 
     def write(stop: bool = False) -> Path:
         studies.load_study.cache_clear()
@@ -247,7 +247,7 @@ def test_a_line_that_was_not_finished_is_computed_again(toy, tmp_path: Path) -> 
 def test_a_journal_of_other_code_is_refused(toy, tmp_path: Path) -> None:
     journal = interrupted(toy, tmp_path / "out")
     before = journal.read_bytes()
-    path = studies.studies_folder() / "toy.py"
+    path = studies.STUDIES / "toy.py"
     path.write_text(path.read_text().replace(".uniform()", ".normal()"))
     studies.load_study.cache_clear()
     with pytest.raises(ro.InputError, match=r"replicates of another file toy\.py"):
@@ -327,7 +327,7 @@ def test_an_untracked_study_is_not_the_commits(tmp_path: Path, monkeypatch) -> N
         subprocess.run(command, check=True, capture_output=True)
 
     (tmp_path / "studies").mkdir()
-    monkeypatch.setattr(studies, "studies_folder", lambda: tmp_path / "studies")
+    monkeypatch.setattr(studies, "STUDIES", tmp_path / "studies")
 
     def made_by_toy() -> str:
         return studies.made_by(tmp_path / "studies" / "toy.py", False, 1, {})
