@@ -159,22 +159,18 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
     pairs = _pairs(joints, values, key, _keyed)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
-    pair = (telling or pairs)[0] if len(telling or pairs) == 1 else None
+    pair = _only(telling or pairs)
     if key == "row":
         return _row_numbers(joints, values, pair if telling else None)
-    if key in ("", "label") and "label" in joints.columns:
-        labels = _normal(joints.columns["label"])
-        for column in ("label", "configuration"):
-            chosen = _keyed("label", (), labels, _normal(values.columns.get(column, ())))
-            if {*labels} & {*chosen.right} and not (telling and counts_rows(labels)):
-                return chosen
     common = [name for name in joints.raw if name in values.raw]
-    name = common[0] if not key and len(common) == 1 and not (telling and pair) else key.lower()
-    if name in common:
-        return _keyed(f"column '{name}'", (name,), _normal(joints.raw[name]), _normal(values.raw[name]))
-    numbered = [] if pairs else _pairs(joints, values, key, _by_numbers)
-    if pair or len(numbered) == 1:
-        return pair or numbered[0]
+    stated = key.lower() or (None if telling and pair else _only(common))
+    chosen = _labels(joints, values, bool(telling)) if key in ("", "label") else None
+    if not chosen and stated in common:
+        chosen = _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
+    if not chosen and not pairs:  # names that differ, with the same numbers
+        pair = _only(_pairs(joints, values, key, _by_numbers))
+    if chosen or pair:
+        return chosen or pair
     found = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
     if key:
         found = f"'{key}', whose values no column of the other file has"
@@ -183,16 +179,32 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     raise InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
 
 
+def _only(items: Sequence[Any]) -> Any:
+    """Return the only one; None where there is none, or several."""
+    return items[0] if len(items) == 1 else None
+
+
+def _labels(joints: Understood, values: Understood, others_tell: bool) -> Key | None:
+    """Return the labels of rows with joints that measured ones have, too, unless they count rows and others tell."""
+    labels = _normal(joints.columns.get("label", ()))
+    if others_tell and counts_rows(labels):
+        return None
+    sides = (_normal(values.columns.get(column, ())) for column in ("label", "configuration"))
+    keys = (_keyed("label", (), labels, side) for side in sides)
+    return next((each for each in keys if {*labels} & {*each.right}), None)
+
+
 def _pairs(
     joints: Understood, values: Understood, key: str, keyed: Callable[[str, tuple[str, ...], list[str], list[str]], Key]
 ) -> list[Key]:
     """Return the keys that two columns make whose values are nearly the same."""
-    pairs = [
+    keys = (
         keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others)
         for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
         if key in ("", "row") or key.lower() in (name.lower(), other.lower())
-    ]
-    return [pair for pair in pairs if _alike({*pair.left}, {*pair.right})]
+    )
+    sides = ((each, {*each.left}, {*each.right}) for each in keys)
+    return [each for each, own, others in sides if len(own & others) >= max(SAME * min(len(own), len(others)), 1)]
 
 
 def _by_numbers(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
@@ -205,10 +217,6 @@ def _by_numbers(how: str, columns: tuple[str, ...], left: list[str], right: list
     named = dict(zip(own, left, strict=True))
     named = [named.get(number, name) for number, name in zip(others, right, strict=True)]
     return Key(f"{how} ('{example}' as '{next(iter(named), '')}')", columns, left, named)
-
-
-def _alike(own: set[str], others: set[str]) -> bool:
-    return len(own & others) >= max(SAME * min(len(own), len(others)), 1)
 
 
 def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
