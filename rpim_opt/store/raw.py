@@ -126,19 +126,11 @@ def understand_of(
 ) -> Understanding:
     """Interpret raw tables (files or data frames) of measurements, or of targets, as one table."""
     options = options or TableOptions()
-    once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}  # once a sheet is once
-    books = {key for key in once if Path(str(key)).suffix.lower() in EXCEL}
-    of_text = replace(options, sheet="") if books else options  # a sheet is the workbooks'
-    files = [
-        (path, _upright(raw, arm))
-        for key, source in once.items()
-        for path, raw in _sheets(source, options if key in books else of_text)
-    ]
-    columns = [raw.columns for _, raw in files]
-    if measurement is None:
+    files = [(path, _upright(raw, arm)) for path, raw in _read(data, options)]
+    known = pick(MEASUREMENTS, measurement, "measurement") if isinstance(measurement, str) else measurement
+    if known is None:
+        columns = [raw.columns for _, raw in files]
         known = next((kind for kind in MEASUREMENTS.values() if kind.shown_by and kind.shown_by(columns)), None)
-    else:
-        known = pick(MEASUREMENTS, measurement, "measurement") if isinstance(measurement, str) else measurement
     for kind in [known] if known else (pose, position):
         tables = _tables(files, arm, kind, options, targets)
         stems = set().union(*(each.stems for each in tables))
@@ -150,6 +142,15 @@ def understand_of(
     sheets = [note.rstrip(".") for _, raw in files for note in raw.notes if note.startswith("sheet '")]
     accepted = "; ".join([f"columns x, y, z, or --measurement {', '.join(MEASUREMENTS)}", *sheets])
     raise InputError("the header", f"no positions among {names}", accepted, files[0][0])
+
+
+def _read(data: Sequence[Any], options: TableOptions) -> Files:
+    """Return the tables of sources, each once; of workbooks and texts a stated sheet is the workbooks'."""
+    once = {str(each) if isinstance(each, str | Path) else id(each): each for each in data}
+    books = {key for key in once if Path(str(key)).suffix.lower() in EXCEL}
+    of_text = replace(options, sheet="") if books else options
+    own = [(source, options if key in books else of_text) for key, source in once.items()]
+    return [each for source, stated in own for each in _sheets(source, stated)]
 
 
 def _sheets(source: Any, options: TableOptions) -> Files:
