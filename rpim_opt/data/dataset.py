@@ -30,10 +30,8 @@ class Block(Brief):
     are the reflectors of the points and ``fixture`` is which anchor, plane or sphere, ``""`` for the only one;
     ``robot`` is whose rows these are.
 
-    Perhaps there are ``torque`` (N, p, dof) of the controller's joints [Nm], ``payload`` (N,) at the flange [kg] (else
-    that of the robot's `Gravity`), ``approach`` (N, p, dof), the direction in which the joints moved last (-1, 0 or
-    +1), names (N, p) of the points that were touched or seen and (N,) of the ``session``, and further ``columns`` (N,)
-    [SI] by name, which terms and measurements of a user's own see.
+    Perhaps there are what `Dataset.of` takes besides: ``torque`` and ``approach`` (N, p, dof), ``payload`` (N,) (else
+    that of the robot's `Gravity`), names (N, p) of the ``point`` and (N,) of the ``session``, and ``columns`` (N,).
     """
 
     measurement: Measurement

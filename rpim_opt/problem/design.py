@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.tables import numbers, read_columns
 from rpim_opt.basics.text import Brief, counted
 from rpim_opt.basics.units import UNITS, joint_columns, with_unit
@@ -21,7 +21,7 @@ from rpim_opt.problem.linear import reduced_rows
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.mdh import Robot
 
-CRITERIA = ("D", "A", "V")
+CRITERIA = {"D": "det^(1/n)", "A": "mean variance", "V": "predicted variance"}
 ANYWHERE = 1.0  # standard deviation of where a touched point is [m]
 MOST_STEPS, MOST_PASSES = 4000, 20  # of the relaxation, and of exchanges over all chosen
 
@@ -47,9 +47,8 @@ class Design(Brief):
         return f"{counted(len(self.chosen), 'configuration')} chosen"
 
     def __str__(self) -> str:
-        names = {"D": "det^(1/n)", "A": "mean variance", "V": "predicted variance"}
         count = f"{len(self.chosen)} of {len(self.weights)} configurations"
-        what = f"{count}, {self.criterion}-optimal ({names[self.criterion]})"
+        what = f"{count}, {self.criterion}-optimal ({CRITERIA[self.criterion]})"
         if self.gap > 1:
             return f"{what}: too few for a useful optimality bound; choose more."
         return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
@@ -124,8 +123,7 @@ def choose(
     >>> print(str(design).partition(":")[0])
     30 of 60 configurations, V-optimal (predicted variance)
     """
-    if criterion not in CRITERIA:
-        raise InputError("criterion", f"'{criterion}'", choices(criterion, CRITERIA))
+    pick(CRITERIA, criterion, "criterion")
     candidates = np.atleast_2d(np.asarray(candidates, dtype=float))
     if not 0 < count < len(candidates):
         raise InputError("count", f"{count}", f"1 to {len(candidates) - 1}, fewer than the candidates")

@@ -12,7 +12,7 @@ from string import ascii_uppercase
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import fits
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.blocks import Source
@@ -91,8 +91,7 @@ def _common(
     """Return what every problem shares: parameters that match a pattern and that several have, stated alike."""
     patterns = shared if isinstance(shared, Mapping) else dict.fromkeys(parts, shared)
     for key, each in patterns.items():
-        if key not in parts:
-            raise InputError("together, shared", f"'{key}'", choices(key, parts))
+        pick(parts, key, "together, shared")
         if isinstance(each, str):
             raise InputError("together, shared", f"'{each}'", f"patterns in a list: ['{each}']")
     count = Counter(name for part in parts.values() for name in part.parameters.names)

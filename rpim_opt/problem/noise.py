@@ -63,11 +63,8 @@ class Stack:
 
     def of(self, dimension: str) -> np.ndarray:
         """Return which equations (N, k) are of a dimension: ``length``, ``angle``, or any other."""
-        if dimension == "length":
-            return self.length
-        if dimension == "angle":
-            return self.angle
-        return ~(self.length | self.angle)
+        others = ~(self.length | self.angle)
+        return {"length": self.length, "angle": self.angle}.get(dimension, others)
 
     def covariance(self, repeatability: Repeatability, reading: bool = True) -> Array:
         """Return the covariances (N, k, k) [SI] of the residuals; without the instrument's part if not of a reading."""

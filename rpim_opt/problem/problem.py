@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.exceptions import InputError, choices, pick
 from rpim_opt.basics.text import Tabled, counted
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, of_fixture
@@ -206,11 +206,9 @@ class CalibrationProblem(RobotModel):
 
     def alone(self, robot: str) -> CalibrationProblem:
         """Return the problem of one of several robots: its parameters, under their own names, and its rows."""
-        if robot not in self.arms:
-            raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
+        arm = pick(self.arms, robot, "robot")
         if not robot:
             return self
-        arm = self.arms[robot]
         p = self.parameters.of_robot(robot)
         others = set(p.terms) - set(arm.model.names(arm.joint_types))  # shared among other robots
         own = np.flatnonzero([name not in others for name in p.names])
@@ -257,8 +255,7 @@ class CalibrationProblem(RobotModel):
         the data state directions of approach, the column "approach" (N, dof) holds -1, 0 or 1, by default 0: the joints
         are in the middle of their backlash. ``covariance`` is as `Dataset.of` takes it.
         """
-        if robot not in self.arms:
-            raise InputError("robot", f"'{robot}'", choices(robot, self.arms))
+        pick(self.arms, robot, "robot")
         q = np.atleast_2d(np.asarray(q, dtype=float))
         N = len(q)
         y = np.zeros((N, len(measurement.columns)))

@@ -17,7 +17,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, read_columns, texts
 from rpim_opt.basics.units import LARGEST, split, split_unit
-from rpim_opt.data.dataset import Dataset
+from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import Measurement, Words
 from rpim_opt.data.tables.reading import quantities_of, require_unique
 
@@ -209,12 +209,15 @@ def on_board(table: Columns, board: Board) -> Columns:
     return {**table, **{f"{stem}_m": values for stem, values in zip(TARGET, places, strict=True)}}
 
 
+def targets(block: Block) -> Array:
+    """Return where the points of a camera's block are on their board (N, 3) [m]."""
+    return np.column_stack([block.columns[stem] for stem in TARGET])
+
+
 def board_of(data: Dataset) -> dict[str, Array]:
     """Return the points that the rows of cameras name, by name."""
     board = {}
     for block in data.blocks:
-        if not block.measurement.by_camera or block.point is None:
-            continue
-        places = np.column_stack([block.columns[stem] for stem in TARGET])
-        board |= {str(name): place for name, place in zip(block.point[:, 0], places, strict=True)}
+        if block.measurement.by_camera and block.point is not None:
+            board |= dict(zip(map(str, block.point[:, 0]), targets(block), strict=True))
     return board

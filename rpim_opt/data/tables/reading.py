@@ -87,15 +87,10 @@ def _dataset(table: Columns, robot: Robot, declared: Mapping[str, Any], kind: Me
     session = texts(table.get("session", ()), "session")
     stated |= {"marker": _markers(table, kind, q, label), "fixture": texts(table.get("fixture", ()), "fixture")}
     data = Dataset.of(q, y, noise, label, kind, columns=further, session=session, point=point, **stated)
-    data = replace(data, configuration=_configurations(table, q.reshape(N, -1)))
+    # as stated, or rows of equal joint values are one
+    stops = np.array(texts(table["configuration"], "configuration")) if "configuration" in table else q.reshape(N, -1)
+    data = replace(data, configuration=np.unique(stops, axis=0, return_inverse=True)[1].reshape(-1))
     return data.grouped_by_points() if kind.touching else data
-
-
-def _configurations(table: Columns, joints: Array) -> np.ndarray:
-    """Return the configuration (N,) of every row: as stated, or rows of equal joint values (N, d) are one."""
-    if "configuration" in table:
-        return np.unique(texts(table["configuration"], "configuration"), return_inverse=True)[1]
-    return np.unique(joints, axis=0, return_inverse=True)[1].reshape(-1)
 
 
 def _markers(table: Columns, kind: Measurement, q: Array, label: Sequence[str]) -> np.ndarray | tuple[()]:

@@ -13,9 +13,9 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.dataset import Block, Dataset
-from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, TARGET, eye_in_hand
+from rpim_opt.data.measurements.camera import CAMERAS, INTRINSICS, eye_in_hand, targets
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.data.measurements.pose import pose
+from rpim_opt.data.measurements.pose import from_matrices, pose
 from rpim_opt.problem.registration.closed_forms import proper, rigid, transformed
 
 FEWEST = {True: 4, False: 6}  # points that a view of a plane, and of points in space, has to show
@@ -133,11 +133,6 @@ def rows_by_view(data: Dataset, block: Block) -> Iterator[np.ndarray]:
         yield np.flatnonzero(configuration == number)
 
 
-def targets(block: Block) -> Array:
-    """Return where the points of a camera's block are on their board (N, 3) [m]."""
-    return np.column_stack([block.columns[stem] for stem in TARGET])
-
-
 def starting_camera(data: Dataset, block: Block) -> dict[str, float]:
     """Return focal lengths and centre [px] from the homographies of three views or more of a plane (Zhang 2000)."""
     rows = []
@@ -208,7 +203,6 @@ def _views(data: Dataset, block: Block, own: Mapping[str, float]) -> tuple[np.nd
     sigma = deviation[:, None] * [1, 1, 1, *[1 / float(np.ptp(points, axis=0).max())] * 3]
     if block.measurement is eye_in_hand:
         T = np.linalg.inv(T)
-    quaternion = scipy.spatial.transform.Rotation.from_matrix(T[:, :3, :3]).as_quat()
-    y = np.hstack([T[:, :3, 3], quaternion[:, [3, 0, 1, 2]]])
+    y = from_matrices(np.hstack([T[:, :3, 3], T[:, :3, :3].reshape(-1, 9)]))
     poses = {"measurement": pose, "y": y, "covariance": sigma[:, :, None] ** 2 * np.eye(6)}
     return block.row[index], poses | {"fixture": "", "point": None, "columns": {}}

@@ -161,12 +161,10 @@ def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, n
         raise InputError("transforms", found, "(N, 4, 4) both, or positions (N, 3)")
     if N < FEWEST:
         raise InputError("poses", f"{N}", f"{FEWEST} or more")
-    points = measured if measured.ndim == 2 else measured[:, :3, 3]
-    poses = rigid(np.eye(3), points)
-    turned = np.zeros(N, dtype=bool)
-    if measured.ndim == 3:
-        turned = np.asarray(~np.isnan(measured[:, :3, :3]).any(axis=(1, 2)))
-        poses[turned] = measured[turned]
+    if measured.ndim == 2:
+        measured = rigid(np.full((3, 3), np.nan), measured)
+    turned = np.asarray(~np.isnan(measured[:, :3, :3]).any(axis=(1, 2)))
+    poses = np.where(turned[:, None, None], measured, rigid(np.eye(3), measured[:, :3, 3]))
     if not (np.isfinite(flange).all() and np.isfinite(poses).all()):
         raise InputError("transforms", "numbers that are not finite", "finite numbers")
     for R in (flange[:, :3, :3], poses[:, :3, :3]):

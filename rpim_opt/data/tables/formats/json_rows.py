@@ -8,7 +8,7 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.files import parse_json
-from rpim_opt.basics.tables import library
+from rpim_opt.basics.tables import library, records
 from rpim_opt.basics.units import split
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
@@ -50,7 +50,7 @@ def _rows(found: Any) -> Rows:
         if columns and len(set(map(len, lists.values()))) != 1:
             raise InputError("the text", "lists of several lengths", "an array of rows, or columns of one length")
         if columns:
-            found = [dict(zip(lists, row, strict=True)) for row in zip(*lists.values(), strict=True)]
+            found = records(lists)
         else:
             found = inner[0] if len(inner) == 1 else [found]
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):

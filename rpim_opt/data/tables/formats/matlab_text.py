@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 
 from rpim_opt.basics.exceptions import InputError
+from rpim_opt.basics.tables import records
 from rpim_opt.basics.units import split
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
@@ -27,7 +28,7 @@ def read(text: str) -> Rows:
     if len({*map(len, columns.values())}) > 1:
         found = ", ".join(f"{name} {len(cells)}" for name, cells in columns.items())
         raise InputError("the matrices", f"rows of {found}", "matrices with one row per configuration")
-    return [dict(zip(columns, row, strict=True)) for row in zip(*columns.values(), strict=True)]
+    return records(columns)
 
 
 FORMATS = (TableFormat("MATLAB text", (".m",), MATRIX.search, read),)
