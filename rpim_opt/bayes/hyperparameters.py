@@ -337,7 +337,7 @@ def learned(fit: Fit, gain: float = 0.0, **more: Any) -> Learned:
         notes.append(f"The data hardly identify the prior scale of {names} ({factor}).")
     m, n = evidence.data.X.shape
     if m < n:
-        rest = f"at least {n - m} parameter combinations are determined by the prior alone."
+        rest = f"at least {n - m} parameter combinations are unidentifiable."
         notes.append(f"{m} equations for {n} parameters: {rest}")
     drift = [point.slopes @ root, tail_widening(point.z, point.C, point.v, heavy, scales, prior.tails)]
     if prior.spectrum is None:  # curves have a prior of their own; a prediction may leave the range of any joint

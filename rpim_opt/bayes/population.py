@@ -75,7 +75,7 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
     else:
         named = {f"arm {i}": result for i, result in enumerate(results, start=1)}
     if len(named) < 2:
-        raise InputError("Prior.from_population", f"{len(named)} results", "results of two arms or more")
+        raise InputError("Prior.from_population", f"{len(named)} results", "results of two robots or more")
     tables = [each.problem.parameters for each in named.values()]
     every = [name for p in tables for name, frame in zip(p.free.names, p.free.of_frames, strict=True) if not frame]
     names = tuple(dict.fromkeys(every))
@@ -91,8 +91,8 @@ def population(results: Sequence[Result] | Mapping[str, Result]) -> tuple[dict[s
         apart = own.nominal - table.nominal[places]
         far = np.abs(apart) > FAR * own.scale
         if far.any():
-            found = f"nominal {own.names[int(np.argmax(far))]} of '{label}', far from that of the first arm"
-            raise InputError("Prior.from_population", found, "arms of one type")
+            found = f"nominal {own.names[int(np.argmax(far))]} of '{label}', far from that of the first robot"
+            raise InputError("Prior.from_population", found, "robots of one type")
         full = np.zeros((len(rows), len(names)))
         full[:, places] = rows * generic[places]
         arms.append((full, values + rows @ apart))
@@ -130,6 +130,6 @@ def _places(names: Sequence[str], some: Sequence[str]) -> np.ndarray:
     for name in some:
         if name not in names:
             raise InputError(
-                "Prior.from_population", f"parameter '{name}', which some of them lack", "arms of one type"
+                "Prior.from_population", f"parameter '{name}', which some of them lack", "robots of one type"
             )
     return np.array([names.index(name) for name in some])

@@ -130,7 +130,7 @@ class Prior:
 
     @classmethod
     def from_population(cls, results: Sequence[Result] | Mapping[str, Result]) -> Prior:
-        """Return a prior for another robot of a type from several calibrated ones: their mean and spread.
+        """Return a prior for another robot of a type from several calibrated ones: mean and standard deviation.
 
         By empirical Bayes (`random_effects`), shrunken towards the generic scales where robots or data are few. Where
         the marginal likelihood of another robot's data is against it, this prior is left out (``optional``). Names in

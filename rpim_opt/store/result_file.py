@@ -390,7 +390,7 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
     own_terms = _terms(model, robot)
     if terms != own_terms:
         accepted = f"model=ro.Model(terms=[...]) with the calibration's terms: {'; '.join(map(str, terms)) or 'none'}"
-        raise InputError("key terms", "; ".join(map(str, own_terms)) or "no term given", accepted)
+        raise InputError("key terms", "; ".join(map(str, own_terms)) or "no term", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
     origins = [displaced(carried) for carried in file.origins.get(name, ())]
     return replace(robot, model=Model((*origins, *model.terms, *curves)))

@@ -112,7 +112,7 @@ class Monitoring:
             lines.append(f"Outside the prediction interval of a new reading: {listed(named, between='; ')}.")
         if self.alarm is not None:
             since = self._named(self._since(self.alarm))
-            lines.append(f"Cumulative sum above its limit: alarm at {self._named(self.alarm)}, since {since}.")
+            lines.append(f"Cumulative sum above its limit at check {self._named(self.alarm)}, rising since {since}.")
         if self.drift is not None:
             cause, first = self.drift.cause, self.drift.first
             course = f"in one step before {self._named(first)}" if first else "before the first check"

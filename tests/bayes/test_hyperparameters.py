@@ -207,7 +207,7 @@ def test_fewer_equations_than_parameters_are_said() -> None:
     few = POSITION.on(POSITION.data.configurations(5, 0))
     result = ro.calibrate(few)
     assert (
-        "15 equations for 34 parameters: at least 19 parameter combinations are determined by the prior alone."
+        "15 equations for 34 parameters: at least 19 parameter combinations are unidentifiable."
         in result.weight_sentence()
     )
 

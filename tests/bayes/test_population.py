@@ -148,5 +148,5 @@ def test_one_arm_is_no_population(count: int) -> None:
 
 def test_arms_of_another_type_are_refused() -> None:
     results = [ro.calibrate(ro.load(name).problem, ro.tikhonov, 1.0) for name in ("position", "paper_arm")]
-    with pytest.raises(ro.InputError, match="arms of one type"):
+    with pytest.raises(ro.InputError, match="robots of one type"):
         Prior.from_population(results)

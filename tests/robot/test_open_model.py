@@ -277,7 +277,7 @@ def test_a_result_says_what_it_needs_and_checks_what_it_gets(tmp_path: Path) -> 
     problem = measured(blank().with_model(model), noise=SIGMA, own2=3e-4)
     result = ro.calibrate(problem, ro.tikhonov, weight=1.0)
     ro.store.save_result(result, tmp_path / "result.json")
-    with pytest.raises(ro.InputError, match=r"found no term given, accepted: model=.*joint \(own2, own3, own4\)"):
+    with pytest.raises(ro.InputError, match=r"found no term, accepted: model=.*joint \(own2, own3, own4\)"):
         ro.load_result(tmp_path / "result.json")
     other = ro.Model([ro.robot.Term(lambda joint, size: size * joint.q, scales, joints=(2, 3, 4))])
     with pytest.raises(ro.InputError, match="terms and measurement models"):

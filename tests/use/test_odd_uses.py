@@ -109,7 +109,7 @@ def test_monitoring_says_what_moved(drift: Drift | None, said: str) -> None:
     found = replace(quiet, sums=sums, drift=drift)
     lines = str(found).splitlines()
     assert lines[0] == "The robot deviates from its calibration (8 checks read)."
-    assert lines[1] == "Cumulative sum above its limit: alarm at '5', since '3'."
+    assert lines[1] == "Cumulative sum above its limit at check '5', rising since '3'."
     assert said in lines[2]
     assert found.content()["since"] == "3"
     only = replace(quiet, sigmas=quiet.sigmas + 100.0 * (np.arange(8) == 5), drift=drift)
