@@ -142,7 +142,7 @@ def test_a_rejected_population_takes_nothing_else_with_it() -> None:
 @pytest.mark.parametrize("count", [0, 1])
 def test_one_arm_is_no_population(count: int) -> None:
     result = ro.calibrate(ro.load("position").problem, ro.tikhonov, 1.0)
-    with pytest.raises(ro.InputError, match="two arms"):
+    with pytest.raises(ro.InputError, match="two robots"):
         Prior.from_population([result] * count)
 
 
