@@ -191,8 +191,7 @@ class Dataset(Tabled):
     def take(self, index: Sequence[int] | np.ndarray) -> Dataset:
         """Return the rows at ``index`` (K,), in that order; a row may be taken more than once."""
         index = np.asarray(index, dtype=int)
-        owner = np.empty(len(self), dtype=int)
-        place = np.empty(len(self), dtype=int)
+        owner, place = np.empty((2, len(self)), dtype=int)
         for i, block in enumerate(self.blocks):
             owner[block.row] = i
             place[block.row] = np.arange(len(block.row))

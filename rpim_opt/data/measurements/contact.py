@@ -157,14 +157,12 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
     labels: list[str] = []
     for i, each in enumerate(known):
         where = each.measurement.name.replace("_", " ")
-        for name in each.between:
-            pick(touched, name, where)
-        planar = {touched[name].measurement.planar for name in each.between}
+        first, second = (pick(touched, name, where) for name in each.between)
+        planar = {first.measurement.planar, second.measurement.planar}
         if len(planar) > 1 or (each.measurement is not known_distance and planar == {False}):
             accepted = "two planes, or two points for a distance"
             raise InputError(where, f"between '{each.between[0]}' and '{each.between[1]}'", accepted)
         # the row's joint values are those of a touch of either; it is of one robot, where the two are all touches say
-        first, second = (touched[name] for name in each.between)
         if second.robot != first.robot:
             first = second
         stated: dict[str, Any] = {"payload": first.payload}

@@ -92,7 +92,7 @@ def understand(
     raw: RawTable,
     robot: Robot,
     kind: Measurement,
-    options: TableOptions | None = None,
+    options: TableOptions,
     joints: Sequence[str] = (),
     targets: bool = False,
 ) -> Understood:
@@ -100,7 +100,6 @@ def understand(
 
     ``joints`` are the names of the robot's file. Of ``targets`` what was commanded counts; rows may lack either values.
     """
-    options = options or TableOptions()
     units = options.units
     options = replace(options, units={**raw.units, **units}, joints=tuple(joints))
     if options.rotation not in ("", "vector") and not known_names.EULER.fullmatch(options.rotation):
@@ -122,12 +121,10 @@ def understand(
     table = Understood(columns, of_file, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
     if not targets:
         table = _rows_with_values(table, robot, kind)
-    notes = list(table.notes)
-    for dimension, each in {dimension_of(m.unit): m for m in meant if m.unit and "in the header" in m.why}.items():
-        unit = units.get(dimension, each.unit)
-        if unit != each.unit:
-            notes.append(f"--units {unit} does not apply: the header has '{each.column}' in {each.unit}.")
-    return replace(table, notes=tuple(notes))
+    headed = {dimension_of(each.unit): each for each in meant if each.unit and "in the header" in each.why}
+    other = [(units[of], each) for of, each in headed.items() if units.get(of, each.unit) != each.unit]
+    notes = [f"--units {unit} does not apply: the header has '{m.column}' in {m.unit}." for unit, m in other]
+    return replace(table, notes=(*table.notes, *notes))
 
 
 def _as_quaternions(columns: Columns, meant: Sequence[Meant], rotation: str) -> tuple[Columns, list[Meant]]:
