@@ -116,40 +116,31 @@ def new_problem(
     if validation and hold_out is not None:
         raise InputError("validation", "a table and a fraction to hold out", "one of them")
     arm = read_arm(source, urdf_base, urdf_tip, dh, origins=bool(chain))
-    paths, later = _files(data), _files(validation or ())
-    tell = understood or (lambda understanding: None)
-    understanding = in_time_order(understand_of(arm, paths, measurement, options))
-    tell(understanding)
     identified, validated, seen = (f"{chain}_{name}" if chain else name for name in TABLES)
     board = stated_target(target, seen)
-    kind, how = _kind(arm, understanding, board, measurement)
-    understanding = replace(understanding, kind=kind)
-    rows = rows_of(understanding, on_board(understanding.columns, board.board), arm, kind)
-    columns = understanding.columns
+    paths, later = _files(data), _files(validation or ())
+    tell = understood or (lambda found: None)
+    found = in_time_order(understand_of(arm, paths, measurement, options))
+    tell(found)
+    kind, how = _kind(arm, found, board, measurement)
+    found = replace(found, kind=kind)
+    rows = rows_of(found, on_board(found.columns, board.board), arm, kind)
     held = _held_out(rows, hold_out, seed)
-    tables = {identified: _rows(columns, ~held), validated: _rows(columns, held), seen: board.table}
+    tables = {identified: _rows(found.columns, ~held), validated: _rows(found.columns, held), seen: board.table}
     if later:
-        other = in_time_order(understand_of(arm, later, kind.name, understanding.options))
+        other = in_time_order(understand_of(arm, later, kind.name, found.options))
         tell(other)
         rows_of(other, on_board(other.columns, board.board), arm, kind)
         tables[validated] = other.columns
-    tables = {name: each for name, each in tables.items() if any(map(len, each.values()))}
-    noise = usual_noise(kind)
-    assumed = {} if any(name.startswith(("sigma", "u95")) for name in columns) else noise
-    supplied = [*paths, *later]
-    alike = len({file.name for file in supplied}) < len(supplied)  # then their paths are noted
-    with in_file(understanding.file):
+    with in_file(found.file):
         text, guessed = _problem_text(
-            arm, kind, rows.take(np.flatnonzero(~held)), chain, noise=noise, first=not before, source=source,
-            ready=source.parent == READY, links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=board.stated,
-            identification=identified, columns=how, data=paths[0].name, validation=validated, held_out=held.any(),
-            seed=seed, validated_by=next((file.name for file in later), ""),
-            assumed=bool(assumed),
-            raw={str(file) if alike else file.name: files.sha256_of(file) for file in supplied},
-            ignored=_ignored_joints(arm, understanding),
-            reading=replace(understanding.options, joints=arm.names).texts(),
+            arm, source, found, rows.take(np.flatnonzero(~held)), chain=chain, first=not before,
+            links={"urdf_base": urdf_base, "urdf_tip": urdf_tip}, target=board.stated, identification=identified,
+            columns=how, data=paths[0].name, validation=validated, held_out=held.any(), seed=seed,
+            validated_by=next((file.name for file in later), ""), raw=_digests([*paths, *later]),
         )  # fmt: skip
-    contents = {name: csv_text(each, zip(*each.values(), strict=True)).encode() for name, each in tables.items()}
+    counts = {name: len(next(iter(each.values()))) for name, each in tables.items() if any(map(len, each.values()))}
+    contents = {name: csv_text(tables[name], zip(*tables[name].values(), strict=True)).encode() for name in counts}
     contents["problem.toml"] = before + text.encode()
     if before and not dry_run:
         files.write_files({folder / name: content for name, content in contents.items()})
@@ -157,22 +148,25 @@ def new_problem(
         _write_whole(folder, contents, arm, source, bool(chain))
     added = f"Chain '{chain}' identifies the URDF's own origins; --chain NAME adds another chain to {folder}."
     of_chain = [SHARED if before else added] if chain else []
-    lost = [f"{text[0].upper()}{text[1:]}" for text in rows_without_values(rows, {"": arm.robot})]
-    notes = (
-        *_remarks(arm, source, understanding, assumed),
-        *lost,
-        f"Measurement {kind.name}: {how}.",
-        guessed,
-        *of_chain,
-    )
-    counts = {name: len(next(iter(each.values()))) for name, each in tables.items()}
-    return Started(folder, counts, notes, understanding, not dry_run)
+    notes = (*_remarks(arm, source, found, rows), f"Measurement {kind.name}: {how}.", guessed, *of_chain)
+    return Started(folder, counts, notes, found, not dry_run)
 
 
-def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, noise: Mapping[str, float]) -> Iterator[str]:
-    """Yield the assumed noise, where base and flange of a converted table are, and joint values of no joint."""
-    if noise:
-        assumed = ", ".join(f"{name} = {value:g}" for name, value in noise.items())
+def _assumed(found: Understanding) -> dict[str, float]:
+    """Return the noise that is assumed where no column states any."""
+    return {} if any(name.startswith(("sigma", "u95")) for name in found.columns) else usual_noise(found.kind)
+
+
+def _digests(supplied: Sequence[Path]) -> dict[str, str]:
+    """Return the SHA-256 of files by name, or by path where two have one name."""
+    alike = len({file.name for file in supplied}) < len(supplied)
+    return {str(file) if alike else file.name: files.sha256_of(file) for file in supplied}
+
+
+def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, rows: Dataset) -> Iterator[str]:
+    """Yield the assumed noise, base and flange of a converted table, joint values of no joint, lost values."""
+    assumed = ", ".join(f"{name} = {value:g}" for name, value in _assumed(understanding).items())
+    if assumed:
         yield (
             f"Assumed measurement noise (1 sigma): {assumed}. State the instrument's own in [noise] of problem.toml: "
             "noise beyond it is taken for the robot's repeatability."
@@ -196,6 +190,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, noise:
             f"Ignored joint values: {further}. The robot ({arm.robot.source or arm.robot.name}) has {arm.robot.dof} "
             "joints; if these move the tool, state another robot, or another link: --urdf-tip."
         )
+    yield from (f"{text[0].upper()}{text[1:]}" for text in rows_without_values(rows, {"": arm.robot}))
 
 
 def _ignored_joints(arm: RobotSetup, understanding: Understanding) -> str:
@@ -330,17 +325,19 @@ def _camera(arm: RobotSetup, columns: Columns) -> tuple[Measurement, str]:
 # --- the text of problem.toml -------------------------------------------------------------------------------------
 
 
-def _problem_text(arm: RobotSetup, kind: Measurement, rows: Dataset, chain: str, **context: Any) -> tuple[str, str]:
+def _problem_text(
+    arm: RobotSetup, source: Path, found: Understanding, rows: Dataset, **context: Any
+) -> tuple[str, str]:
     """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
     from jinja2 import Environment
 
-    robot = arm.robot
+    robot, kind = arm.robot, found.kind
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
     tools = dict.fromkeys(markers, arm.tool)
     base, how = _base(arm, rows, tools, kind)
     parameters = starting_parameters(robot, rows, base, tools)
     names = list(identifiable("auto", robot, parameters, rows))
-    if chain and markers == [""]:
+    if context["chain"] and markers == [""]:
         names = _at_links(names, carried_by(robot.model.terms), base is not None)
     lenses = starting_cameras(rows, {})
     cameras = {
@@ -356,7 +353,12 @@ def _problem_text(arm: RobotSetup, kind: Measurement, rows: Dataset, chain: str,
     template.filters |= {"toml": toml, "frame": _frame, "key": lambda k: k if bare.fullmatch(k) else toml(k)}
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(
         **context,
-        chain=chain,
+        source=source,
+        ready=source.parent == READY,
+        noise=usual_noise(kind),
+        assumed=bool(_assumed(found)),
+        ignored=_ignored_joints(arm, found),
+        reading=replace(found.options, joints=arm.names).texts(),
         robot=robot,
         kind=kind,
         rows=rows,
