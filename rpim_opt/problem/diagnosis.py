@@ -52,6 +52,7 @@ LINEAR, EXACT = 13, 1e-5
 """Coefficients of a coordinate by position and rotation of the flange, and what no measurement comes up to [m]."""
 BEYOND_REACH = 3.0
 """Lengths of the arm by which a position may be away from the others, if they are not so far themselves."""
+MOST_LOST = 0.25  # part of the rows that may be so by lost decimal points: more are of another frame or quantity
 UNRELATED = 0.25  # part of the spread of positions that a fit leaves where joint values do not explain them
 FOLDED = 0.1  # part of its largest value below which the smallest one of a column without signs is near zero
 MOST_DECIMALS = 4  # that are counted
@@ -346,7 +347,7 @@ def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[st
         reach = arm_length(arms[block.robot], [block])
         away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
         labels = [data.label[i] for i in block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]]
-        if labels:
+        if 0 < len(labels) < MOST_LOST * len(y):
             yield (
                 f"{_rows(labels, 'is', 'are')} farther from the others than the arm is long: was a decimal point lost, "
                 "or is it another unit?"
@@ -651,7 +652,7 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def turned_joint(problem: CalibrationProblem) -> Iterator[str]:
-    """Report outliers of a calibrated robot that another value of one joint explains, the same joint in all of them."""
+    """Report outliers of a calibrated robot that another value of one joint explains, or another interpretation."""
     points = points_of(problem)
     if points is None or points.turns is not None:
         return
@@ -677,6 +678,8 @@ def turned_joint(problem: CalibrationProblem) -> Iterator[str]:
             said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct column q{i + 1}"
     if said:
         yield f"{said}, or leave them out ([exclude])."
+    else:
+        yield from _read_otherwise(problem, out, float(rms(fit.error)) / points.extent)
 
 
 def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Array:
@@ -770,7 +773,7 @@ def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
 
 
 def part_way(problem: CalibrationProblem) -> Iterator[str]:
-    """Report the approximate row from which on another interpretation of the table fits."""
+    """Report the approximate row from which on another interpretation of the table fits, or in which rows it does."""
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
@@ -780,14 +783,25 @@ def part_way(problem: CalibrationProblem) -> Iterator[str]:
     if not fitting:
         return
     error = fit_points(first[max(fitting)]).error
-    far = np.append(0, np.cumsum(error > FAR * np.median(error)))
-    start = int(np.argmin(2 * far - np.arange(len(far))))  # fewest rows that are on the wrong side of it
+    far = error > FAR * np.median(error)
+    wrong = np.append(0, np.cumsum(far))
+    start = int(np.argmin(2 * wrong - np.arange(len(wrong))))  # fewest rows that are on the wrong side of it
     rest = points.take(np.arange(start, len(points.row)))
-    if len(rest.row) < FEWEST or misfit(rest) < BETTER * whole:  # what fits as stated may fit otherwise by chance
+    if wrong[start] < 2 * FEWEST:
+        yield from _read_otherwise(problem, rest, whole, f"from about row {problem.data.label[rest.row[0]]} on")
+    else:
+        yield from _read_otherwise(problem, points.take(np.flatnonzero(far)), whole)
+
+
+def _read_otherwise(problem: CalibrationProblem, some: Points, whole: float, where: str = "") -> Iterator[str]:
+    """Report another interpretation of some rows that do not fit as stated either, much better than ``whole``."""
+    least = FEWEST if where else 2 * FEWEST  # scattered rows were chosen by their errors
+    if len(some.row) < least or misfit(some) < BETTER * whole:
         return
-    better = better_reading(problem.on(problem.data.take(rest.row)))
+    better = better_reading(problem.on(problem.data.take(some.row)))
     if better is not None:
-        yield f"from about row {problem.data.label[points.row[start]]} on {better.sentence}"
+        labels = [problem.data.label[i] for i in some.row]
+        yield f"{where or _rows(labels, 'fits otherwise:', 'fit otherwise:')} {better.sentence}"
 
 
 def _places(count: int, most: int = PLACES) -> list[int]:

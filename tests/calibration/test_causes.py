@@ -14,7 +14,7 @@ from rpim_opt.calibration import likely_causes
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.calibration.verdict import _in_table_order
 from rpim_opt.problem import inspect
-from rpim_opt.problem.diagnosis import left_out_together, part_way
+from rpim_opt.problem.diagnosis import left_out_together, part_way, rows_without_values
 from rpim_opt.problem.misreadings import better_reading
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, numeric_frame
@@ -432,6 +432,21 @@ def repeated(q: np.ndarray, rows: np.ndarray) -> np.ndarray:
 def test_rows_that_were_filled_in_are_named(wrong, rows: list[int], said: str) -> None:
     found = inspect(wrong(np.array(rows))(simulated_arm("irb120"))).warnings
     assert any(said in text for text in found), found
+
+
+def test_a_third_of_the_rows_in_another_frame_has_lost_no_decimal_point() -> None:
+    away = values(lambda y: y + 20.0 * (np.arange(COUNT) % 3 == 1)[:, None])(simulated_arm("irb120"))
+    assert not list(rows_without_values(away.data, away.arms))
+    alone = values(lambda y: y + 20.0 * (np.arange(COUNT) == 1)[:, None])(simulated_arm("irb120"))
+    (said,) = rows_without_values(alone.data, alone.arms)
+    assert said.startswith("row P2 is farther from the others than the arm is long: was a decimal point lost")
+
+
+def test_rows_here_and_there_that_another_interpretation_fits_are_named() -> None:
+    some = np.arange(80)[:, None, None] % 4 == 1
+    wrong = joints(lambda q: np.where(some, q[..., [0, 2, 1, 3, 4, 5]], q))(simulated_arm("irb120", count=80))
+    (said,) = part_way(wrong)
+    assert re.match("rows P2, P6, P10, .* more fit otherwise: .* joints 2 and 3 exchanged", said)
 
 
 def test_measured_points_of_a_grid_are_not_called_filled_in_whatever_their_unit() -> None:
