@@ -138,7 +138,7 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
         tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
         lines.append(
             f"Active bound: {held.name} at {held.bound / si:+.3g} {unit}. Loosening its tolerance by {tenth} would "
-            f"lower the whitened RMS by {held.gain:.2g}."
+            f"lower the RMS of the standardized residuals by {held.gain:.2g}."
         )
     beyond = np.flatnonzero(np.abs(result.x) > 1.001 * result.problem.parameters.free.tolerance)
     if len(beyond):
