@@ -1199,14 +1199,14 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
     def scaled(column: Array, what: str, remedy: str, of: str = "too long") -> Addition:
         return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % {of}", remedy))
 
-    def longer(column: Array, what: str, remedy: str) -> Addition:
-        return Addition(column[:, None], lambda c: (f"{what} {three_digits(1e3 * c[0])} mm too long", remedy))
+    def longer(share: Array | float, when: str, remedy: str) -> Addition:
+        said = "{}measured distances are {} mm too long".format
+        return Addition((along[:, 1] * share)[:, None], lambda c: (said(when, three_digits(1e3 * c[0])), remedy))
 
     yield scaled(along[:, 0], "measured lengths are", "check the scale of the instrument")
-    too_long = "measured distances are"
-    yield longer(along[:, 1], too_long, "check the instrument's zero and the reflector's radius")
+    yield longer(1.0, "", "check the instrument's zero and the reflector's radius")
     for when, share in _shares(problem).items():
-        yield longer(along[:, 1] * share, f"{when} {too_long}", "check the reflector and its radius in these rows")
+        yield longer(share, f"{when} ", "check the reflector and its radius in these rows")
     if y.any():  # of an instrument at the origin: index of the vertical circle, eccentricity of both
         flat = np.linalg.norm(y[:, :2], axis=1, keepdims=True)
         radius = np.maximum(np.linalg.norm(y, axis=1, keepdims=True), 1e-9)
@@ -1221,8 +1221,8 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is", "check its scale")
         if i != j:
-            square = "check whether the instrument's axes are square"
-            what = (f"column {'xyz'[i]} contains", square, f"of column {'xyz'[j]}")
+            axes = "check whether the instrument's axes are square"
+            what = (f"column {'xyz'[i]} contains", axes, f"of column {'xyz'[j]}")
         yield scaled(of_axis[:, i] * y[:, j], *what)
 
 

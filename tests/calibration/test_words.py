@@ -75,7 +75,8 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
     bounds = [line for line in eleven if line.startswith("Active bound")]
     assert len(bounds) == 5
     assert bounds[0] == (
-        "Active bound: a2 at +0.5 mm. Loosening its tolerance by 0.05 mm would lower the whitened RMS by 0.05."
+        "Active bound: a2 at +0.5 mm. Loosening its tolerance by 0.05 mm would lower "
+        "the RMS of the standardized residuals by 0.05."
     )
     loosened = "'a2 by 0.5 mm' is active: loosening it by 0.1 mm would lower the objective by 0.2 of 9."
     assert eleven.count(loosened) == 11

@@ -469,11 +469,9 @@ def _judged(
         plainer, more = _plainer(points, problem, sign[near], Fit(*(each[near] for each in fits)), inliers)
         near += range(given, given + len(plainer))
         sign, fits = np.vstack([sign, plainer]), stacked([fits, more])
-    found, elsewhere, same = (
-        _Mappings(points, sign, fits, given),
-        _elsewhere(points, rng),
-        0.5 * max(least, LEAST_NOISE),
-    )
+    found = _Mappings(points, sign, fits, given)
+    elsewhere = _elsewhere(points, rng)
+    same = 0.5 * max(least, LEAST_NOISE)
     robots = sorted(found.robots(near, elsewhere, same), key=lambda each: found.plain(each.plainest))
     best = next(each for each in robots if near[0] in each.members)
 
