@@ -24,6 +24,7 @@ from rpim_opt.calibration.held_out import (
     headline_errors,
     of_positions,
     required_coverage,
+    unseen,
 )
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
@@ -406,6 +407,9 @@ def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, Hel
     """Return held-out rows, their errors, labels that a fit to all rows excluded, and what moved; None without any."""
     apart, held = result.record.validation if data is None else data, result.record.held_out
     if apart is not None:
+        apart = unseen(result, apart)
+        if apart is None:
+            return None
         held = compared(result, apart)
         return apart, held, [], "".join(displaced(result, apart, held))
     if held is None:
@@ -431,7 +435,8 @@ def _held_out(
     """Return what held-out rows say of a limit: a document [mm] or None, that they miss it, and what is lacking."""
     found = _rows_apart(result, data)
     if found is None:
-        return None, [], ["Missing: held-out rows (`new --hold-out`, or a table for `accept --data`)."]
+        used = "" if data is None else f"; all {len(data)} rows of the table are identification rows"
+        return None, [], [f"Missing: held-out rows (`new --hold-out`, or a table for `accept --data`){used}."]
     apart, held, excluded, moved = found
     kept = ~np.isin(held.label, excluded)
     error, sigmas, allowed = held.error[kept], held.sigmas[kept], held.allowed[kept]

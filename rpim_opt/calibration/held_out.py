@@ -18,11 +18,20 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.record import CONFIDENCE, HeldOut
+from rpim_opt.problem.diagnosis import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
 
 FEWEST = 5  # held-out rows below which they say too little
 GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
+
+
+def unseen(result: Calibration, data: Dataset) -> Dataset | None:
+    """Return the measurements without copies of identification rows; None where they are nothing else."""
+    used = {label for label, _ in common_rows(result.problem.sample().data, data)}
+    if used.issuperset(data.label):
+        return None
+    return data.without(used) if used else data
 
 
 def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:

@@ -389,7 +389,7 @@ class Outcome:
         if not self.program.linear_penalty:
             return f"the penalty {of} is not quadratic; only a normal prior has a posterior covariance"
         if self.known_covariance is None:
-            return f"the loss {of} depends on a few equations and has no quadratic model"
+            return f"the loss {of} depends on a few equations, or has own variables, and no quadratic model"
         return ""
 
     def no_covariance(self, instead: str) -> InputError:

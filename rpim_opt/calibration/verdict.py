@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import cast
@@ -31,6 +30,8 @@ BAD = "Larger than expected"
 """Beginning of the sentence on a fit whose residuals or deviations are large; where it is delivered all the same."""
 SLIGHTLY = "Slight, but significant"
 """Beginning of the sentence on an effect in residuals that are no larger than instrument and robot make them."""
+LIMITED = "the formulation, not the robot, limits the fit"
+"""Beginning of the cause that loss, penalty or constraints contradict the data."""
 REMARKS = (BAD, SLIGHTLY)  # beginnings of what is said of robots that are delivered, too
 OVERSTATED = 0.05  # residual RMS over the stated noise below which the noise is not that of these data; from 20 um on
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
@@ -109,8 +110,11 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     noise and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors
     on held-out rows are larger than the nominal robot's, or that interpolates all rows; whose data were computed; and
     one with a likely mistake. The limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not
-    limited.
+    limited. Where the formulation limits the fit, that is the reason: whatever else is wrong follows from it.
     """
+    limited = tuple(text for text in causes if LIMITED in text)
+    if limited:
+        return Verdict(limited)
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
@@ -350,7 +354,7 @@ def likely_causes(result: Outcome) -> list[str]:
     noticed = max(ratio for _, ratio in residuals.values()) > NOTICED
     signs = [*_large_residuals(result, residuals), *_large_deviations(result)]
     head = [f"{BAD}: {'; '.join(signs)}."] if signs else []
-    ordered = _in_table_order(result, problem)
+    ordered = diagnosis.in_table_order(problem, result.excluded, result.record.validation)
     shared = [*diagnosis.shared_rows(problem.data, result.record.validation), *diagnosis.copied_rows(problem.data)]
     left_out = () if result.learned is None else result.learned.left_out
     together = list(diagnosis.left_out_together(problem.labels, {row.label for row in left_out}))
@@ -473,7 +477,7 @@ def _limited_by_formulation(result: Outcome, problem: CalibrationProblem, kept: 
     names = [name_of(constraint, k) for k, constraint in enumerate(result.formulation.constraints)]
     remedy = f"Loosen its constraints ({joined(names)}) or use" if names else "Use"
     return [
-        f"the formulation, not the robot, limits the fit: residuals are {three_digits(now)} times the measurement "
+        f"{LIMITED}: residuals are {three_digits(now)} times the measurement "
         f"noise, but {three_digits(plain)} times with a squared penalty at weight 1 and no constraint. {remedy} a "
         "smaller weight."
     ]
@@ -538,18 +542,6 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     if causes or error < LARGEST["length"]:  # which a robot's own effects may be
         return first(causes, unrelated)
     return first(diagnosis.odd_column(problem), unrelated)
-
-
-def _in_table_order(result: Outcome, problem: CalibrationProblem) -> CalibrationProblem:
-    """Return the problem with held-out and excluded rows, all at their places in the table by the labels' numbers."""
-    parts = {"identification": problem.data, "excluded": result.excluded, "validation": result.record.validation}
-    there = {name: data for name, data in parts.items() if data is not None}
-    numbers = [re.search(r"\d+$", label) for data in there.values() for label in data.label]
-    rows = [int(match[0]) for match in numbers if match]
-    if len(set(rows)) < len(numbers):  # labels without numbers, or a validation table of its own
-        return problem
-    order = np.argsort(rows, kind="stable")
-    return problem.on(Dataset.together(list(there.values()), list(there)).take(order))
 
 
 def _without_outliers(

@@ -102,7 +102,8 @@ def inliers_of(formulation: Formulation, norms: Array, count: np.ndarray, loss: 
     accepted = "a loss with gradients, without own variables, which covariances, predictions and most rules need; "
     accepted += "`forward`, monte_carlo, l_curve and k_fold do not"
     if slope is None:
-        raise InputError(found, "a loss without gradient", accepted)
+        lacking = "with own variables" if len(loss.expression.variables()) > 1 else "without gradient"
+        raise InputError(found, f"a loss {lacking}", accepted)
     factor = float(np.median(np.abs(slope[: len(v)]) / (2 * v))) if len(v) else 0.0
     if not factor > 0:
         raise InputError(found, "a loss that depends on a few equations", accepted)

@@ -6,7 +6,7 @@ import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import chain, combinations, combinations_with_replacement, product
+from itertools import chain, combinations, combinations_with_replacement, pairwise, product
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -250,12 +250,13 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
     warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation)]
     warnings += [*rows_without_values(data, problem.arms), *filled_rows(data)]
-    better = better_reading(problem)
+    ordered = in_table_order(problem, validation)
+    better = better_reading(ordered)
     if better is not None:
         warnings.append(better.sentence)
     else:
-        warnings += exchanged_rows(problem)
-        warnings += first(part_way(problem), moved_far(problem), shown_by_fit(whole))
+        warnings += exchanged_rows(ordered)
+        warnings += first(part_way(ordered), moved_far(problem), shown_by_fit(whole))
     return Inspection(
         problem=problem,
         residual=residual,
@@ -267,6 +268,28 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         observability=observe(whole),
         contact=tuple(contact_sentences(problem)),
     )
+
+
+def in_table_order(problem: CalibrationProblem, *apart: Dataset | None) -> CalibrationProblem:
+    """Return a problem with rows that were kept apart, all at their places in the table by the numbers in their labels.
+
+    The problem alone where its own labels do not increase (but for held-out rows behind the others), or parts have
+    other labels (P07_A, v7): a table of its own says nothing of neighbouring rows.
+    """
+    parts = [problem.data, *(data for data in apart if data is not None)]
+    own, *others = [[_natural(label) for label in data.label] for data in parts]
+    every = own + [key for keys in others for key in keys]
+    kinds = {key[::2] for key in own}
+    turns = sum(one > next_one for one, next_one in pairwise(own))
+    if turns > 1 or len(set(every)) < len(every) or any(key[::2] not in kinds for key in every):
+        return problem
+    order = sorted(range(len(every)), key=every.__getitem__)
+    return problem.on(Dataset.together(parts, [f"part {k}" for k in range(len(parts))]).take(order))
+
+
+def _natural(label: str) -> tuple[str | int, ...]:
+    """Return what a label sorts by: its text and numbers in turn."""
+    return tuple(int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", label)))
 
 
 def far_off(errors: Array) -> np.ndarray:
@@ -354,20 +377,23 @@ def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[st
             )
 
 
-def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
-    """Report rows of the validation set that are copies of identification rows."""
+def common_rows(data: Dataset, other: Dataset) -> list[tuple[str, str]]:
+    """Return the labels of other rows that are copies of rows of data, to the last digit, and the labels of those."""
 
     def rows(of: Dataset) -> list[tuple[bytes, str]]:
         blocks = [block for block in of.blocks if block.measurement.columns]
         each = [(block, i, row) for block in blocks for i, row in enumerate(block.row)]
         return [(block.q[i].tobytes() + block.y[i].tobytes(), of.label[row]) for block, i, row in each]
 
-    if validation is None:
-        return
     own = dict(reversed(rows(data)))  # of copies the first
-    both = [(label, own[key]) for key, label in rows(validation) if key in own]
+    return [(label, own[key]) for key, label in rows(other) if key in own]
+
+
+def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
+    """Report rows of the validation set that are copies of identification rows."""
+    both = [] if validation is None else common_rows(data, validation)
     copies = [label if label == other else f"{label} ({other})" for label, other in both]
-    if copies:
+    if validation is not None and copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
             f"{listed(copies)}. The validation error is too optimistic: separate the sets (rpim-opt new --hold-out)."

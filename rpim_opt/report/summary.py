@@ -118,6 +118,7 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
         "validation": f"On {n} validation measurements, not used for identification,",
         "held out": f"On {n} measurements that were held out",
         "new": f"On {n} new measurements, not used for identification,",
+        "used": f"On {n} measurements, which were used for identification at least in part,",
         "identification": f"On the {n} identification measurements (no validation data{few})",
     }[name]
     what = "position error" if of_positions(result) else "error"

@@ -210,6 +210,20 @@ def test_what_is_lacking_is_said(result, change, said: str) -> None:
     assert any(said in reason for reason in found.reasons)
 
 
+def test_rows_that_the_fit_used_accept_nothing(result, tmp_path: Path) -> None:
+    used, apart = result.problem.data, result.record.validation
+    found = accept(result, Requirement(0.01), data=used)
+    assert found.verdict == "inconclusive"
+    assert f"all {len(used)} rows of the table are identification rows" in found.reasons[0]
+    both = ro.Dataset.together([apart, used], ["apart", "used"])
+    assert accept(result, Requirement(0.01), data=both).held_out["rows"] == len(apart)
+    for data, said in ((used, "were used for identification"), (apart, "not used for identification")):
+        ro.report.write_report(result, tmp_path / "report.html", new={"table.csv": ro.use.validate(result, data)})
+        page = (tmp_path / "report.html").read_text()
+        assert f"On {len(data)} " in page
+        assert said in page.partition(f"On {len(data)} ")[2].partition("the mean position error")[0]
+
+
 def test_an_unmeasured_part_of_the_region_is_named(result) -> None:
     found = accept(result, Requirement(0.01, joints=((2, (-3.0, 3.0)),)))
     assert found.verdict == "inconclusive"

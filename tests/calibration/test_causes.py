@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.calibration import likely_causes
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.calibration.verdict import _in_table_order
 from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together, part_way, rows_without_values
 from rpim_opt.problem.misreadings import better_reading
@@ -729,11 +728,12 @@ def test_a_lost_reading_is_named_also_where_rows_are_held_out() -> None:
     assert "with measured values 1 row too high" in said
     held = np.isin(np.arange(COUNT), [3, 9, 17, 18, 25, 33])
     rows = [problem.data.take(np.flatnonzero(part)) for part in (~held, held)]
-    wrong = calibrated(problem.on(rows[0]))
-    whole = _in_table_order(validated(wrong, rows[1]), wrong.problem)
-    assert whole.labels == problem.labels
-    (again,) = part_way(whole)
-    assert "with measured values 1 row too high" in again
+    found = [likely_causes(validated(calibrated(problem.on(rows[0])), rows[1]))]
+    for label in ("P{}", "P{}_A"):  # of a configuration, and of a reflector there
+        apart = [replace(part, label=tuple(label.format(each[1:]) for each in part.label)) for part in rows]
+        found.append(inspect(problem.on(apart[0]), apart[1]).warnings)
+    for texts in found:
+        assert any("with measured values 1 row too high" in text for text in texts), texts
 
 
 def test_an_outlier_among_few_rows_is_excluded_and_named() -> None:

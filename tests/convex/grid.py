@@ -206,6 +206,8 @@ case("lasso", cp.sum_squares, cp.norm1)
 case("squares + L2", cp.sum_squares, cp.norm2)
 case("squares + groups by link", cp.sum_squares, cp.sum, penalty_over=ro.constraints.by_link)
 case("squares + largest group", cp.sum_squares, cp.max, penalty_over=ro.constraints.by_kind)
+case("squares + kinds and their squares", cp.sum_squares, lambda v: cp.sum(v) + 0.1 * cp.sum_squares(v),
+     penalty_over=ro.constraints.by_kind)  # fmt: skip
 case("squares + groups of three", cp.sum_squares, groups_of_three)
 case("elastic net", cp.sum_squares, elastic_net)
 case("squares + Huber", cp.sum_squares, lambda z: cp.sum(cp.huber(z, 0.3)))

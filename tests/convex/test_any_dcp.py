@@ -141,7 +141,7 @@ def test_a_covariance_that_needs_slopes_says_so() -> None:
     result = ro.calibrate(ro.load("position").problem, ro.Formulation("level", penalty=SQUARES, **level()), 1.0)
     with pytest.raises(
         ro.InputError,
-        match="a loss without gradient, accepted: a loss with gradients, without own variables, which covariances",
+        match="a loss with own variables, accepted: a loss with gradients, without own variables, which covariances",
     ):
         _ = result.covariance
 

@@ -112,8 +112,8 @@ def test_a_residual_of_zero_has_the_factor_of_a_millionth_sigma() -> None:
 @pytest.mark.parametrize(
     ("loss", "said"),
     [
-        (lambda v: cp.sum_squares(v - cp.Variable()), "a loss without gradient"),
-        (cp.max, "a loss that rests on a few equations"),
+        (lambda v: cp.sum_squares(v - cp.Variable()), "a loss with own variables"),
+        (cp.max, "a loss that depends on a few equations"),
     ],
 )
 def test_a_loss_that_has_no_factor_is_named(loss: Any, said: str) -> None:

@@ -177,7 +177,7 @@ def test_reml_says_what_it_cannot_choose() -> None:
     few, _ = simulated(("a[234]", "d5"), noise=5e-5, configurations=12)
     with pytest.raises(
         ro.InputError,
-        match="found a loss that rests on a few equations, accepted: a loss with gradients, without own variables",
+        match="found a loss that depends on a few equations, accepted: a loss with gradients, without own variables",
     ):
         ro.reml(ro.convex.pose(ro.minimax, few.linearize(np.zeros(4))))
     sphere = ro.load("sphere").problem

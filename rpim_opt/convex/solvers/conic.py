@@ -208,13 +208,18 @@ def _in_one_cone(objective: Any) -> tuple[Any, list[Any]]:
     CVXPY takes a millisecond for each norm otherwise, half of a calibration's canonicalization.
     """
     found = _norms_in(objective)
-    if len(found) < 2:
-        return objective, []
+    if len(found) < 2 or _count(objective, {id(norm) for norm in found}) > len(found):
+        return objective, []  # other terms have the norms, too, and may ask for their sign
     parts = [cp.vec(norm.args[0], order="C") for norm in found]
     bounds = cp.Variable(len(found))
     every = norms(cp.hstack(parts), np.repeat(np.arange(len(found)), [part.size for part in parts]))
     objective = substituted(objective, {id(norm): bounds[i] for i, norm in enumerate(found)})
     return objective, [cp.SOC(bounds, every.args[0], axis=1)]
+
+
+def _count(e: Any, which: set[int]) -> int:
+    """Return how often an expression has one of some parts, by their ``id``."""
+    return (id(e) in which) + sum(_count(arg, which) for arg in e.args)
 
 
 def _norms_in(e: Any) -> list[Any]:
