@@ -136,7 +136,7 @@ def test_a_reflector_that_is_not_the_tip_is_placed_in_the_tip_links_frame(made: 
     result = ro.load_result(made / "results")
     farther = TOOL @ numeric_link(d=0.1)
     (tmp_path / "arm.urdf").write_text(urdf_text(ARM.mdh, farther))
-    root, tip, uncertain = ro.use.export_urdf(result, tmp_path / "arm.urdf", tmp_path / "out.urdf")
+    root, tip, uncertain = ro.use.export_files(result, tmp_path / "out.urdf", urdf=tmp_path / "arm.urdf").notes
     there = np.linalg.inv(farther) @ numeric_frame(ro.use.identified(result).tool)
     said = [float(number) for number in re.findall(r"[xyz] (-?[\d.]+)", tip)[:3]]
     np.testing.assert_allclose(said, 1e3 * there[:3, 3], atol=6e-4)

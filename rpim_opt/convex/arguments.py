@@ -10,6 +10,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
+from rpim_opt.basics.text import joined
 from rpim_opt.basics.units import fits
 from rpim_opt.convex.expressions import cp
 from rpim_opt.problem.problem import CalibrationProblem, Identified
@@ -79,8 +80,9 @@ class Arguments(Identified):
         """Return predicted positions (N, 3) [m] in the instrument's frame, affine in z.
 
         To first order about the solution: a calibration is repeated about what it found until that is so. q (N, dof)
-        are joint values of the controller [rad or m]; ``marker`` is the reflector, the only one or the first by
-        default; ``torque`` (N, dof) joint torques [Nm], where compliance is identified from measured ones.
+        are joint values of the controller [rad or m]; ``marker`` is the reflector, the only one by default
+        (InputError where there are several); ``torque`` (N, dof) joint torques [Nm], where compliance is identified
+        from measured ones.
 
         >>> import numpy as np
         >>> import rpim_opt as ro
@@ -91,7 +93,11 @@ class Arguments(Identified):
         >>> print(f"{result.forward(home)[0, 2, 3]:.4f} m")
         0.1975 m
         """
-        prediction = predicted(problem_of(self), q, marker, torque, self.at)
+        problem = problem_of(self)
+        known = markers(problem)
+        if marker is None and len(known) > 1:
+            raise InputError("positions", f"no marker, of {len(known)} reflectors", f"marker = one of {joined(known)}")
+        prediction = predicted(problem, q, marker, torque, self.at)
         count = len(prediction.position)
         flat = (prediction.slope * self.scale).reshape(3 * count, -1)
         return cp.reshape(flat @ self.z, (count, 3), order="C") + prediction.position

@@ -843,6 +843,7 @@ class Addition(NamedTuple):
 
     columns: Array
     said: Callable[[Array], tuple[str, str]] | None  # None where it is no mistake
+    most: float = np.inf  # coefficient from which on a slope says nothing
 
 
 def _explained(
@@ -871,7 +872,7 @@ def _explained(
     spare = max(len(model.A) - taken - len(step), 1)
     left = max(whole - gain, 1e-300)
     chance = fdtrc(len(step), spare, gain / len(step) / (left / spare))
-    if gain <= (1 - left_at_most) * whole or chance * len(tried) >= RARE:
+    if gain <= (1 - left_at_most) * whole or chance * len(tried) >= RARE or np.abs(step).max() > addition.most:
         return None
     return float(np.sqrt(left / whole)), addition, step
 
@@ -1223,7 +1224,8 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         along += np.column_stack([np.sum(of_axis * y, axis=1), np.sum(of_axis * radial, axis=1)])
 
     def scaled(column: Array, what: str, remedy: str, of: str = "too long") -> Addition:
-        return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % {of}", remedy))
+        # a scale that shrinks positions to half and less fits values that have nothing to do with the robot
+        return Addition(column[:, None], lambda c: (f"{what} {100 * c[0]:+.2g} % {of}", remedy), most=0.5)
 
     def longer(share: Array | float, when: str, remedy: str) -> Addition:
         said = "{}measured distances are {} mm too long".format

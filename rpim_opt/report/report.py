@@ -133,6 +133,8 @@ def _headline(content: Content) -> Iterator[Block]:
         elif accepted.bound is not None:
             U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
+        if _beyond_geometry(result):
+            text += " It holds for the whole model, as `compensate` uses it; files with geometry alone have another U."
         yield "verdict", {"kind": accepted.verdict, "word": word, "text": text}
     elif result.verdict.delivered:
         doubt = inconclusive(result, content.map)
@@ -153,6 +155,11 @@ def _headline(content: Content) -> Iterator[Block]:
         note = f"{percent(content.map.requirement.confidence)}, maximum over the region"
         cards.append(("Expanded uncertainty U", "after", mm(1e3 * content.map.largest), note))
     yield "cards", cards
+
+
+def _beyond_geometry(result: Calibration) -> bool:
+    """Return whether the model has what files for controllers do not hold."""
+    return any(value for robot in result.robots for value in beyond_geometry(result, robot).values())
 
 
 def _mean_interval(errors: Array) -> str:
@@ -296,9 +303,8 @@ def _parameters(content: Content) -> Iterator[Block]:
         allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
         rows.append([f"{name} [{unit}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)
-    beyond = [name for robot in result.robots for name, value in beyond_geometry(result, robot).items() if value]
     files = "Exported files hold the geometry of a fit of its own, without model extensions: other numbers than these."
-    yield "text", [note, *words.turned_frames(result), *([files] if beyond else [])]
+    yield "text", [note, *words.turned_frames(result), *([files] if _beyond_geometry(result) else [])]
     count = Counter(np.array(own.dimensions)[~own.of_frames].tolist())
     drawn = []
     for dimension in ("length", "angle"):

@@ -1,7 +1,6 @@
 from .compensation import Compensation as Compensation
 from .compensation import compensate as compensate
 from .export import export_files as export_files
-from .export import export_urdf as export_urdf
 from .export import geometry_alone as geometry_alone
 from .export import identified as identified
 from .iso9283 import Performance as Performance

@@ -115,6 +115,11 @@ class Compensation:
         counts = {"miss their target": len(self.missed) - uncertain, unsure: uncertain}
         said = "{} of {} commands {}; do not execute these rows."
         lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
+        if uncertain:
+            lines.append(
+                "More measurements reduce the uncertainty, and so does what is known of lengths that the data do not "
+                'tell apart ([prior] known = ["d6 = 72 +- 0.05 mm", ...]).'
+            )
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
             lines.append(
@@ -396,7 +401,9 @@ def _tooled(
     if tool is not None:
         marker = known[0]
     elif marker not in known:
-        raise InputError("--marker", f"'{marker}'", choices(marker, [m or "no marker" for m in known]))
+        found = f"'{marker}'" if marker else "none"
+        named = choices(marker, [m or "no marker" for m in known])
+        raise InputError("--marker", found, f"{named}; the point of a controller's TCP is --tool")
     at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
     identified = p.identified.copy()
     nominal = p.nominal.copy()

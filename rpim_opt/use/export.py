@@ -301,11 +301,6 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     ]
 
 
-def export_urdf(result: Calibration, source: str | Path, target: str | Path, **options: Any) -> list[str]:
-    """Write a URDF alone, with the options of `export_files`; return its notes."""
-    return export_files(result, target, urdf=source, **options).notes
-
-
 def _write_urdf(
     result: Calibration,
     marker: str | None,

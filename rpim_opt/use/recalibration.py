@@ -46,6 +46,7 @@ STRANGE = 5.0  # times the error before any calibration by which readings that n
 RIVAL, AS_GOOD = 0.05, 4.0  # probability, or what chi-squared falls less by, up to which another cause is named, too
 SHOWN = 5  # causes that are shown
 BASE = "base_"
+OF_ROBOT = ("robot_serial", "controller")  # details of a record that stay when the robot is measured again
 UPDATED, BEFORE = " (updated)", "; of the earlier calibration: "  # What title and source of an updated calibration say.
 
 
@@ -261,6 +262,7 @@ def update(
         f"{record.title.removesuffix(UPDATED)}{UPDATED}", f"{source}{BEFORE}{first_source}" if first_source else source,
         excluded=excluded, simulated=record.simulated, noise_assumed=record.noise_assumed,
         requirement=record.requirement, earlier=(*record.earlier, last), reading=record.reading, terms=record.terms,
+        details={key: record.details[key] for key in OF_ROBOT if key in record.details},
     )  # fmt: skip
     updated = replace(updated, record=record)
     moved = _moved(result, updated, released, changes)

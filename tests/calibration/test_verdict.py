@@ -139,7 +139,7 @@ def test_python_follows_it(tmp_path: Path) -> None:
     assert "despite the verdict" in forced.note
     assert forced.note in forced.csv()
     with pytest.raises(ro.basics.NotDelivered):
-        ro.use.export_urdf(result, "arm.urdf", tmp_path / "out.urdf")
+        ro.use.export_files(result, tmp_path / "out.urdf", urdf="arm.urdf")
     with pytest.raises(ro.basics.NotDelivered):
         ro.use.export_files(result, mdh=tmp_path / "out.csv")
     assert not list(tmp_path.iterdir())

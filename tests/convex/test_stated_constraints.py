@@ -183,6 +183,18 @@ def test_predicted_positions_are_those_of_the_result() -> None:
     assert np.min(result.forward(q)[:, 2, 3] - lowest) == pytest.approx(0, abs=1e-9)
 
 
+def test_positions_of_several_reflectors_need_a_name() -> None:
+    problem = ro.load("markers").problem
+    reflector, q = problem.data.blocks[0].markers[0], np.zeros((1, 6))
+    for names, accepted in (((), False), ((reflector,), True)):
+        mine = replace(ro.tikhonov, constraints=(lambda z, p, names=names: p.positions(q, *names)[0, 2] <= 9,))
+        if accepted:
+            assert ro.calibrate(problem, mine, weight=1.0).converged
+            continue
+        with pytest.raises(InputError, match=f"no marker, of . reflectors, accepted: marker = one of {reflector}"):
+            ro.calibrate(problem, mine, weight=1.0)
+
+
 def test_a_name_that_is_none_is_refused() -> None:
     for expression in (lambda z, p: z["a99"] <= 1, lambda z, p: p.x["a99"] <= 1):
         with pytest.raises(InputError, match="a99"):

@@ -423,7 +423,7 @@ def test_files_keep_their_own_joint_values(tmp_path: Path) -> None:
     problem = ro.CalibrationProblem(counted, parameters, ro.Dataset.of(q, np.zeros((8, 3)), 1e-5))
     y = problem.modelled(1e-3 * np.arange(len(parameters.free)))[0]
     result = ro.calibrate(problem.on(ro.Dataset.of(q, y, 1e-5)), ro.tikhonov, weight=1e-3)
-    notes = ro.use.export_urdf(result, path, target, tip="tip", despite_verdict=True)
+    notes = ro.use.export_files(result, target, urdf=path, tip="tip", despite_verdict=True).notes
     assert "joint 1 is at -1 q1 and joint 2 is at +1 q1 +1 q2" in notes[-1]
     found = urdf_kinematics(target, "tip", q @ joint_map.T)[:, :3, 3]
     assert np.abs(found - result.problem.modelled(result.x)[0]).max() < EXACT

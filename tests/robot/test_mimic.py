@@ -62,7 +62,7 @@ def test_errors_of_joints_that_follow_are_found_and_go_back_into_the_file(arm: r
     assert ro.problem.inspect(problem)
     ro.store.save_result(result, "result.json")
     assert np.array_equal(ro.load_result("result.json").robot.joint_map, robot.joint_map)
-    ro.use.export_urdf(result, "arm.urdf", "identified.urdf")
+    ro.use.export_files(result, "identified.urdf", urdf="arm.urdf")
     written = ro.read_urdf("identified.urdf")
     identified = ro.use.identified(result)
     assert np.abs(reach(written, q) - reach(replace(identified, base=arm.base), q)).max() < 1e-12

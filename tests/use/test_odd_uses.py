@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.problem.blocks import PartitionedProblem
 from rpim_opt.problem.noise import Repeatability
-from rpim_opt.use.export import export_urdf, write_all
+from rpim_opt.use.export import export_files, write_all
 from rpim_opt.use.monitoring import Drift
 from rpim_opt.use.recalibration import Cause, Moved
 from tests.simulate import simulated
@@ -273,7 +273,7 @@ def test_measurements_of_an_instrument_that_moved_are_registered_again(name: str
 
 def test_a_urdf_that_is_not_there(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match=r"none\.urdf"):
-        export_urdf(calibrated(), tmp_path / "none.urdf", tmp_path / "out.urdf")
+        export_files(calibrated(), tmp_path / "out.urdf", urdf=tmp_path / "none.urdf")
 
 
 def test_what_no_file_holds_is_named_and_counted() -> None:

@@ -121,7 +121,7 @@ def test_a_tree_is_calibrated_as_a_whole_and_written_into_one_file(
     ro.store.save_result(result, "result.json")
     again = ro.load_result("result.json")
     assert np.array_equal(again.problem.residual(result.x), result.problem.residual(result.x))
-    ro.use.export_urdf(result, "robot.urdf", "better.urdf")
+    ro.use.export_files(result, "better.urdf", urdf="robot.urdf")
     for name, (base, tip) in chains(seed, tips).items():
         arm = arms[name]
         q = drawn(arm, NEW, rng)
@@ -409,4 +409,4 @@ def test_what_a_urdf_does_not_hold_is_refused(tmp_path: Path, monkeypatch: pytes
     result = ro.calibrate(ro.load(".").problem, ro.tikhonov, weight=1.0)
     moved = replace(result, x=np.full(len(result.x), 1e-6))
     with pytest.raises(ro.InputError, match=r"found left.ratio1, .*accepted: origins"):
-        ro.use.export_urdf(moved, "robot.urdf", "new.urdf", despite_verdict=True)
+        ro.use.export_files(moved, "new.urdf", urdf="robot.urdf", despite_verdict=True)

@@ -187,7 +187,10 @@ def test_without_a_change_it_equals_calibrating_with_all_data() -> None:
 def test_a_file_says_what_it_carries_on(tmp_path, crashed: Robot, first) -> None:
     ro.store.save_result(first, tmp_path / "first.json")
     loaded = ro.load_result(tmp_path / "first.json")
+    details = {"by": "the first operator", "robot_serial": "120-4711"}
+    loaded = replace(loaded, record=replace(loaded.record, details=details))
     found = ro.use.update(loaded, crashed.after)
+    assert found.result.record.details == {"robot_serial": "120-4711"}
     ro.store.save_result(found.result, tmp_path / "second.json")
     second = ro.load_result(tmp_path / "second.json")
     last = second.record.earlier[-1]
