@@ -39,7 +39,7 @@ NEAR_FIRST = 0.01  # share of the solution that the next step at the first weigh
 STALLED, STALLED_MOST = 2, 20
 """Evaluations in a row that do not lower the objective beyond its accuracy, after which the loop is at rest: where the
 next step promises nothing, and whatever that promises."""
-FAR, FAR_ITERATIONS = 1000.0, 200
+FAR, FAR_ITERATIONS = 1000.0, 250
 """Deviations in prior standard deviations beyond which a fit is called divergent; iterations after which it is given
 up there: combinations that neither data nor penalty hold lead on and on."""
 DAMPING_MOST = 1e30  # damping at which no step, however short, lowers the objective

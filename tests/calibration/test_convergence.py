@@ -451,7 +451,7 @@ def test_a_damped_program_that_no_solver_solves_is_damped_more() -> None:
 
 
 def test_a_fit_that_leads_on_and_on_is_given_up() -> None:
-    """After 200 iterations beyond a thousand prior standard deviations, not after the 500 that are allowed."""
+    """After 250 iterations beyond a thousand prior standard deviations, not after the 500 that are allowed."""
     norms = ro.Formulation("sum of norms", loss=cp.sum, loss_over="configuration")
     result = ro.calibrate(ro.load("paper_arm").problem, norms, 0.0)
     assert not result.converged
