@@ -24,7 +24,7 @@ from rpim_opt.calibration.held_out import (
     headline_errors,
     of_positions,
     required_coverage,
-    unseen,
+    rows_used,
 )
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.outcome import Outcome
@@ -407,11 +407,13 @@ def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, Hel
     """Return held-out rows, their errors, labels that a fit to all rows excluded, and what moved; None without any."""
     apart, held = result.record.validation if data is None else data, result.record.held_out
     if apart is not None:
-        apart = unseen(result, apart)
-        if apart is None:
+        used = rows_used(result, apart)
+        if not used.keys() >= set(apart.label):
+            apart = apart.without(used) if used else apart
+            held = compared(result, apart)
+            return apart, held, [], "".join(displaced(result, apart, held))
+        if held is not None and not set(held.label).issuperset(used.values()):
             return None
-        held = compared(result, apart)
-        return apart, held, [], "".join(displaced(result, apart, held))
     if held is None:
         return None
     row = {label: row for row, label in enumerate(result.problem.data.label)}

@@ -26,12 +26,9 @@ GROSS = 6.0  # factor on the median distance from which on a row does not count 
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
 
-def unseen(result: Calibration, data: Dataset) -> Dataset | None:
-    """Return the measurements without copies of identification rows; None where they are nothing else."""
-    used = {label for label, _ in common_rows(result.problem.sample().data, data)}
-    if used.issuperset(data.label):
-        return None
-    return data.without(used) if used else data
+def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
+    """Return the labels of measurements that are copies of identification rows, with the labels of those."""
+    return dict(common_rows(result.problem.sample().data, data))
 
 
 def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:

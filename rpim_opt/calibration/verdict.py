@@ -110,11 +110,11 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     noise and 0.3 % of the arm's length; whose repeatability, deviations or share of outliers no robot has; whose errors
     on held-out rows are larger than the nominal robot's, or that interpolates all rows; whose data were computed; and
     one with a likely mistake. The limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not
-    limited. Where the formulation limits the fit, that is the reason: whatever else is wrong follows from it.
+    limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
-        return Verdict(limited)
+        return Verdict((*limited, *_worse(result)))
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
@@ -262,7 +262,8 @@ def _worse(result: Outcome) -> Iterator[str]:
     nominal, identified = result.nominal_errors(), result.errors()
     if worse_than_nominal(nominal, identified):
         sentence = worse_sentence(nominal, identified, "the identification rows")
-        yield f"{sentence.removesuffix('.')}: the weight is too large."
+        tight = ", or constraints are too tight" if result.formulation.constraints else ""
+        yield f"{sentence.removesuffix('.')}: the weight is too large{tight}."
     held, validation = result.record.held_out, result.record.validation
     if held is not None:
         nominal, identified = held.nominal, held.error

@@ -20,7 +20,7 @@ from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import compared, coverage_text, headline_errors, unseen
+from rpim_opt.calibration.held_out import compared, coverage_text, headline_errors, rows_used
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
@@ -106,7 +106,7 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     errors = headline_errors(result)
     if any(np.isfinite(each.error).any() for each in new.values()):
         nominal, identified = (np.concatenate([getattr(v, of) for v in new.values()]) for of in ("nominal", "error"))
-        used = any(unseen(result, each.data) is not each.data for each in new.values())
+        used = any(rows_used(result, each.data) for each in new.values())
         errors = "used" if used else "new", nominal, identified
     content = Content(result, accepted, tested, errors, workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
