@@ -403,7 +403,7 @@ def _tooled(
     elif marker not in known:
         found = f"'{marker}'" if marker else "none"
         named = choices(marker, [m or "no marker" for m in known])
-        raise InputError("--marker", found, f"{named}; the point of a controller's TCP is --tool")
+        raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
     at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
     identified = p.identified.copy()
     nominal = p.nominal.copy()

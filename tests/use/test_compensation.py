@@ -424,7 +424,7 @@ def test_several_reflectors_and_torques() -> None:
     q = instance.problem.data.q[:5]
     marker = instance.problem.data.blocks[0].markers[0]
     assert ok(ro.use.compensate(result, q, marker=marker, orientation=False)).all()
-    with pytest.raises(ro.InputError, match="marker: found ''"):
+    with pytest.raises(ro.InputError, match="marker: found none"):
         ro.use.compensate(result, q)
     elastic = ro.load("joints")
     result = ro.calibrate(elastic.problem, elastic.formulation, 1.0)
