@@ -391,9 +391,10 @@ def common_rows(data: Dataset, other: Dataset) -> list[tuple[str, str]]:
 
 def shared_rows(data: Dataset, validation: Dataset | None) -> Iterator[str]:
     """Report rows of the validation set that are copies of identification rows."""
-    both = [] if validation is None else common_rows(data, validation)
-    copies = [label if label == other else f"{label} ({other})" for label, other in both]
-    if validation is not None and copies:
+    if validation is None:
+        return
+    copies = [own if own == other else f"{own} ({other})" for own, other in common_rows(data, validation)]
+    if copies:
         yield (
             f"{len(copies)} of {len(validation)} rows of the validation set are identification rows as well: "
             f"{listed(copies)}. The validation error is too optimistic: separate the sets (rpim-opt new --hold-out)."

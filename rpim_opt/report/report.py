@@ -97,18 +97,10 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
-    tests, tested = {}, ""
-    for name, each in new.items() if accepted is not None else ():
-        with contextlib.suppress(InputError):  # rows that are read in another way: a failure above
-            tests[name] = accept(result, data=each.data)
-    if tests:  # new rows test all that the result's own test does
-        tested, accepted = max(tests.items(), key=lambda test: FAVOURABLE.index(test[1].verdict))
-    errors = headline_errors(result)
-    if any(np.isfinite(each.error).any() for each in new.values()):
-        nominal, identified = (np.concatenate([getattr(v, of) for v in new.values()]) for of in ("nominal", "error"))
-        used = any(rows_used(result, each.data) for each in new.values())
-        errors = "used" if used else "new", nominal, identified
-    content = Content(result, accepted, tested, errors, workspace, composition, new)
+    tested = ""
+    if accepted is not None:
+        tested, accepted = _least_favourable(result, accepted, new)
+    content = Content(result, accepted, tested, _errors(result, new), workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
     return render(
@@ -118,6 +110,24 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
         [*headline, ("notes", warnings)],
         [(name, blocks) for name, blocks in sections if blocks],
     )
+
+
+def _least_favourable(result: Calibration, own: Acceptance, new: Mapping[str, Validation]) -> tuple[str, Acceptance]:
+    """Return the acceptance test by new measurements, which test all that the result's own does, and their name."""
+    tests = {}
+    for name, each in new.items():
+        with contextlib.suppress(InputError):  # rows that are read in another way: a failure
+            tests[name] = accept(result, data=each.data)
+    return max(tests.items(), key=lambda test: FAVOURABLE.index(test[1].verdict), default=("", own))
+
+
+def _errors(result: Calibration, new: Mapping[str, Validation]) -> tuple[str, Array, Array]:
+    """Return what the headline's rows are, and their errors (N,) [m], nominal and identified."""
+    if not any(np.isfinite(each.error).any() for each in new.values()):
+        return headline_errors(result)
+    nominal, identified = (np.concatenate([getattr(v, of) for v in new.values()]) for of in ("nominal", "error"))
+    used = any(rows_used(result, each.data) for each in new.values())
+    return "used" if used else "new", nominal, identified
 
 
 def _headline(content: Content) -> Iterator[Block]:

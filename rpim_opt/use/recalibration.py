@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import fdtrc, logsumexp
 
-from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.arrays import Array, rms
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined, table, three_digits
 from rpim_opt.basics.units import display
@@ -240,33 +240,48 @@ def update(
         else:
             released += cause.members
         start = updated.x
-    robots = " and ".join(robot.name for robot in result.problem.arms.values())
     if not after.likely:
-        # another unit or order explains them, or they are further off than the robot ever was uncalibrated
-        refuse_misread(result, data)
-        furthest = float(np.nanmax(result.nominal_errors()))
-        missed = float(np.sqrt(np.nanmean(updated.errors(data) ** 2)))
-        if missed > STRANGE * furthest:
-            same = f"those of the same robot ({robots}) in the same units and instrument's frame"
-            found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
-            raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
+        _refuse_another_robot(result, updated, data)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
-    record = result.record
     last = Earlier(
-        record.title or robots, record.made, record.digest or content(result)["digest"], len(result.problem.labels),
-        {robot: ranges.tolist() for robot, ranges in result.ranges.items()}, prior_inflation, released, left_out,
+        result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
+        len(result.problem.labels), {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
+        prior_inflation, released, left_out,
     )  # fmt: skip
-    excluded = dict.fromkeys(left_out, "far outside the prediction intervals of the previous calibration")
-    first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
-    record = Record(
-        f"{record.title.removesuffix(UPDATED)}{UPDATED}", f"{source}{BEFORE}{first_source}" if first_source else source,
-        excluded=excluded, simulated=record.simulated, noise_assumed=record.noise_assumed,
-        requirement=record.requirement, earlier=(*record.earlier, last), reading=record.reading, terms=record.terms,
-        details={key: record.details[key] for key in OF_ROBOT if key in record.details},
-    )  # fmt: skip
-    updated = replace(updated, record=record)
+    updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), elsewhere)
+
+
+def _robots(result: Calibration) -> str:
+    return " and ".join(robot.name for robot in result.problem.arms.values())
+
+
+def _refuse_another_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
+    """Refuse readings in another unit or order, or further off than the robot ever was uncalibrated."""
+    refuse_misread(result, data)
+    furthest, missed = float(np.nanmax(result.nominal_errors())), rms(updated.errors(data))
+    if missed > STRANGE * furthest:
+        same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
+        found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
+        raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
+
+
+def _carried_on(record: Record, last: Earlier, source: str) -> Record:
+    """Return the record of an updated calibration: of the earlier one what holds for the new measurements, too."""
+    first_source = record.source.rpartition(BEFORE)[2]  # what is said of a file belongs to its own measurements
+    return Record(
+        title=f"{record.title.removesuffix(UPDATED)}{UPDATED}",
+        source=f"{source}{BEFORE}{first_source}" if first_source else source,
+        excluded=dict.fromkeys(last.excluded, "far outside the prediction intervals of the previous calibration"),
+        simulated=record.simulated,
+        noise_assumed=record.noise_assumed,
+        details={key: record.details[key] for key in OF_ROBOT if key in record.details},
+        requirement=record.requirement,
+        earlier=(*record.earlier, last),
+        reading=record.reading,
+        terms=record.terms,
+    )
 
 
 def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation: float) -> str:

@@ -100,19 +100,9 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
     first = tables[0]
     if len(tables) == 1:
         return replace(first, notes=())
-    names = [{split_unit(name)[0]: name for name in table.columns if name != "label"} for table in tables]
     whole: dict[str, list[Any]] = {"label": [label for table in tables for label in table.labels]}
-    for table, own in zip(tables, names, strict=True):
-        lacking = own.keys() ^ names[0].keys()
-        if lacking:
-            found = f"{listed(sorted(lacking))} in only one of {first.file} and {table.file}"
-            accepted = "the same columns in all files, or one file of joints and one of values"
-            raise InputError("the header", found, accepted)
-        for stem, name in names[0].items():
-            cells = table.columns[own[stem]]
-            old, new = split_unit(own[stem])[1], split_unit(name)[1]
-            if old is not None and new is not None and old.si != new.si:
-                cells = [repr(float(cell) * old.si / new.si) for cell in cells]
+    for table in tables:
+        for name, cells in _in_units_of(first, table).items():
             whole.setdefault(name, []).extend(cells)
     notes = [f"rows of the files are stacked: {', '.join(f'{each.file} {len(each.labels)}' for each in tables)}."]
     if len(set(whole["label"])) < len(whole["label"]):
@@ -124,6 +114,23 @@ def _stacked(tables: Sequence[Understood]) -> Understood:
     common = [name for name in first.raw if all(name in table.raw for table in tables)]
     raw = {name: [cell for table in tables for cell in table.raw[name]] for name in common}
     return replace(first, columns=whole, raw=raw, notes=tuple(notes))
+
+
+def _in_units_of(first: Understood, table: Understood) -> dict[str, Sequence[Any]]:
+    """Return the columns of a table, but its labels, by the names and in the units of the first one's."""
+    names, own = ({split_unit(name)[0]: name for name in of.columns if name != "label"} for of in (first, table))
+    lacking = own.keys() ^ names.keys()
+    if lacking:
+        found = f"{listed(sorted(lacking))} in only one of {first.file} and {table.file}"
+        accepted = "the same columns in all files, or one file of joints and one of values"
+        raise InputError("the header", found, accepted)
+    columns: dict[str, Sequence[Any]] = {}
+    for stem, name in names.items():
+        columns[name] = table.columns[own[stem]]
+        old, new = split_unit(own[stem])[1], split_unit(name)[1]
+        if old is not None and new is not None and old.si != new.si:
+            columns[name] = [repr(float(cell) * old.si / new.si) for cell in columns[name]]
+    return columns
 
 
 def _by_key(joints: Understood, values: Understood, key: str) -> Match:

@@ -104,10 +104,10 @@ def locate(robot: Robot, data: Dataset, tools: Mapping[str, Place]) -> tuple[Arr
         places[name] = frame_numbers(rigid(proper(turn.sum(axis=0)), places[name][:3]))
     missed = transformed(base @ flange, np.array([places[name][:3] for name in marker.tolist()])) - y
     error = float(np.sqrt(np.mean(np.sum(missed**2, axis=1))))
-    fits = f"RMS error of the nominal robot {three_digits(1e3 * error)} mm"
+    fits = "RMS error of the nominal robot"
     if error > UNEXPLAINED * np.linalg.norm(y.std(axis=0)):
-        fits = f"the nominal robot does not explain the data, {fits.replace(' of the nominal robot', '')}"
-    return frame_numbers(base), places, f"{fits}; {how}"
+        fits = "the nominal robot does not explain the data, RMS error"
+    return frame_numbers(base), places, f"{fits} {three_digits(1e3 * error)} mm; {how}"
 
 
 APART = 0.1
