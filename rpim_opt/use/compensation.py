@@ -115,11 +115,6 @@ class Compensation:
         counts = {"miss their target": len(self.missed) - uncertain, unsure: uncertain}
         said = "{} of {} commands {}; do not execute these rows."
         lines += [said.format(count, len(self.q), what) for what, count in counts.items() if count]
-        if uncertain:
-            lines.append(
-                "More measurements reduce the uncertainty, and so does what is known of lengths that the data do not "
-                'tell apart ([prior] known = ["d6 = 72 +- 0.05 mm", ...]).'
-            )
         vague = EXPANDED * self.std > self.position_before
         if vague.mean() > 0.5 and np.isfinite(self.std).all():
             lines.append(

@@ -70,7 +70,11 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     assert "transmission2_c1" not in text
     assert text.count("joint 2") == 1
     assert any(row["parameter"] == "transmission2_c1" for row in result.parameter_rows())
-    page = report.page(result)
+    required = dataclasses.replace(
+        result, record=dataclasses.replace(result.record, requirement=ro.data.Requirement(0.01))
+    )
+    page = report.page(required)
+    assert "It holds for the whole model, as `compensate` uses it" in page
     assert "transmission2_c1" not in page
     assert "Joint 2: 0." in page
     assert "Exported files hold the geometry of a fit of its own" in page
