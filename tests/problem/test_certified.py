@@ -9,7 +9,6 @@ import cvxpy as cp
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
-from scipy.stats import chi2
 
 import rpim_opt as ro
 from rpim_opt.problem.registration.certified import lifted, relax, rotation_constraints, smallest
@@ -161,21 +160,17 @@ def test_base_and_tool_of_poses_and_of_positions(turned: bool) -> None:
     assert np.abs(start.tool[:3, 3] - X[:3, 3]).max() < 1e-9
 
 
-@pytest.mark.parametrize("loss", ["squares", "truncated"])
-def test_the_cost_is_what_the_docstring_says(loss: str) -> None:
+def test_the_cost_is_what_the_docstring_says() -> None:
     rng, flange, Z, X = poses(11, 20)
     sigma = 1e-3, 2e-3
     measured = noisy(Z @ flange @ X, rng, sigma)
-    measured[3, :3, 3] += 0.05
-    start = ro.problem.certified_hand_eye(flange, measured, sigma=sigma, loss=loss)
+    start = ro.problem.certified_hand_eye(flange, measured, sigma=sigma)
     T = start.base @ flange @ start.tool
     turns = np.sum((measured - T)[:, :3, :3] ** 2, axis=(1, 2)) / (2 * sigma[1] ** 2)
     squares = np.sum((measured - T)[:, :3, 3] ** 2, axis=1) / sigma[0] ** 2 + turns
-    lost = squares if loss == "squares" else np.minimum(squares, chi2.ppf(0.99, 6))
-    assert start.cost == pytest.approx(lost.sum(), rel=1e-6)
+    assert start.cost == pytest.approx(squares.sum(), rel=1e-6)
     assert start.bound <= start.cost
     assert start.certified
-    assert (start.weights[3] < 0.5) == (loss != "squares")
 
 
 def test_turns_about_one_axis_are_not_certified() -> None:
@@ -207,34 +202,6 @@ def test_starts_that_fit_as_well_are_not_certified() -> None:
         assert start.radius > turned_by(start.base, Z)
 
 
-def test_outliers_that_are_as_many_are_not_certified() -> None:
-    """Somebody moved the instrument: halves agree with two bases. With one more, they agree with one."""
-    rng, flange, Z, X = poses(23, 12)
-    other = frame(rng, 2.0)
-    for kept in (6, 7):
-        measured = Z @ flange @ X
-        measured[kept:] = other @ flange[kept:] @ X
-        start = ro.problem.certified_hand_eye(flange, measured, loss="truncated")
-        assert start.certified == (kept == 7)
-        assert start.weights.sum() == kept
-        if not start.certified:
-            assert "6 of 12 measurements agree, and as many others may agree with another start" in start.reason
-
-
-@pytest.mark.parametrize(("count", "wrong"), [(4, 1), (5, 2), (9, 5)])
-def test_a_few_that_agree_are_certified_where_no_others_can(count: int, wrong: int) -> None:
-    """Of four poses three, of nine four: no majority, but what else turns as the flange does is none of the others."""
-    sigma = 1e-3, 3e-3
-    rng, flange, Z, X = poses(37 + count, count)
-    measured = noisy(Z @ flange @ X, rng, sigma)
-    measured[:wrong] = [frame(rng, 1.0) for _ in range(wrong)]
-    start = ro.problem.certified_hand_eye(flange, measured, sigma=sigma, loss="truncated")
-    assert start.certified, start.reason
-    np.testing.assert_array_equal(start.weights, np.arange(count) >= wrong)
-    assert turned_by(start.base, Z) < 0.05
-    assert turned_by(start.tool, X) < 0.05
-
-
 def test_three_poses_with_two_answers_are_not_certified() -> None:
     """Two frames fit three noisy poses within the noise; the better one is not that of which they were made."""
     study = load_study(find_study("certified_start"))
@@ -247,7 +214,6 @@ def test_three_poses_with_two_answers_are_not_certified() -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"loss": "l1"}, "loss: found 'l1', accepted: squares, truncated"),
         ({"sigma": (0.0, 1.0)}, "sigma: found a number that is not positive"),
         ({"measured": np.zeros((12, 2))}, "transforms: found shapes"),
         ({"measured": np.zeros((12, 4, 4))}, "pose 1: found a matrix that violates R R' = I by 1"),
@@ -313,28 +279,3 @@ def test_a_real_camera_is_certified() -> None:
     assert start.gap < 1e-6
     assert start.rank_ratio < 1e-6
     assert np.abs(start.tool[:3, 3] - [0.0909, -0.0121, 0.0438]).max() < 2e-3
-
-
-@pytest.mark.parametrize(
-    ("groups", "expected"), [([3, 1], True), ([3, 2], True), ([4, 4], False), ([4, 3, 3], True), ([3, 3, 1], False)]
-)
-def test_what_agrees_is_certified_where_no_others_are_as_many(groups: list[int], expected: bool) -> None:
-    rng, flange, _, tool = poses(3, sum(groups))
-    bases = np.array([frame(rng, 1.0) for _ in groups])
-    measured = bases[np.repeat(np.arange(len(groups)), groups)] @ flange @ tool
-    start = ro.problem.certified_hand_eye(flange, measured, sigma=(1e-3, 1e-3), loss="truncated")
-    assert start.certified == expected
-    if expected:
-        np.testing.assert_array_equal(start.weights, np.arange(len(flange)) < groups[0])
-    else:
-        assert "as many others may agree" in start.reason
-
-
-def test_rotations_of_four_digits_agree() -> None:
-    """Small turns, whose cosines say little, from a file that was written shortly."""
-    rng, flange, base, tool = poses(2, 40)
-    flange[:, :3, :3] = Rotation.from_rotvec(0.01 * rng.normal(size=(40, 3))).as_matrix()
-    measured = base @ flange @ tool
-    measured[:, :3, :3] = measured[:, :3, :3].round(4)
-    start = ro.problem.certified_hand_eye(flange, measured, sigma=(1e-3, 1e-3), loss="truncated")
-    assert (start.weights == 1).all()

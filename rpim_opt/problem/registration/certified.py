@@ -1,9 +1,8 @@
-"""Certified registration: base and tool from closed loops, with or without outliers, with an optimality certificate."""
+"""Certified registration: base and tool from closed loops, with an optimality certificate."""
 
 from __future__ import annotations
 
-from bisect import bisect_left
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from typing import NamedTuple
@@ -24,12 +23,7 @@ FAR = 0.5  # angle [rad] within which all starts have to be that fit as well, fo
 AS_WELL = 1e-4  # probability that the truth fits worse than what counts as fitting as well
 RIDGE = 1e-6
 """How certain an expected translation is at least, in units of all positions together: what they do not show stays."""
-LOSSES = ("squares", "truncated")
-QUANTILE = 0.99  # which part of good measurements the truncated loss leaves as they are: their squares are chi-squared
-FEWEST, MOST_ROUNDS = 3, 100  # measurements that have to agree, and how often these are chosen anew
-MOST_PAIRED = 2000  # measurements up to which all pairs are compared
-TRIED, FEW = 40, 10  # measurements, evenly spread, whose compatible sets are tried, and the most sets that are
-SURPRISE = 1e-4  # probability that a good measurement is off by more than counts as good
+FEWEST = 3  # measurements
 LINEAR = 6  # unknowns that are eliminated exactly: the translations t of the tool and u of the base
 
 
@@ -39,13 +33,12 @@ class CertifiedStart:
 
     ::
 
-        cost   = sum_i loss(|r_i|) + |t - expected|^2 / spread^2,   r_i in standard deviations
+        cost   = sum_i |r_i|^2 + |t - expected|^2 / spread^2,   r_i in standard deviations
         bound <= cost of any base and tool whatever
         gap    = (cost - bound) / (1 + cost)
 
-    Angles are in rad; ``bound`` and ``radius`` are proven. Where outliers are left out, the bound is that of the sum of
-    squares of the others. ``certified`` says that the optimum is global, the only one and determined, and, where
-    outliers were expected, that so many measurements agree with it that no other can have as many.
+    Angles are in rad; ``bound`` and ``radius`` are proven. ``certified`` says that the optimum is global, the only one
+    and determined.
     """
 
     base: Array  # (4, 4) transform of the robot's base in the instrument's frame [m]
@@ -56,7 +49,6 @@ class CertifiedStart:
     rank_ratio: float  # second over first eigenvalue of the moment matrix: zero where the relaxation is tight
     uncertainty: float  # standard deviation of the least certain rotation
     radius: float  # angle from these rotations beyond which all others fit worse by more than noise explains
-    weights: Array  # (N,) that the loss gives the measurements; one for those that count
     certified: bool
     reason: str  # why it is certified or not, in a sentence
 
@@ -69,14 +61,13 @@ def certified_hand_eye(
     sigma: tuple[float | Array, float | Array] = (NOMINAL_ERROR, NOMINAL_ERROR),
     expected: Place = (0, 0, 0),
     spread: float = np.inf,
-    loss: str = "squares",
 ) -> CertifiedStart:
     """Return base Z and tool X of A X = Z B, measured_i = Z flange_i X, with an optimality certificate.
 
     ::
 
-        minimize  sum_i loss(|r_i|),   |r_i|^2 = |Z_R'y_i - A_R,i t - A_t,i - u|^2 / sigma_position^2
-                                               + |B_R,i X_R' - Z_R A_R,i|^2 / (2 sigma_orientation^2)
+        minimize  sum_i |r_i|^2,   |r_i|^2 = |Z_R'y_i - A_R,i t - A_t,i - u|^2 / sigma_position^2
+                                             + |B_R,i X_R' - Z_R A_R,i|^2 / (2 sigma_orientation^2)
 
     over rotations Z_R, X_R and translations t = X_t, u = Z_R'Z_t. The translations are eliminated exactly; the
     rotations are relaxed to a moment matrix (`relax`).
@@ -85,9 +76,8 @@ def certified_hand_eye(
     instrument's frame, NaN for rotations that were not measured; or positions (N, 3). ``sigma`` are the standard
     deviations of a position [m] and an orientation [rad], each a number or (N,): of the instrument and of the robot,
     which differs from the nominal one. The tool is ``expected`` (3,) in the flange frame [m] with the standard
-    deviation ``spread`` [m]; a direction that the measurements do not show stays there in any case. The loss is
-    "squares", or "truncated", which leaves outliers out. InputError for fewer than three measurements, and what is no
-    transform.
+    deviation ``spread`` [m]; a direction that the measurements do not show stays there in any case. InputError for
+    fewer than three measurements, and what is no transform.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -95,67 +85,45 @@ def certified_hand_eye(
     >>> flange = ro.robot.forward_kinematics(arm.robot, arm.data.q)
     >>> base, tool = np.eye(4), np.eye(4)
     >>> base[:3, 3], tool[:3, 3] = [2.0, 0.0, 0.5], [0.0, 0.02, 0.06]
-    >>> seen = base @ flange @ tool
-    >>> seen[0, 0, 3] += 0.5  # one of them is wrong
-    >>> start = ro.problem.certified_hand_eye(flange, seen, loss="truncated")
-    >>> bool(np.abs(start.base - base).max() < 1e-6), bool(np.abs(start.tool - tool).max() < 1e-6)
-    (True, True)
-    >>> start.certified, int(np.sum(start.weights == 0))
-    (True, 1)
+    >>> start = ro.problem.certified_hand_eye(flange, base @ flange @ tool)
+    >>> bool(np.abs(start.base - base).max() < 1e-6), bool(np.abs(start.tool - tool).max() < 1e-6), start.certified
+    (True, True, True)
     """
-    flange, measured, turned = _checked(flange, measured, loss)
+    flange, measured, turned = _checked(flange, measured)
     N = len(flange)
     deviations = np.stack([np.broadcast_to(np.asarray(each, dtype=float), N) for each in sigma], axis=1)
     if not (np.isfinite(deviations).all() and (deviations > 0).all()):
         raise InputError("sigma", "a number that is not positive", "standard deviations of position and orientation")
-    equations = np.where(turned, 6, 3)
-    beyond = np.full(N, np.inf) if loss == "squares" else chdtri(equations, 1 - QUANTILE)
-    expected = np.asarray(expected, dtype=float)[:3]
-    loops = _Loops(*_equations(flange, measured, turned, deviations, expected, spread), beyond)
-    several = False  # whether other measurements than those of full weight may be as many that agree
-    if loss == "squares":
-        solved = loops.repeated(np.ones(N, dtype=bool))
-    else:
-        pairs = _compatible(flange, measured, turned, deviations[:, 1], beyond)
-        solved = _truncated(loops, pairs)
-        count = int(np.sum(solved.agreeing))
-        if count < N // 2 + 2:  # no majority: none of the others is in a core of that size but what a good one may be
-            strange = ~solved.agreeing & (solved.squares > chdtri(equations, SURPRISE))
-            several = count < 2 or bool((_core(pairs, count) & strange).any())
-    best = solved.smallest
+    J = _equations(flange, measured, turned, deviations, np.asarray(expected, dtype=float)[:3], spread)
+    # |T v| = |J v|, T upper: its last rows are the least over translations (a Schur complement), its first say which
+    T = np.asarray(np.linalg.qr(J, mode="r"))
+    best = smallest(T[LINEAR:, LINEAR:])
+    t, u = solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ lifted(best.rotations)).reshape(2, 3)
     first, *last = best.rotations
-    t, u = solved.v[:LINEAR].reshape(2, 3)
-    excess = best.value - best.bound
-    gap = excess / (1 + solved.cost)
+    gap = (best.value - best.bound) / (1 + best.value)
     weakest = float(np.linalg.eigvalsh(best.information)[0])
     uncertainty = float(1 / np.sqrt(weakest)) if weakest > 0 else float(np.inf)
     radius = best.radius(float(chdtri(LINEAR + 3 * len(best.rotations), AS_WELL)))
-    full = int(np.sum(solved.agreeing))
-    causes = {
-        f"the measurements do not determine the rotations (about {uncertainty:.2g} rad): rotations about two axes "
-        "would": (uncertainty > UNKNOWN),
-        f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better": gap > GAP,
-        f"another start, up to {radius:.2g} rad away, may fit as well: measure more or other poses to decide": radius
-        > FAR,
-        "the weights of the loss did not converge": not solved.converged,
-        f"{full} of {N} measurements agree, and as many others may agree with another start": several,
-    }
-    cause = next((text for text, true in causes.items() if true), "")
+    cause = ""
+    if uncertainty > UNKNOWN:
+        rotations = f"the rotations (about {uncertainty:.2g} rad)"
+        cause = f"the measurements do not determine {rotations}: rotations about two axes would"
+    elif gap > GAP:
+        cause = f"the relaxation is not tight: another start may be up to {100 * gap:.2g} % better"
+    elif radius > FAR:
+        cause = f"another start, up to {radius:.2g} rad away, may fit as well: measure more or other poses to decide"
     return CertifiedStart(
-        base=rigid(first, first @ u), tool=rigid(last[0].T if last else np.eye(3), t), cost=solved.cost,
-        bound=solved.cost - excess, gap=gap, rank_ratio=best.rank_ratio, uncertainty=uncertainty, radius=radius,
-        weights=solved.agreeing.astype(float), certified=not cause,
-        reason=cause or f"globally optimal (relative optimality gap at most {GAP:g})",
+        base=rigid(first, first @ u), tool=rigid(last[0].T if last else np.eye(3), t), cost=best.value,
+        bound=best.bound, gap=gap, rank_ratio=best.rank_ratio, uncertainty=uncertainty, radius=radius,
+        certified=not cause, reason=cause or f"globally optimal (relative optimality gap at most {GAP:g})",
     )  # fmt: skip
 
 
-def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, np.ndarray]:
+def _checked(flange: Array, measured: Array) -> tuple[Array, Array, np.ndarray]:
     """Return transforms and which were measured to turn; refuse what is none."""
     flange = np.asarray(flange, dtype=float)
     measured = np.asarray(measured, dtype=float)
     N = len(flange)
-    if loss not in LOSSES:
-        raise InputError("loss", repr(loss), ", ".join(LOSSES))
     if flange.shape != (N, 4, 4) or measured.shape not in ((N, 4, 4), (N, 3)):
         found = f"shapes {flange.shape}, {measured.shape}"
         raise InputError("transforms", found, "(N, 4, 4) both, or positions (N, 3)")
@@ -181,15 +149,16 @@ def _checked(flange: Array, measured: Array, loss: str) -> tuple[Array, Array, n
 
 def _equations(
     flange: Array, measured: Array, turned: np.ndarray, sigma: Array, expected: Array, spread: float
-) -> tuple[Array, Array]:
-    """Return the loops ``measured = base flange tool``, and what is expected of t, as equations of v (`_Loops`).
+) -> Array:
+    """Return J (12 N + 3, n): loops ``measured = base flange tool`` and what is expected of t are J v.
 
     ::
 
-        (Z_R' y - A_R t - A_t - u) / sigma_position,    t = X_t,  u = Z_R' Z_t
+        v = (t, u, 1, vec Z_R, vec X_R'),  rotations' rows first,    t = X_t,  u = Z_R' Z_t
+        (Z_R' y - A_R t - A_t - u) / sigma_position
         (B_R X_R' - Z_R A_R) / (sqrt(2) sigma_orientation)    where the orientation was measured
 
-    The norm of the second is the angle between the two, up to third order. X_R is left out where nothing turned.
+    The norm of the last is the angle between the two, up to third order. X_R is left out where nothing turned.
     """
     N = len(flange)
     eye = np.eye(3)
@@ -210,124 +179,7 @@ def _equations(
     prior = np.zeros((3, J.shape[2]))
     prior[:, :3] = certainty * eye
     prior[:, one] = -certainty * expected
-    return J, prior
-
-
-class _Solved(NamedTuple):
-    """Where a loss of closed loops is least."""
-
-    v: Array  # (n,) translations, 1 and rotations, as `_Loops` has them
-    smallest: Smallest  # of the measurements that agree
-    squares: Array  # (N,) squared residuals
-    agreeing: np.ndarray  # (N,) which of them count
-    converged: bool  # whether it is the solution of those
-    cost: float  # the loss, summed, and what is expected of translations
-
-
-class _Loops(NamedTuple):
-    """Residuals J_i v of N measurements, v = (t, u, 1, vec Z_R, vec X_R'), rotations' rows first."""
-
-    rows: Array  # (N, 12, n) J_i, each residual in units of its standard deviation
-    prior: Array  # (3, n) residuals of what is expected of t
-    beyond: Array  # (N,) c^2 of the loss min(r^2, c^2), infinite for the sum of squares
-
-    def of(self, some: np.ndarray, start: Array | None = None) -> _Solved:
-        """Return the solution of the sum of squares of some measurements (N,), as `smallest` does.
-
-        With T (n, n), upper, |T v|^2 = sum_i |J_i v|^2 + |prior v|^2: its last rows are the least over translations (a
-        Schur complement), its first ones say which these are.
-        """
-        n = self.rows.shape[2]
-        T = np.asarray(np.linalg.qr(np.vstack([*self.rows[some], self.prior, np.zeros((n, n))]), mode="r"))
-        best = smallest(T[LINEAR:, LINEAR:], start)
-        x = lifted(best.rotations)
-        v = np.concatenate([solve_triangular(T[:LINEAR, :LINEAR], -T[:LINEAR, LINEAR:] @ x), x])
-        squares = np.sum((self.rows @ v) ** 2, axis=1)
-        cost = float(np.sum(np.minimum(squares, self.beyond)) + np.sum((self.prior @ v) ** 2))
-        agreeing = squares <= self.beyond
-        return _Solved(v, best, squares, agreeing, np.array_equal(agreeing, some), cost)
-
-    def repeated(self, some: np.ndarray) -> _Solved:
-        """Return the fixed point of solution and measurements that agree with it, beginning with some (N,).
-
-        Of those that do not agree at most the worst quarter is left out at once: the first solution may fit none.
-        """
-        solved = self.of(some)
-        for _ in range(MOST_ROUNDS):
-            off = solved.squares / self.beyond
-            limit = np.sort(off[some])[: max(FEWEST, 3 * some.sum() // 4)][-1]
-            before, some = some, solved.agreeing | (some & (off <= limit))
-            if np.array_equal(some, before):
-                break
-            solved = self.of(some, solved.smallest.rotations)
-        return solved if np.isfinite(solved.smallest.bound) else self.of(some)
-
-
-def _truncated(loops: _Loops, pairs: np.ndarray) -> _Solved:
-    """Return the least of the truncated loss min(r^2, c^2) of r = |J_i v|, c^2 being a quantile of chi-squared.
-
-    It begins with the largest core of measurements that turn alike, of which ``pairs`` (N, N) can agree, and if not all
-    of that agree, with all of them and with parts of it.
-    """
-    first = _likeliest(pairs)
-    solutions = [loops.repeated(first)]
-    if not np.array_equal(solutions[0].agreeing, first):
-        solutions.append(loops.repeated(np.ones(len(pairs), dtype=bool)))
-    most = max(each.agreeing.sum() for each in solutions)
-    if most < first.sum() - 1:  # the likeliest do not all agree: begin with those that one of them goes with, too
-        members = np.flatnonzero(first)
-        around = [pairs & np.outer(pairs[i], pairs[i]) for i in members[:: 1 + len(members) // TRIED]]
-        parts = [_likeliest(some) for some in around]
-        if len(members) <= FEW:  # turning alike, one may be wrong all the same
-            parts += list(first & ~np.eye(len(first), dtype=bool)[members])
-        distinct = sorted(np.unique(parts, axis=0), key=np.sum)[-FEW:]
-        solutions += [loops.repeated(part) for part in distinct if part.sum() >= FEWEST]
-    least = min(each.cost for each in solutions)
-    return next(each for each in solutions if each.cost * (1 - 1e-6) <= least)  # the first, up to rounding
-
-
-def _compatible(flange: Array, measured: Array, turned: np.ndarray, sigma: Array, beyond: Array) -> np.ndarray:
-    """Return which two measurements (N, N) can both have squared residuals up to c^2, for some frames.
-
-    ::
-
-        B_i = E_i Z A_i X,  |E_i| <= 2 asin(sigma_i c_i / 2)    hence    ||A_i'A_j| - |B_i'B_j|| <= |E_i| + |E_j|
-
-    |.| being the angle of a rotation: X and Z drop out. Pairs of which nothing is known are compatible.
-    """
-    N = len(beyond)
-    if N > MOST_PAIRED:
-        return np.ones((N, N), dtype=bool)
-    angles = []
-    rough = np.zeros(N)
-    for matrices in (flange[:, :3, :3], measured[:, :3, :3]):
-        rotations = proper(matrices)
-        rough += np.linalg.norm(matrices - rotations, axis=(1, 2))  # taken for the nearest rotations
-        flat = rotations.reshape(-1, 9)
-        angles.append(np.arccos(np.clip((flat @ flat.T - 1) / 2, -1.0, 1.0)))
-    chord = sigma * np.sqrt(beyond) / 2 + rough / np.sqrt(8)
-    off = 2 * np.arcsin(np.minimum(1.0, chord)) + 1e-7  # what an angle from its cosine is off by
-    return (np.abs(angles[0] - angles[1]) <= off[:, None] + off) | ~np.outer(turned, turned)
-
-
-def _core(pairs: np.ndarray, count: int) -> np.ndarray:
-    """Return which measurements (N,) are left after those are dropped, in turn, that fewer than `count` go with.
-
-    All sets of `count` that go with one another are among these (the k-core of a graph; Shi, Yang, Carlone 2021, IEEE
-    ICRA, find outliers so).
-    """
-    left = np.ones(len(pairs), dtype=bool)
-    while True:
-        kept = left & (np.sum(pairs[:, left], axis=1) >= count)
-        if np.array_equal(kept, left):
-            return left
-        left = kept
-
-
-def _likeliest(pairs: np.ndarray) -> np.ndarray:
-    """Return the core (N,) of the largest count that leaves any."""
-    counts = range(len(pairs) + 2)
-    return _core(pairs, bisect_left(counts, True, key=lambda count: not _core(pairs, count).any()) - 1)
+    return np.vstack([*J, prior])
 
 
 # --- quadratic forms of rotations: relaxation, rounding, refinement and a lower bound -----------------------------
@@ -417,10 +269,10 @@ class Smallest:
 
     rotations: Array
     value: float
-    bound: float = -np.inf  # no rotations have less, up to rounding
-    rank_ratio: float = np.inf  # of the moment matrix
-    information: Array = field(default_factory=lambda: np.zeros((0, 0)))  # (3k, 3k) half the Hessian by turns [1/rad^2]
-    steepness: float = 0.0  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
+    bound: float  # no rotations have less, up to rounding
+    rank_ratio: float  # of the moment matrix
+    information: Array  # (3k, 3k) half the Hessian by turns [1/rad^2]
+    steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
 
     def radius(self, excess: float) -> float:
         """Return the angle [rad] from the best beyond which every value exceeds the smallest by more than this.
@@ -440,8 +292,8 @@ class Smallest:
         return float(2 * np.arcsin(min(1.0, np.sqrt(apart / 8))))
 
 
-def smallest(L: Array, start: Array | None = None) -> Smallest:
-    """Return the best rotations that the relaxation leads to, with its bound; or those near a start, of no bound.
+def smallest(L: Array) -> Smallest:
+    """Return the best rotations that the relaxation leads to, with its bound.
 
     ::
 
@@ -451,9 +303,6 @@ def smallest(L: Array, start: Array | None = None) -> Smallest:
     The multipliers are the solver's, moved by the least that makes the left side vanish on the rotations found, with f
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
-    if start is not None:
-        near = _refined(L, start)
-        return Smallest(near, _value(L, near))
     Q = L.T @ L
     moments = relax(Q)
     if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
