@@ -428,16 +428,11 @@ def accept(
     Exit code 0 if it is accepted, 1 if it is rejected, 4 if inconclusive: then it says what is missing.
     """
     with _loaded(result) as (loaded, say):
-        from rpim_opt.calibration.held_out import registered
-
         _require_data(register, data)
         left_out, notes, measured = (), (), None
         if data:
-            read = ro.use.read_measurements(loaded, data, measurement, tables.options)
+            read = ro.use.read_measurements(loaded, data, measurement, tables.options, register)
             left_out, notes, measured = read.left_out, read.notes, read.data
-            if register:
-                measured, motion = registered(loaded, measured)
-                notes = (*notes, f"Registered again: the measurements were {motion}.")
         say("searching for the maximum uncertainty")
         acceptance = ro.calibration.accept(loaded, console.required(limit, box, loaded.record.requirement), measured)
     return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], left_out=left_out, notes=notes)
@@ -500,6 +495,7 @@ def monitor(
     checks: Annotated[list[Path], Argument(help=f"Readings; a column time, timestamp or date orders them; {Several}")],
     tables: Tables = TABLES,
     measurement: Kind = None,
+    register: Register = False,
     out: Annotated[File, Option(help="Control chart over time as .html, or its points as .csv.")] = None,
 ) -> Answer:
     """Detect drift in check readings over time, by their prediction intervals and a CUSUM chart.
@@ -507,7 +503,7 @@ def monitor(
     Exit code 1 if the robot drifts.
     """
     with _loaded(result) as (loaded, _):
-        read = ro.use.read_measurements(loaded, checks, measurement, tables.options)
+        read = ro.use.read_measurements(loaded, checks, measurement, tables.options, register)
         monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
         if out is not None:
             with refused(out):
@@ -526,7 +522,9 @@ def export(
     mdh: Annotated[File, Option(help="DH table to write: .csv, .json or .toml, in the convention of --dh.")] = None,
     dh: Convention = "modified",
     robodk: Annotated[File, Option(help="CSV file to write: RoboDK's four numbers per joint (modified DH).")] = None,
-    corrections: Annotated[File, Option(help="CSV file for transmission errors, to subtract from commands.")] = None,
+    corrections: Annotated[
+        File, Option(help="CSV file for transmission errors, if any, to subtract from commands.")
+    ] = None,
     out: Annotated[File, Option(help="File to write, or folder if there are several sources.")] = None,
     urdf_base: UrdfBase = None,
     urdf_tip: UrdfTip = None,
@@ -535,7 +533,7 @@ def export(
     robot: Annotated[str, Option(help="Robot to export, of several in one calibration.")] = "",
     despite_verdict: Despite = False,
 ) -> Answer:
-    """Export the identified robot to files of other tools; all requested files are written, or none.
+    """Export the identified robot to files of other tools: all of them are written, or none.
 
     Exit code 1 if the robot is not delivered, or rejected by its acceptance test, and nothing is written; 4 if
     `calibrate` ends inconclusive, or the limit is met by the whole model alone, not by the geometry of files.

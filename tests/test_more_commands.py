@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from tests.test_cli import run
@@ -118,3 +120,67 @@ def test_two_logs_are_read_alike_by_every_command_that_takes_measurements(
     other = logs("other", slice(25, 33), "Nummer")
     assert run(monkeypatch, "validate", cell, *other, "--key", "Nummer") == 0
     assert "joined by column 'nummer': 8 rows match, of 8" in capsys.readouterr().out
+
+
+@pytest.fixture
+def moved(tmp_path: Any) -> tuple[str, str, str]:
+    """A result, new rows of an instrument that was set up anew, and the identification rows, as files."""
+    instance = ro.load("position")
+    result = replace(instance.calibrate(), record=replace(instance.record, validation=None))
+    ro.store.save_result(result, tmp_path / "result.json")
+    turn = Rotation.from_rotvec([0.1, 0.2, -0.3]).as_matrix()
+    tables = {
+        "new": (instance.validation, turn, [0.5, -0.2, 0.1]),
+        "old": (instance.problem.data, np.eye(3), [0, 0, 0]),
+    }
+    for name, (data, about, shift) in tables.items():
+        rows = np.column_stack([np.degrees(data.q), 1e3 * (data.blocks[0].y @ about.T + shift)])
+        head = ",".join([*(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"])
+        lines = [",".join(map(repr, row)) for row in rows.tolist()]
+        (tmp_path / f"{name}.csv").write_text("\n".join([head, *lines]) + "\n")
+    return str(tmp_path), str(tmp_path / "new.csv"), str(tmp_path / "old.csv")
+
+
+def test_an_instrument_that_was_set_up_anew_is_registered_by_every_command_that_judges(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, moved: tuple[str, str, str]
+) -> None:
+    result, new, old = moved
+    assert run(monkeypatch, "monitor", result, new) == 1
+    assert "Use --register in `validate`, `monitor` and `accept`" in capsys.readouterr().out
+    for command in (["monitor", new], ["validate", new], ["accept", "--limit", "0.5", "--data", new]):
+        assert run(monkeypatch, command[0], result, *command[1:], "--register") == 0, command
+        assert "Registered again: the measurements were displaced as a whole by" in capsys.readouterr().out
+    # after a motion they would no longer be recognized as rows that the calibration knows
+    for command in (["monitor", old], ["validate", old], ["accept", "--limit", "0.5", "--data", old]):
+        assert run(monkeypatch, command[0], result, *command[1:], "--register") == 2, command
+        assert "of 40 rows are identification rows, accepted: new rows alone" in capsys.readouterr().err
+
+
+def test_an_update_says_in_millimetres_what_it_changed(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any
+) -> None:
+    instance = ro.load("position")
+    ro.store.save_result(replace(instance.calibrate(), record=instance.record), tmp_path / "result.json")
+    data = instance.problem.data.take(np.arange(8))
+    rows = np.column_stack([np.degrees(data.q), 1e3 * data.blocks[0].y + 0.01])
+    head = ",".join([*(f"q{i}_deg" for i in range(1, 7)), "x_mm", "y_mm", "z_mm"])
+    np.savetxt(tmp_path / "later.csv", rows, delimiter=",", header=head, comments="", fmt="%.6f")
+    assert run(monkeypatch, "update", str(tmp_path), str(tmp_path / "later.csv")) == 0
+    out = capsys.readouterr().out
+    assert run(monkeypatch, "update", str(tmp_path), str(tmp_path / "later.csv"), "--json") == 0
+    errors = json.loads(capsys.readouterr().out)["errors"]
+    assert {name: of["after"]["count"] for name, of in errors.items()} == {"new": 8, "held-out": 40}
+    assert errors["new"]["after"]["rms_mm"] < errors["new"]["before"]["rms_mm"]
+    for name, of in errors.items():
+        was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
+        assert f"{name} rows: {was} with the previous calibration, {now} with this one." in out
+
+
+def test_only_endings_that_a_table_is_written_with_are_accepted(
+    monkeypatch: pytest.MonkeyPatch, capsys: Any, tmp_path: Any
+) -> None:
+    ro.store.save_result(ro.load("position").calibrate(), tmp_path / "result.json")
+    for name in ("arm.xyz", "arm.xlsx"):
+        assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / name)) == 2
+        assert "accepted: a name ending in .toml, .json, .csv.\n" in capsys.readouterr().err
+        assert not (tmp_path / name).exists()

@@ -105,9 +105,9 @@ def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, s
     )
     if far and after <= before / 2:
         return (
-            f"Likely: the instrument or the base moved. {said} Use --register in `validate` and `accept`, or "
-            "recalibrate by `update --reset 'base_*'`; do not add such rows to the problem's folder. If neither moved, "
-            "the robot has a common error at these configurations."
+            f"Likely: the instrument or the base moved. {said} Use --register in `validate`, `monitor` and `accept`, "
+            "or recalibrate by `update --reset 'base_*'`; do not add such rows to the problem's folder. If neither "
+            "moved, the robot has a common error at these configurations."
         ), ""
     if fdtrc(6, freedom, (squares - left) / 6 / (left / freedom)) < UNLIKELY:
         return "", f"{said} If the instrument was moved since the calibration, use --register."
@@ -118,12 +118,15 @@ def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
     """Return measurements after the motion of the instrument that registers them best, and that motion in words.
 
     Positions, poses and their covariances turn, lengths stay. The motion takes six degrees of freedom; rows beyond
-    six times the median distance do not count for it. InputError for fewer than five positions, and points on a line.
+    six times the median distance do not count for it. InputError for rows of the identification data, which are in the
+    calibration's frame and would not be recognized after a motion; for fewer than five positions; points on a line.
     """
+    if used := rows_used(result, data):
+        raise InputError("--register", f"{len(used)} of {len(data)} rows are identification rows", "new rows alone")
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
     if len(rows) < FEWEST:
-        raise InputError("register", f"{len(rows)} measured positions", f"at least {FEWEST}")
+        raise InputError("--register", f"{len(rows)} measured positions", f"at least {FEWEST}")
     measured = result.measured_positions(data)[rows]
     predicted = measured - vectors[rows]
     first = register(measured, predicted)

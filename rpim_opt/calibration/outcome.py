@@ -15,7 +15,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, choices
 from rpim_opt.basics.text import joined, three_digits
 from rpim_opt.bayes.hyperparameters import Learned, sessions_spread
-from rpim_opt.bayes.outliers import coherent, contradicted, error_vectors
+from rpim_opt.bayes.outliers import by_block, coherent, contradicted, error_vectors
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration import diagnosis
 from rpim_opt.calibration.certificate import Certificate
@@ -205,7 +205,7 @@ class Outcome:
     def predict(
         self,
         q: Array,
-        marker: str = "",
+        marker: str | Sequence[str] = "",
         torque: Array | None = None,
         payload: float | Array | None = None,
         of: Interval = "reached",
@@ -215,6 +215,7 @@ class Outcome:
     ) -> Prediction:
         """Return predicted positions of a reflector with their uncertainty; arguments as for `forward`.
 
+        ``marker`` may be N names as well, one for each row.
         Positions in the instrument's frame, with standard uncertainties u and expanded ones U = 2 u, or U = k u with
         Student's factor of a ``confidence``: with ``of`` ``"mean"`` of what the model says, J C J'; ``"reached"`` of
         the position that the robot will reach, with its repeatability; ``"reading"`` of what the instrument will read
@@ -232,18 +233,22 @@ class Outcome:
         spread = self.spread  # refuses a penalty without covariance before anything is computed
         noise = position_noise(self.problem)
         problem = self.problem.sample().measuring(q, position, marker, torque, payload, columns, robot, noise)
-        J = problem.jacobian(self.x).reshape(len(problem.data), 3, -1)
-        covariance = spread.of_positions(J)
+        N = len(problem.data)
+        at, covariance, session = np.empty((N, 3)), np.empty((N, 3, 3)), np.zeros((N, 3, 3))
         added = noise_covariances(problem, self.variance_factor)
-        if of == "reached":
-            covariance = covariance + added.robot[0]
+        whole = {"mean": [np.zeros((3, 3))] * len(added.robot), "reached": added.robot, "reading": added.reading}[of]
+        parts = by_block(problem, problem.jacobian(self.x))
+        for (block, J), positions, more, sessions in zip(
+            parts, problem.modelled(self.x), whole, added.session, strict=True
+        ):
+            at[block.row] = positions
+            covariance[block.row] = spread.of_positions(J) + more
+            session[block.row] = sessions
         factor = COVERAGE_FACTOR if confidence is None else coverage_factor(self.freedom, confidence)
-        if of == "reading":
-            covariance = covariance + added.reading[0]
-            if confidence is not None and added.session[0].any():
-                freedom = row_freedom(self.freedom, sessions_spread(self.learned), covariance, added.session[0])
-                factor = coverage_factor(freedom, confidence)[:, None]
-        return Prediction(problem.modelled(self.x)[0], covariance, factor, self.outside(problem.data))
+        if of == "reading" and confidence is not None and session.any():
+            freedom = row_freedom(self.freedom, sessions_spread(self.learned), covariance, session)
+            factor = coverage_factor(freedom, confidence)[:, None]
+        return Prediction(at, covariance, factor, self.outside(problem.data))
 
     def outside(self, data: Dataset) -> Outside:
         """Return which rows are outside the measured joint ranges, where the model extrapolates."""

@@ -294,7 +294,7 @@ def implausible(result: Outcome, error: Array) -> str:
     return (
         f"Median error on {len(error)} held-out rows {three_digits(1e3 * float(np.nanmedian(error)))} mm: a robot's "
         f"own errors stay below {100 * REACH:g} % of the arm's length. Either the instrument or the base moved (then "
-        "use these rows with --register in `validate` or `accept`), or another reflector, tool or robot was measured."
+        "--register in `validate`, `monitor` or `accept`), or another reflector, tool or robot was measured."
     )
 
 

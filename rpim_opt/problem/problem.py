@@ -241,7 +241,7 @@ class CalibrationProblem(RobotModel):
         self,
         q: Array,
         measurement: Measurement = position,
-        marker: str | None = None,
+        marker: str | Sequence[str] | None = None,
         torque: Array | None = None,
         payload: float | Array | None = None,
         columns: Mapping[str, Any] = MappingProxyType({}),
@@ -250,10 +250,10 @@ class CalibrationProblem(RobotModel):
     ) -> CalibrationProblem:
         """Return the same problem with a reflector measured at joint values q (N, dof) [rad or m], all values zero.
 
-        The reflector is by default that of the first row, ``robot`` one of several. ``torque`` (N, dof) [Nm],
-        ``payload`` [kg] and further ``columns`` by name [SI], one number or (N,), are what the joints bear. Where
-        the data state directions of approach, the column "approach" (N, dof) holds -1, 0 or 1, by default 0: the joints
-        are in the middle of their backlash. ``covariance`` is as `Dataset.of` takes it.
+        The reflector is by default that of the first row, or one for each row (N,); ``robot`` is one of several.
+        ``torque`` (N, dof) [Nm], ``payload`` [kg] and further ``columns`` by name [SI], one number or (N,), are what
+        the joints bear. Where the data state directions of approach, the column "approach" (N, dof) holds -1, 0 or 1,
+        by default 0: the joints are in the middle of their backlash. ``covariance`` is as `Dataset.of` takes it.
         """
         pick(self.arms, robot, "robot")
         q = np.atleast_2d(np.asarray(q, dtype=float))
@@ -262,18 +262,19 @@ class CalibrationProblem(RobotModel):
         y[:, [name == "qw" for name in measurement.columns]] = 1.0
         stated = {name: np.asarray(values, dtype=float) for name, values in columns.items()}
         approach = np.broadcast_to(stated.pop("approach", 0.0), q.shape)
+        of_rows = () if marker is None or isinstance(marker, str) else marker
         data = Dataset.of(
-            q, y, covariance, measurement=measurement,
+            q, y, covariance, measurement=measurement, marker=of_rows,
             torque=None if torque is None else np.reshape(np.asarray(torque, dtype=float), (N, -1)),
             approach=None if all(block.approach is None for block in self.data.blocks) else approach,
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
             columns={name: np.broadcast_to(values, N) for name, values in stated.items()},
         )  # fmt: skip
         first = self.data.blocks[0]
-        own = first.markers[:1] if marker is None else (marker,)
+        own = first.markers[:1] if marker is None else (str(marker),)
         fixture = first.fixture if measurement is first.measurement else ""
-        block = replace(data.blocks[0], markers=own, fixture=fixture, robot=robot)
-        return self.on(replace(data, blocks=(block,)))
+        blocks = (replace(each, markers=each.markers if len(of_rows) else own) for each in data.blocks)
+        return self.on(replace(data, blocks=tuple(replace(each, fixture=fixture, robot=robot) for each in blocks)))
 
     def without(self, labels: Collection[str]) -> CalibrationProblem:
         """Return the same problem without the rows of these labels."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -32,6 +33,7 @@ Axes = Any  # matplotlib's, imported where axes are made
 COLORS = {"before": "#a3adb8", "after": "#1769c2", "mark": "#c8371b", "other": "#7a5bc7", "ink": "#59636e"}
 """Colours by meaning, as in the page's style sheet, which has others in the dark."""
 SHAPES = "osD^v<>"
+SAME_MARK, LEGEND_WIDTH = 0.03, 44  # part of the axes within which rules share a mark; characters of its names a line
 CLOSE = 3.0  # ratio of an axis's ends below which a logarithmic one has ticks as a linear one has
 MANY_DOTS = 1000  # Dots beyond which they are one picture in a vector graphic.
 FONT_X, FONT_Y, FONT_LEAST = 0.75, 1.0, 6.0
@@ -205,19 +207,27 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     ax = _axes(ax)
     residual, solution = curve[curve[:, 1] > VANISHED * float(np.median(curve[:, 1]))].T
     ax.plot(residual, solution, color=COLORS["ink"], lw=1.5)
-    for k, name in enumerate(sorted(marked, key=lambda name: name == own)):
-        label = f"{name}, weight {marked[name]:.2g}"
-        for x, y in at(marked[name]):
-            if name == own:
-                _dots(ax, [x], [y], "mark", f"chosen: {label}", ms=9.0)
-                continue
-            style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 8, "ls": "none"}
-            ax.plot([x], [y], color=f"C{k}", label=label, **style)
+    if own:
+        chosen = marked.pop(own)
+        for x, y in at(chosen):
+            _dots(ax, [x], [y], "mark", f"chosen: {own}, weight {chosen:.2g}")
     norms = "residual norm [standard deviations of the noise]", "deviation norm [prior standard deviations]"
     ax.set(xlabel="root of the loss" if program.loss_form is None else norms[0])
     ax.set(ylabel="root of the penalty" if program.penalty_form is None else norms[1])
     logarithmic(ax, "x")
     logarithmic(ax, "y")
+    groups: list[tuple[Array, Array, list[str]]] = []  # a mark, where it is in parts of the axes, and its rules
+    for name in sorted(marked, key=lambda name: marked[name]):
+        for point in at(marked[name]):
+            place = (ax.transScale + ax.transLimits).transform(point)
+            if not groups or np.abs(place - groups[-1][1]).max() > SAME_MARK:
+                groups.append((point, place, []))
+            groups[-1][2].append(name)
+    for k, (point, _, names) in enumerate(groups):
+        ends = " to ".join(dict.fromkeys(f"{marked[name]:.2g}" for name in (names[0], names[-1])))
+        label = fill(f"{', '.join(names)}: weight {ends}", LEGEND_WIDTH)
+        style = {"marker": SHAPES[k % len(SHAPES)], "mfc": "none", "mew": 1.6, "ms": 11, "ls": "none"}
+        ax.plot(*point, color=f"C{k}", label=label, **style)
     return _with_legend(ax)
 
 

@@ -120,15 +120,16 @@ def export_files(
     despite_verdict: bool = False,
     **frames: str | bool | None,
 ) -> Exported:
-    """Export the identified robot to files of other tools; all requested files are written, or none.
+    """Export the identified robot to files of other tools: all of them, or none.
 
     Of a calibration with more than geometry `geometry_alone` is written, its transmission errors beside it.
 
     ``urdf``, ``ur_kinematics`` (``kinematics.yaml`` of ROS), ``ur_calibration`` (``calibration.conf``) and
     ``camera_info`` (a camera's YAML of ROS) are files of the nominal robot to correct, which go to ``out``, of several
     a folder. ``mdh`` (.csv, .json, .toml; in the convention ``dh``, as for `write_robot`), ``robodk`` (.csv, four
-    numbers per joint, modified) and ``corrections`` are files to write, the last one the transmission errors:
-    ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be subtracted from a command, and ``std_mrad``.
+    numbers per joint, modified) and ``corrections`` are files to write, the last one the transmission errors, beside
+    others only where the model has any: ``joint``, ``angle_deg`` (the controller's), ``correction_mrad``, to be
+    subtracted from a command, and ``std_mrad``.
     ``marker`` is the reflector, ``robot`` which of several (`together`).
 
     ``root`` and ``tip``, links of the URDF between which the robot is, are by default those that it was read between.

@@ -16,6 +16,7 @@ from rpim_opt.basics.exceptions import InputError, choices, in_file, pick
 from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import EXCEL
 from rpim_opt.basics.units import display, joint_columns, split_unit
+from rpim_opt.calibration.held_out import registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.camera import board_of, on_board
@@ -104,7 +105,11 @@ class Measured(NamedTuple):
 
 
 def read_measurements(
-    result: Calibration, source: Any, measurement: str | None = None, options: TableOptions | None = None
+    result: Calibration,
+    source: Any,
+    measurement: str | None = None,
+    options: TableOptions | None = None,
+    register: bool = False,
 ) -> Measured:
     """Return the measurements of tables, whose columns are recognized by name, as ``rpim-opt new`` reads them.
 
@@ -112,7 +117,8 @@ def read_measurements(
 
     ``source`` is a text, Excel or Parquet file, a data frame, or a list of them, which are stacked or joined;
     ``measurement`` which of the calibration's measurement types, where it has several. ``options`` are what is stated
-    of the tables; what is not, is as it was for the calibration's own.
+    of the tables; what is not, is as it was for the calibration's own. Where the instrument was moved since then, rows
+    ``register``: they are those after the motion that fits them best (`held_out.registered`), which the notes state.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("paper_arm").problem, ro.tikhonov, ro.l_curve)
@@ -145,7 +151,11 @@ def read_measurements(
     left_out = tuple(column for column in understanding.left_out if column.lower() != name)
     lost = re.compile(r"rows without|line \d|\d+ more lines")
     notes = [f"{each.file}: {note}" for each in understanding.tables for note in each.notes if lost.match(note)]
-    return Measured(data, left_out, (*notes, *understanding.notes), clock)
+    notes += understanding.notes
+    if register:
+        data, motion = registered(result, data)
+        notes.append(f"Registered again: the measurements were {motion}.")
+    return Measured(data, left_out, tuple(notes), clock)
 
 
 def _typical_noise(blocks: Sequence[Block], kind: Measurement) -> dict[str, float]:

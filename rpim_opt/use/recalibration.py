@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import fdtrc, logsumexp
 
-from rpim_opt.basics.arrays import Array, rms
+from rpim_opt.basics.arrays import Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import joined, table, three_digits
+from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
@@ -103,7 +103,9 @@ class Update:
     (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
     readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
     evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
-    ``registered`` says that the instrument or the base moved so far that the base was registered again; else empty.
+    ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
+    previous one, where nothing was released. ``registered`` says that the instrument or the base moved so far that the
+    base was registered again; else empty.
     """
 
     result: Calibration
@@ -113,6 +115,7 @@ class Update:
     causes: tuple[Cause, ...]
     moved: tuple[Moved, ...]
     readings: int
+    errors: Mapping[str, Mapping[str, Any]]
     registered: str = ""
 
     @property
@@ -136,6 +139,7 @@ class Update:
             "moved": [each.content() for each in self.moved],
             "causes": [cause._asdict() for cause in self.causes],
             "readings": self.readings,
+            "errors": self.errors,
             "converged": self.result.converged,
             "verdict": {"delivered": self.result.verdict.delivered, "reasons": list(self.result.verdict.reasons)},
             "earlier": [each._asdict() for each in self.result.record.earlier],
@@ -165,6 +169,10 @@ class Update:
             lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
+        for name, of in self.errors.items():
+            was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
+            rows = counted(of["after"]["count"], f"{name} row")
+            lines.append(f"RMS error on {rows}: {was} with the previous calibration, {now} with this one.")
         if not self.explained:
             lines.append(
                 "No small set of changed parameters, frames or readings explains the rest. Check that it is the same "
@@ -248,9 +256,14 @@ def update(
         len(result.problem.labels), {robot: ranges.tolist() for robot, ranges in result.ranges.items()},
         prior_inflation, released, left_out,
     )  # fmt: skip
+    held_out = None if released else result.record.validation  # which was measured before a change
+    rows = {"new": updated.problem.data, "held-out": held_out}
+    errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
+    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
+    figures = {name: each for name, each in figures.items() if each["after"]["count"]}
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
-    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), elsewhere)
+    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere)
 
 
 def _robots(result: Calibration) -> str:

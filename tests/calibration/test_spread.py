@@ -163,3 +163,19 @@ def test_a_penalty_without_covariance_is_refused() -> None:
         with pytest.raises(ro.InputError, match="formulation 'lasso'"):
             ask()
     assert lasso.known_covariance is None
+
+
+def test_reflectors_of_rows_are_predicted_in_one_call() -> None:
+    result = ro.calibrate(ro.load("markers").problem)
+    q = result.problem.data.q[:6]
+    names = ["A", "C", "B", "B", "A", "C"]
+    for of in ("mean", "reached", "reading"):
+        whole = result.predict(q, names, of=of, confidence=0.9)
+        for row, name in enumerate(names):
+            alone = result.predict(q[row : row + 1], name, of=of, confidence=0.9)
+            np.testing.assert_allclose(whole.position[row], alone.position[0], atol=1e-12)
+            np.testing.assert_allclose(whole.expanded[row], alone.expanded[0], rtol=1e-9)
+    with pytest.raises(ro.InputError, match="found 'X', accepted: a reflector of A, B, C"):
+        result.predict(q, ["A", "X", "B", "B", "A", "C"])
+    with pytest.raises(ro.InputError, match="found 2 names, accepted: 6, one per row"):
+        result.predict(q, ["A", "B"])

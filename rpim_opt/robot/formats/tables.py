@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -25,7 +26,7 @@ from rpim_opt.robot.mdh import MDH, MDH_DIMENSION, MOUNTINGS, Gravity, Robot
 
 READY = Path(__file__).resolve().parents[1] / "ready"
 SHEETS = (".csv", ".tsv", ".txt", ".md", ".xlsx")  # endings of tables with one row per joint
-ENDINGS = (".toml", ".json", *SHEETS)
+WRITTEN = (".toml", ".json", ".csv")  # endings of what is written
 LIMITS = ("lower", "upper")
 SI = {"angle": "rad", "length": "m"}
 FAR = 10.0  # a common normal that is further away [m] is that of nearly parallel axes
@@ -145,11 +146,10 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     return replace(robot, limits=np.array([limits[i] for i in robot.leading], dtype=float))
 
 
-def _ending(path: Path) -> str:
+def _ending(path: Path, endings: Sequence[str], others: str = "") -> str:
     ending = path.suffix.lower()
-    if ending not in ENDINGS:
-        accepted = f"a name ending in {', '.join(ENDINGS)}; read_urdf reads .urdf; ready robots are ro.robots()"
-        raise InputError("the file's name", f"'{path.name}'", accepted)
+    if ending not in endings:
+        raise InputError("the file's name", f"'{path.name}'", f"a name ending in {', '.join(endings)}{others}")
     return ending
 
 
@@ -171,7 +171,7 @@ def read_robot(path: str | Path) -> Robot:
     [1.5708, 0.0, 0.0, 0.107, 0.0]
     """
     path = next((ready for ready in READY.glob("*.toml") if ready.stem == str(path)), Path(path))
-    ending = _ending(path)
+    ending = _ending(path, (*WRITTEN[:2], *SHEETS), "; read_urdf reads .urdf; ready robots are ro.robots()")
     if ending in SHEETS:
         described = read_sheet(path)
         if described.tool.any() or described.base.any():
@@ -284,7 +284,7 @@ def write_robot(robot: Robot, path: str | Path, convention: str = "modified") ->
     coupling of joints, a mounting other than on the floor, and a payload.
     """
     path = Path(path)
-    ending = _ending(path)
+    ending = _ending(path, WRITTEN)
     convention = pick(CONVENTIONS, convention.lower(), "--dh")
     if convention == "standard":
         if ending != ".csv":
