@@ -150,6 +150,14 @@ class WeightChoice:
             return replace(self, settled=True, final=True, note=again.note)
         return again
 
+    def kept(self, last: WeightChoice) -> WeightChoice:
+        """Return this choice as the final one, since at the last one deviations diverge."""
+        rule = last.selection.name if last.selection else "selector"
+        where = f"{last.weight:.2g} at last, where deviations exceed {FAR:.0f} prior standard deviations"
+        return replace(
+            self, final=True, note=f"The rule {rule} chooses {where}: {self.weight:.2g}, its choice before, is used."
+        )
+
     def _checked(self) -> WeightChoice:
         """Settle a rule that alternates, or never comes to rest, on the safer of its choices."""
         turns = [self.weights[0]]
@@ -205,7 +213,7 @@ class State:
     ``size`` (n,) is the largest norm that each column of A has had, ``damping`` the weight of |size (step)|^2.
     ``stalled`` counts the evaluations since the objective was last lowered beyond its accuracy, to ``lowest``.
     ``outcome`` says why the loop ended (``"rest"``, ``"stuck"``, ``"far"``), ``floor`` is what vanishing objectives are
-    compared with.
+    compared with. ``before`` is the state at rest with the weight that the rule chose before.
     """
 
     z: Array
@@ -220,6 +228,7 @@ class State:
     stalled: int = 0
     lowest: float = np.inf
     outcome: str = ""
+    before: State | None = None
 
     def weighted(self, choice: WeightChoice) -> State:
         """Return the state with another weight and its objective."""
@@ -324,7 +333,7 @@ class Loop:
         choice = state.choice.confirmed(self._judged(state))
         if choice.weight == state.choice.weight:
             return replace(state, choice=choice)
-        return replace(state.weighted(choice), outcome="")
+        return replace(state.weighted(choice), outcome="", before=None if state.far else state)
 
     def answered(self, state: State) -> State:
         """Apply a rule that was not applied yet."""
@@ -346,7 +355,10 @@ class Loop:
 
     def advanced(self, state: State) -> State:
         """Solve the convex program at z; converge if it predicts no decrease, else step to its minimum, or damp."""
-        if state.evaluations > FAR_ITERATIONS and state.far:
+        if state.far and state.before is not None:
+            before = state.before
+            return replace(before, choice=before.choice.kept(state.choice))
+        if state.far and state.evaluations > FAR_ITERATIONS:
             return replace(state, outcome="far")
         try:
             solution, promised = self._predicted(state)

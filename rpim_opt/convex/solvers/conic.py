@@ -376,6 +376,7 @@ class ReducedProgram:
         self.canonical, self.rows, self.loss, self.counts = canonical, rows, loss, counts
         self.working = np.zeros(0, dtype=int)
         self.near = np.zeros(canonical.size)
+        self.far = -1.0  # the weight of the last minimum, if that was far from where it was sought
 
     def solve(self, squares: ReducedSquares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
@@ -448,20 +449,41 @@ class ReducedProgram:
         if self.rows and not near.any():
             rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
             near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
-        point, slack = self._about(near, squares, weight, A, b)
-        missed = p.missed(point.x)
-        if (missed > ACCEPTED or np.abs(point.x - near).max() > FAR) and not len(p.shared):
-            there = point, slack
-            for _ in range(REFINEMENTS):
-                try:
-                    there = self._refined(there[0].x, squares, weight, A, b)
-                except Unsolved:
-                    break
-                if p.missed(there[0].x) <= max(missed, FEASIBLE, SOUGHT * np.abs(there[0].x).max()):
-                    point, slack = there
-                    break
+        found = self._nearby(near, squares, weight, A, b) if self._walks(weight) else None
+        if found is None:
+            found = self._about(near, squares, weight, A, b)
+            missed = p.missed(found[0].x)
+            if (missed > ACCEPTED or np.abs(found[0].x - near).max() > FAR) and not len(p.shared):
+                found = self._nearby(found[0].x, squares, weight, A, b, missed) or found
+        point, slack = found
+        self.far = weight if np.abs(point.x - near).max() > FAR and not len(p.shared) else -1.0
         self.near = point.x
         return point, slack
+
+    def _walks(self, weight: float) -> bool:
+        """Return whether the minimum at a weight is as far away as the last one was, along what hardly costs."""
+        return weight <= FAR * self.far
+
+    def _nearby(
+        self,
+        near: Array,
+        squares: ReducedSquares,
+        weight: float,
+        A: Array | None,
+        b: Array | None,
+        missed: float = 0.0,
+    ) -> tuple[Point, Array] | None:
+        """Return the minimum refined from a point (N,), or None where it misses constraints by more than ``missed``."""
+        there = near
+        for _ in range(REFINEMENTS):
+            try:
+                point, slack = self._refined(there, squares, weight, A, b)
+            except Unsolved:
+                return None
+            there = point.x
+            if self.canonical.missed(there) <= max(missed, FEASIBLE, SOUGHT * np.abs(there).max()):
+                return point, slack
+        return None
 
     def _refined(
         self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
@@ -479,14 +501,16 @@ class ReducedProgram:
             every = np.vstack([every, A])
         _, s, V = np.linalg.svd(np.linalg.qr(every, mode="r"))
         M = V.T / np.maximum(np.pad(s, (0, len(z0) - len(s))), 1 / far)
-        changes: Any = far * sparse.eye_array(p.size, format="lil")
-        changes[np.ix_(p.at, p.at)] = M
-        changes = sparse.csc_array(changes)
+        rows, columns, _ = _block(p.at, p.at)
+        others = np.setdiff1d(np.arange(p.size), p.at)
+        numbers = np.append(M.ravel(), np.full(len(others), far))
+        changes: Any = sparse.csc_array((numbers, (np.append(rows, others), np.append(columns, others))))
         changed = copy(p)
         changed.A, changed.b = sparse.csr_array(p.A @ changes / far), (p.b - p.A @ near) / far
         changed.P, changed.q = sparse.csc_array(changes.T @ p.P @ changes), changes.T @ (p.q + p.P @ near)
         program = ReducedProgram(changed, self.rows, self.loss, self.counts)
-        program.data.clarabel.attempts = [(*REFINED, *other) for other in ATTEMPTS]
+        attempts = ATTEMPTS[1:] if self._walks(weight) else ATTEMPTS  # the first one hardly ever reaches far
+        program.data.clarabel.attempts = [(*REFINED, *other) for other in attempts]
         squares = ReducedSquares(squares.R @ M, squares.y - squares.R @ z0, M.T @ squares.g)
         if A is not None and b is not None:
             A, b = A @ M, b - A @ z0
