@@ -213,7 +213,7 @@ def ending(ended: Ended, most: int) -> str:
     diverges = DIVERGES_PENALIZED if state.choice.weight else DIVERGES
     exceeded = f"eviations exceed {FAR:g} prior standard deviations: {diverges}"
     if not ended.settled:
-        what = "the positions predicted in the constraints still change; use a larger weight"
+        what = "the positions predicted in the constraints still change: loosen them, or use a larger weight"
         return f"Not converged: after {ROUNDS} linearizations {what}."
     if ended.converged and ended.rounds > 1:
         return (

@@ -498,28 +498,30 @@ def minimize(
     """Run the loop from deviations ``start`` (n,) [SI], and certify the result.
 
     Positions that constraints bound are linear about a point: then it runs again about its solution until they are
-    those of the solution. Where solutions jump to and fro, the next round linearizes between them.
+    those of the solution. Where solutions move as far as the point does, the next round linearizes between them.
     """
     loop = replace(Loop.of(problem, formulation, options), about=(start, None))
     ended = _certified(loop, problem, loop.run(weight, start))
     if not ended.state.program.structure.predicts:
         return ended
     about = farthest = ended.x
-    share, last = 1.0, np.inf
+    moved = np.zeros(len(about))
     for rounds in range(2, ROUNDS + 1):
         loop = replace(loop, about=(about, farthest))
-        before = ended.state.history
+        before = ended
         ended = _certified(loop, problem, loop.run(weight, ended.x))
-        history = (*before, *ended.state.history)
+        history = (*before.state.history, *ended.state.history)
         ended = replace(ended, rounds=rounds, state=replace(ended.state, history=history))
         step = ended.x - about
-        length = float(np.linalg.norm(step / loop.scale))
-        if not ended.converged or ended.state.relative(length) <= SAME_POSITIONS:
+        if not ended.converged or ended.state.relative(float(np.linalg.norm(step / loop.scale))) <= SAME_POSITIONS:
             return ended
-        if length > last / 2:
-            share = max(share / 2, LEAST_SHARE)
-        about = about + share * step
-        last = length
+        factor = 0.0
+        if moved.any():
+            factor = np.linalg.norm((ended.x - before.x) / loop.scale) / np.linalg.norm(moved / loop.scale)
+        # of a solution that moves against the point by a factor the fixed point is at 1 / (1 + factor) of the way
+        share = max(1 / (1 + factor), LEAST_SHARE) if factor > 0.5 else 1.0
+        moved = share * step
+        about = about + moved
         if rounds <= ROUNDS_FARTHEST:
             farthest = about
     return replace(ended, settled=False)
