@@ -11,14 +11,15 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
+import numpy as np
 import scipy
 
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.tables.formats.registry import Rows, TableFormat
 
-NUMBER = r"[+-]?[\d.]+(?:e[+-]?\d+)?"
+NUMBER = r"[+-]?(?:\d+\.?\d*|\.\d+)(?:e[+-]?\d+)?"
 FANUC = re.compile(r'P\[(\d+)(?::"([^"]*)")?\]\s*\{(.*?)\};', re.DOTALL)
 KUKA = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^{}]{0,500})\}", re.IGNORECASE)
 ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\]", re.IGNORECASE)
@@ -31,55 +32,52 @@ MITSUBISHI = re.compile(r"^[ \t]*(J\w*)[ \t]*=[ \t]*\(([-+\d.][-+\d., \t]*)\)", 
 STAUBLI = re.compile(r"<(Data|Value)\s([^<>]{0,2000})>")
 PLACE = [f"commanded {axis} [mm]" for axis in "xyz"]
 TURN = [f"commanded q{part}" for part in "wxyz"]
-PAIRS = {**{f"{letter}{i}": f"{letter}{i} [deg]" for i in range(1, 7) for letter in "AJ"},
-         **dict(zip("XYZ", PLACE, strict=True)), **{turn: f"commanded {turn} [deg]" for turn in "ABC"}}  # fmt: skip
-"""What is stated by name, in capitals, and the header that says so."""
-Targets = Sequence[tuple[str, Mapping[str, str]]]
+PAIR = re.compile(rf'\b([AJ]\d|[XYZABCWPR])\s*[= ]\s*"?({NUMBER})(?:\s*(deg|mm))?', re.IGNORECASE)
+"""A joint, a coordinate or a turn that is stated by name."""
+Target = tuple[str, Mapping[str, str]]
 
 
-def _rows(joints: Targets, poses: Targets = ()) -> Rows:
+def _rows(targets: Sequence[Target]) -> Rows:
     """Return one row per joint target, or per pose if there are none; unnamed targets are numbered."""
-    return [{"label": name or str(i), **values} for i, (name, values) in enumerate(joints or poses, start=1)]
+    joints = [each for each in targets if not all(name.startswith("commanded") for name in each[1])]
+    return [{"label": name or str(i), **values} for i, (name, values) in enumerate(joints or targets, start=1)]
 
 
-def _listed(cells: str, names: Sequence[str] = ()) -> dict[str, str]:
-    """Return values that are separated by commas, by default of joints [deg]."""
+def _listed(name: str, cells: str, headers: Sequence[str] = ()) -> Target:
+    """Return a target whose values are separated by commas, by default those of joints [deg]."""
     values = [cell.strip() for cell in cells.split(",")]
-    return dict(zip(names or [f"J{i} [deg]" for i in range(1, len(values) + 1)], values, strict=False))
+    return name, dict(zip(headers or [f"J{i} [deg]" for i in range(1, len(values) + 1)], values, strict=False))
 
 
-def _paired(pairs: Iterable[tuple[str, str]]) -> dict[str, str]:
-    return {PAIRS[name.upper()]: value for name, value in pairs if name.upper() in PAIRS}
+def _paired(name: str, fields: str) -> Target:
+    """Return a target whose values are stated by name, in degrees and millimetres unless it says otherwise."""
+    values = {}
+    for part, value, unit in PAIR.findall(fields):
+        header = part.upper() if part[1:] else f"commanded {part.upper()}"
+        values[f"{header} [{unit or ('mm' if part in 'xyzXYZ' else 'deg')}]"] = value
+    return name, values
 
 
 def read_fanuc(text: str) -> Rows:
     """Return the points; a position register without values (``********``) has none."""
     points = FANUC.findall(text)
-    comments = [comment for _, comment, _ in points]
-    named = all(comments) and len(set(comments)) == len(comments)
-    rows = []
-    for number, comment, fields in points:
-        numbers = re.findall(r"\b(J\d|[XYZWPR])\s*=\s*([+-]?[\d.]+)\s*(deg|mm)", fields)
-        values = {f"{'' if name[0] == 'J' else 'commanded '}{name} [{unit}]": value for name, value, unit in numbers}
-        rows.append((comment if named else f"P{number}", values))
-    return _rows(rows)
+    comments = {comment for _, comment, _ in points} - {""}
+    named = len(comments) == len(points)
+    return _rows([_paired(comment if named else f"P{number}", fields) for number, comment, fields in points])
 
 
 def read_kuka(text: str) -> Rows:
     """Return the targets; a prefix X of all names, as in inline forms, is removed."""
-    targets = KUKA.findall(text)
-    targets = [each for each in targets if re.search(r"\bA1\b", each[1], re.IGNORECASE)] or targets
-    inline = all(name.upper().startswith("X") for name, _ in targets)
-    pair = re.compile(rf"\b([A-Z]\d?)\s+({NUMBER})", re.IGNORECASE)
-    return _rows([(name[1:] if inline else name, _paired(pair.findall(fields))) for name, fields in targets])
+    rows = _rows([_paired(name, fields) for name, fields in KUKA.findall(text)])
+    inline = all(row["label"].upper().startswith("X") for row in rows)
+    return [{**row, "label": row["label"][inline:]} for row in rows]
 
 
 def read_abb(text: str) -> Rows:
     """Return the targets; a quaternion has w first."""
     text = re.sub(r"!.*", "", text)
-    joints = [f"rax_{i} [deg]" for i in range(1, 10)]
-    poses = [(name, _listed(f"{place},{turn}", [*PLACE, *TURN])) for name, place, turn in ABB_POSES.findall(text)]
-    return _rows([(name, _listed(cells, joints)) for name, cells in ABB_JOINTS.findall(text)], poses)
+    poses = [_listed(name, f"{place},{turn}", [*PLACE, *TURN]) for name, place, turn in ABB_POSES.findall(text)]
+    return _rows([_listed(name, cells) for name, cells in ABB_JOINTS.findall(text)] or poses)
 
 
 def _plain_urscript(text: str) -> str:
@@ -90,21 +88,16 @@ def _plain_urscript(text: str) -> str:
 
 def read_urscript(text: str) -> Rows:
     """Return the targets that are commanded or named."""
-    joints = []
-    poses = []
+    targets = []
     for name, pose, cells in UR.findall(_plain_urscript(text)):
-        values = [float(cell) for cell in cells.split(",")]
-        if name.lower() == "set_tcp":
-            continue
         if not pose:
-            row = {f"joint_{i} [rad]": repr(value) for i, value in enumerate(values, start=1)}
-            joints.append((name.removesuffix("_q"), row))
-        else:
-            w_last = scipy.spatial.transform.Rotation.from_rotvec(values[3:]).as_quat().tolist()
-            row = {f"commanded {axis} [m]": repr(value) for axis, value in zip("xyz", values, strict=False)}
-            row |= {part: repr(value) for part, value in zip([*TURN[1:], TURN[0]], w_last, strict=True)}
-            poses.append((name.removesuffix("_p"), row))
-    return _rows(joints, poses)
+            targets.append(_listed(name.removesuffix("_q"), cells, [f"J{i} [rad]" for i in range(1, 7)]))
+        elif name.lower() != "set_tcp":
+            place, turn = np.array(cells.split(","), dtype=float).reshape(2, 3)
+            x, y, z, w = scipy.spatial.transform.Rotation.from_rotvec(turn).as_quat()
+            numbers = map(repr, [*(1e3 * place).tolist(), *map(float, (w, x, y, z))])
+            targets.append((name.removesuffix("_p"), dict(zip([*PLACE, *TURN], numbers, strict=True))))
+    return _rows(targets)
 
 
 def read_yaskawa(text: str) -> Rows:
@@ -112,35 +105,37 @@ def read_yaskawa(text: str) -> Rows:
     kind = re.search(r"///POSTYPE\s+(\w+)", text)
     if kind is None or kind[1] == "PULSE":
         raise InputError("the positions", "encoder pulses", "a job that was exported with ///POSTYPE ANGLE or BASE")
-    names = () if kind[1] == "ANGLE" else PLACE
-    return _rows([(name, _listed(cells, names)) for name, cells in YASKAWA.findall(text)])
+    headers = () if kind[1] == "ANGLE" else PLACE
+    return _rows([_listed(name, cells, headers) for name, cells in YASKAWA.findall(text)])
 
 
 def read_kawasaki(text: str) -> Rows:
     """Return the points of joint values of an AS program or of what a controller saved."""
     lines = [line.split() for section in KAWASAKI.findall(text) for line in section.splitlines()]
-    return _rows([(words[0].removeprefix("#"), _listed(",".join(words[1:]))) for words in lines if len(words) > 1])
+    return _rows([_listed(words[0].removeprefix("#"), ",".join(words[1:])) for words in lines if len(words) > 1])
 
 
 def read_staubli(text: str) -> Rows:
     """Return the points by their keys, numbered from 0 without keys; of several arrays as ``array[key]``."""
-    array, i = "", -1
+    array, i = "", 0
     targets = []
     for element, fields in STAUBLI.findall(text):
         attributes = dict(re.findall(r'\b(\w+)\s*=\s*"([^"]*)"', fields))
         if element == "Data":
-            array, i = attributes.get("name", ""), -1
-            continue
-        i += 1
-        targets.append((array, attributes.get("key", str(i)), _paired(attributes.items())))
-    targets = [each for each in targets if "J1 [deg]" in each[2]] or targets
-    several = len({array for array, _, _ in targets}) > 1
-    return _rows([(f"{array}[{key}]" if several else key, values) for array, key, values in targets])
+            array, i = attributes.get("name", ""), 0
+        else:
+            targets.append(_paired(f"{array}[{attributes.get('key', i)}]", fields))
+            i += 1
+    rows = _rows(targets)
+    parts = [row["label"].rstrip("]").partition("[") for row in rows]
+    if len({array for array, _, _ in parts}) > 1:
+        return rows
+    return [{**row, "label": key} for row, (_, _, key) in zip(rows, parts, strict=True)]
 
 
 def read_mitsubishi(text: str) -> Rows:
     """Return the points of joint values."""
-    return _rows([(name, _listed(cells)) for name, cells in MITSUBISHI.findall(text)])
+    return _rows([_listed(name, cells) for name, cells in MITSUBISHI.findall(text)])
 
 
 FORMATS = (
