@@ -12,8 +12,6 @@ from itertools import takewhile, zip_longest
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
 from rpim_opt.basics.units import FOREIGN, UNIT_SIGNS, UNITS, numeral, parse_units, split
@@ -27,11 +25,10 @@ MOST_NAMED = 5  # lines that are left out and named one by one
 SUMMARIES = frozenset({
     "mean", "average", "avg", "std", "stddev", "stdev", "sigma", "min", "max", "minimum", "maximum", "range", "rms",
     "sum", "total", "median", "standarddeviation", "mittelwert", "mittel", "summe", "stdabw", "standardabweichung",
-    "spannweite", "moyenne", "écarttype", "media", "promedio", "平均", "最大", "最小", "标准差", "標準偏差",
+    "spannweite", "moyenne", "écarttype", "media", "média", "promedio", "gemiddelde", "ortalama", "среднее", "平均", "最大",
+    "最小", "标准差", "標準偏差",
 })  # fmt: skip
 """What a row begins with that is no measurement, letters alone."""
-MOST_SUMMARIES, FEWEST_ROWS, SAME = 6, 6, 1e-3
-"""Such rows at most, rows above them at least, and the part of a column's spread by which its mean may be rounded."""
 COMMENT = re.compile(r"(?:(?://|[#%!*])\s*)+")
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
 """How tables say that there is no value."""
@@ -198,11 +195,9 @@ def _of_grid(grid: Grid, options: TableOptions) -> RawTable:
             units = stated
             lines_of_units.append(f"units above the header: {' '.join(filter(None, row))}.")
     table = _columns([grid.rows[i] for i in full], heads, replace(options, units={**units, **options.units}))
-    full = full[: len(full) - _summaries(table.columns)]
     left = set(range(numeric[0], len(grid.rows))).difference(full)
     notes = (*grid.notes, *_notes(grid, above, left, options), *lines_of_units, *table.notes)
-    columns = {name: cells[: len(full)] for name, cells in table.columns.items()}
-    return RawTable(columns, table.groups, notes, units)
+    return replace(table, notes=notes, units=units)
 
 
 def _stated_units(row: Sequence[str]) -> dict[str, str]:
@@ -215,20 +210,6 @@ def _stated_units(row: Sequence[str]) -> dict[str, str]:
     with suppress(InputError):  # units of columns, or a sentence
         return parse_units(",".join(names))
     return {}
-
-
-def _summaries(columns: Columns) -> int:
-    """Return how many rows at the end are means, spreads or extremes of all above; extremes alone may end a path."""
-    table = np.array([[numeral(cell) for cell in cells] for cells in columns.values() if _is_numeric(cells)]).T
-    for count in range(min(MOST_SUMMARIES, len(table) - FEWEST_ROWS), 0, -1):
-        above, below = table[:-count], table[-count:]
-        figures = np.array([above.mean(axis=0), above.std(axis=0), above.min(axis=0), above.max(axis=0)])
-        there = np.isfinite(below)[:, None]
-        same = np.abs(below[:, None] - figures) <= SAME * above.std(axis=0)  # (row, figure, column)
-        shows = (same | ~there).all(axis=2) & (there.sum(axis=2) > 2)
-        if shows[:, :2].any() and shows[0].any():
-            return count
-    return 0
 
 
 def _count(row: Sequence[str]) -> int:
