@@ -14,7 +14,7 @@ from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.tables import Columns, Grid, array_columns, is_numeral, list_of_numbers, read_columns, read_grid
-from rpim_opt.basics.units import FOREIGN, UNIT_SIGNS, UNITS, numeral, parse_units, split
+from rpim_opt.basics.units import UNIT_SIGNS, UNITS, numeral, parse_units, split
 
 FULL = 0.6  # a row belongs to the data if it has this part of the numbers of the fullest row
 MOSTLY = 0.8  # a column is one of numbers if this part of its cells are
@@ -25,8 +25,8 @@ MOST_NAMED = 5  # lines that are left out and named one by one
 SUMMARIES = frozenset({
     "mean", "average", "avg", "std", "stddev", "stdev", "sigma", "min", "max", "minimum", "maximum", "range", "rms",
     "sum", "total", "median", "standarddeviation", "mittelwert", "mittel", "summe", "stdabw", "standardabweichung",
-    "spannweite", "moyenne", "écarttype", "media", "média", "promedio", "gemiddelde", "ortalama", "среднее", "平均", "最大",
-    "最小", "标准差", "標準偏差",
+    "spannweite", "moyenne", "écarttype", "media", "média", "promedio", "gemiddelde", "ortalama", "среднее", "平均",
+    "最大", "最小", "标准差", "標準偏差",
 })  # fmt: skip
 """What a row begins with that is no measurement, letters alone."""
 COMMENT = re.compile(r"(?:(?://|[#%!*])\s*)+")
@@ -429,7 +429,7 @@ def _mark(cell: str) -> str:
 def _impossible(number: str, name: str, options: TableOptions) -> bool:
     """Return whether a number is beyond any joint value or coordinate, in its column's unit or all that are stated."""
     own = split(name)[1]
-    units = [UNITS[FOREIGN.get(unit, (unit,))[0]] for unit in ([own] if own else options.units.values())]
+    units = [UNITS[unit] for unit in ([own] if own else options.units.values())]
     beyond = [abs(float(number)) * unit.si > BEYOND[unit.dimension] for unit in units if unit.dimension in BEYOND]
     return bool(beyond) and all(beyond)
 

@@ -22,9 +22,9 @@ class Unit(NamedTuple):
 
 
 _BY_DIMENSION = {
-    "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6},
+    "length": {"m": 1.0, "mm": 1e-3, "um": 1e-6, "cm": 1e-2, "in": 0.0254},
     "length2": {"m2": 1.0, "mm2": 1e-6, "um2": 1e-12},
-    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180},
+    "angle": {"rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180, "gon": math.pi / 200},
     "angle2": {"rad2": 1.0, "mrad2": 1e-6},
     "length angle": {"m_rad": 1.0, "mm_mrad": 1e-6},
     "torque": {"Nm": 1.0},
@@ -167,7 +167,7 @@ SPELLED = {
     "derece": "deg", "град": "deg", "рад": "rad", "度": "deg", "도": "deg", "мм": "mm", "毫米": "mm", "gons": "gon",
 }  # fmt: skip
 """Units as they are spelled in headers; a small grad may be a gon."""
-UNIT_SIGNS = frozenset(map(str.lower, [*UNITS, *SPELLED, "in", "cm", "gon", "-", "s", "1"]))
+UNIT_SIGNS = frozenset(map(str.lower, [*UNITS, *SPELLED, "-", "s", "1"]))
 """What stands in a line of units, in lower case."""
 IN_A_NAME = (
     re.compile(r"(.+?)[\s_]*[\[(]\s*(\S+?)\s*[\])]"),
@@ -178,19 +178,10 @@ IN_A_NAME = (
 )
 
 
-FOREIGN = {"in": ("mm", 25.4), "cm": ("mm", 10.0), "gon": ("deg", 0.9)}
-"""Units that files of ours do not have: the unit of ours, and how many of it one is. Their numbers are converted."""
-
-
 def _spelled(text: str) -> str:
     """Return the name of a unit, or nothing where a text is none."""
     names = (text, SPELLED.get(text) or SPELLED.get(text.lower(), ""), text.lower() if len(text) > 1 else "")
-    return next((name for name in names if name in UNITS or name in FOREIGN), "")
-
-
-def dimension_of(unit: str) -> str:
-    """Return the dimension of a unit."""
-    return UNITS[FOREIGN[unit][0] if unit in FOREIGN else unit].dimension
+    return next((name for name in names if name in UNITS), "")
 
 
 def parse_units(text: str) -> dict[str, str]:
@@ -200,8 +191,8 @@ def parse_units(text: str) -> dict[str, str]:
         stem, _, sign = (each.strip() for each in part.rpartition("="))
         name = _spelled(sign)
         if not name:
-            raise InputError("--units", f"'{part}'", choices(part, [*UNITS, *FOREIGN]))
-        key = stem or dimension_of(name)
+            raise InputError("--units", f"'{part}'", choices(part, UNITS))
+        key = stem or UNITS[name].dimension
         if key in units:
             accepted = "one unit per dimension; another for joint values alone as q=rad"
             raise InputError("--units", f"{units[key]} and {part}", accepted)

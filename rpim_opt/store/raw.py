@@ -14,7 +14,7 @@ import numpy as np
 from rpim_opt.basics.exceptions import InputError, in_file, pick
 from rpim_opt.basics.layout import RawTable, TableOptions
 from rpim_opt.basics.tables import EXCEL, Columns, read_columns
-from rpim_opt.basics.units import dimension_of, split
+from rpim_opt.basics.units import UNITS, split
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.measurements.pose import pose
@@ -110,7 +110,7 @@ def rows_of(
         of_column = [table.file for table in found.tables if column in {each.column for each in table.meant}]
         accepted = error.accepted
         units = {name: split(name)[1] for name in found.left_out}
-        lengths = [name for name, unit in units.items() if unit and dimension_of(unit) == "length"]
+        lengths = [name for name, unit in units.items() if unit and UNITS[unit].dimension == "length"]
         lacking = any(error.found.startswith(f"no column for '{stem}'") for stem in kind.columns)
         if lacking and len(lengths) == 1 and list(kind.columns.values()) == ["length"]:
             accepted += f", or rename '{lengths[0]}'"

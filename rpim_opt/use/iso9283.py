@@ -13,7 +13,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, of_file
 from rpim_opt.basics.tables import csv_text, numbers, read_columns, texts
 from rpim_opt.basics.text import Tabled, counted, listed, table
-from rpim_opt.basics.units import FOREIGN, LARGEST, UNITS, dimension_of, parse_units, split
+from rpim_opt.basics.units import LARGEST, UNITS, parse_units, split
 from rpim_opt.data.tables.formats.registry import read_raw
 from rpim_opt.data.tables.names import recognize
 
@@ -207,11 +207,10 @@ def read_approaches(source: Any, units: str = "") -> Performance:
                 raise InputError("the header", f"'{of[meaning.stem][0]}' and '{name}'", "one of them")
             dimension = "length" if meaning.stem in AXES else "angle"
             unit = unit or stated.get(dimension, "")
-            if not unit or dimension_of(unit) != dimension:
+            if not unit or UNITS[unit].dimension != dimension:
                 found = f"column '{name}' without a unit of {dimension}"
                 raise InputError("the header", found, "x_mm, or --units deg,mm")
-            ours, size = FOREIGN.get(unit, (unit, 1.0))
-            of[meaning.stem] = name, size * UNITS[ours].si
+            of[meaning.stem] = name, UNITS[unit].si
     attained, commanded = figures.values()
     pose = poses.get("configuration", poses.get("label"))
     if pose is None or not set(AXES) <= set(attained):

@@ -26,8 +26,9 @@ def test_a_table_has_no_column_without_a_value_and_blanks_where_one_lacks() -> N
 
 
 def test_a_unit_is_what_its_name_says() -> None:
-    sizes = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "rad": 1.0, "mrad": 1e-3, "urad": 1e-6, "deg": math.pi / 180,
-             "Nm": 1.0, "N": 1.0, "kg": 1.0, "K": 1.0, "degC": 1.0, "ppm": 1e-6, "px": 1.0}  # fmt: skip
+    sizes = {"m": 1.0, "mm": 1e-3, "um": 1e-6, "cm": 1e-2, "in": 0.0254, "rad": 1.0, "mrad": 1e-3, "urad": 1e-6,
+             "deg": math.pi / 180, "gon": math.pi / 200, "Nm": 1.0, "N": 1.0, "kg": 1.0, "K": 1.0, "degC": 1.0,
+             "ppm": 1e-6, "px": 1.0}  # fmt: skip
     for name, unit in UNITS.items():
         above, _, below = name.partition("_per_")
         size = math.prod(sizes[part.removesuffix("2")] ** (1 + part.endswith("2")) for part in above.split("_"))

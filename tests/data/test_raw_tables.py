@@ -200,12 +200,14 @@ def test_q0_to_q3_are_a_quaternion_where_other_columns_are_all_joints(tmp_path: 
     assert [found.columns[f"q{i}_deg"] for i in range(1, 5)] == [["1"], ["2"], ["3"], ["4"]]
 
 
-@pytest.mark.parametrize(("unit", "millimetres"), [("cm", "10"), ("in", "25.4")])
-def test_units_of_others_are_lengths_and_are_converted(tmp_path: Path, unit: str, millimetres: str) -> None:
+@pytest.mark.parametrize(("unit", "millimetres"), [("cm", 10), ("in", 25.4)])
+def test_centimetres_and_inches_are_lengths(tmp_path: Path, unit: str, millimetres: float) -> None:
     assert parse_units(unit) == {"length": unit}
     text = HEAD.replace("[mm]", f"[{unit}]")
     found = read(write(tmp_path, text + "P1,1,2,1,5,6\n"))
-    assert float(found.columns["x_mm"][0]) == pytest.approx(float(millimetres))
+    assert found.columns[f"x_{unit}"] == ["1"]
+    data = ro.read_data(found.columns, ARM, {"position_mm": 0.1})
+    assert 1e3 * data.blocks[0].y[0, 0] == pytest.approx(millimetres)
 
 
 def test_two_bytes_and_fewer_than_four_are_read_as_text(tmp_path: Path) -> None:

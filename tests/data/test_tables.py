@@ -81,7 +81,7 @@ HOSTILE = {
     "a driver's header": (GOOD.replace("x_mm", "/tracker/point/x"), "rpim-opt new (ro.store.new_problem)"),
     "unknown column": (GOOD.replace("x_mm", "px_mm"), "column 'px_mm'"),
     "no unit": (GOOD.replace("x_mm", "x"), "column 'x' without a unit"),
-    "unknown unit": (GOOD.replace("x_mm", "x_in"), "column 'x_in'"),
+    "unknown unit": (GOOD.replace("x_mm", "x_ft"), "column 'x_ft'"),
     "length for an angle": (GOOD.replace("q1_deg", "q1_mm"), "column 'q1_mm' without a unit of the right dimension"),
     "angle for a length": (GOOD.replace("x_mm", "x_deg"), "column 'x_deg' without a unit of the right dimension"),
     "missing joint": (GOOD.replace("q2_deg", "sigma_mm"), "no column for 'q2'"),

@@ -13,7 +13,7 @@ from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.layout import RawTable, TableOptions, is_missing
 from rpim_opt.basics.tables import Columns, numbers
 from rpim_opt.basics.text import listed
-from rpim_opt.basics.units import DISPLAY, FOREIGN, UNITS, dimension_of, split, split_unit
+from rpim_opt.basics.units import DISPLAY, UNITS, split, split_unit
 from rpim_opt.data.measurements.measurement import Measurement
 from rpim_opt.data.tables import names as known_names
 from rpim_opt.data.tables.names import Reading, Readings, endings, numbered, quaternion_columns, recognize
@@ -121,7 +121,7 @@ def understand(
     table = Understood(columns, of_file, tuple(meant), raw.notes, _doubt(read, robot, options, rotation))
     if not targets:
         table = _rows_with_values(table, robot, kind)
-    headed = {dimension_of(each.unit): each for each in meant if each.unit and "in the header" in each.why}
+    headed = {UNITS[each.unit].dimension: each for each in meant if each.unit and "in the header" in each.why}
     other = [(units[of], each) for of, each in headed.items() if units.get(of, each.unit) != each.unit]
     notes = [f"--units {unit} does not apply: the header has '{m.column}' in {m.unit}." for unit, m in other]
     return replace(table, notes=(*table.notes, *notes))
@@ -318,7 +318,7 @@ def _counted(read: Readings, robot: Robot) -> None:
         match = re.fullmatch(r"(\D*?)_?(0|[1-9]\d?)", each.stem)
         if match and not each.why:
             words.setdefault(match[1], {})[int(match[2])] = name
-    dimensions = {name: dimension_of(read[name].unit) if read[name].unit else "" for name in read}
+    dimensions = {name: UNITS[read[name].unit].dimension if read[name].unit else "" for name in read}
     stems = {each.stem for each in read.values()}
     joints = set(enumerate(robot.joint_dimensions, start=1))
     whole = [word for word, names in words.items() if joints <= {(i, dimensions[n]) for i, n in names.items()}]
@@ -384,7 +384,10 @@ def _under_our_names(
             unused = reason and stem and "not used by this robot and measurement type"
             meant.append(Meant(name, "not used", "", "", unused or reason or "an unknown name"))
             continue
-        cells, unit, why = _in_our_unit(name, cells, read[name], dimensions[stem], units)
+        unit, why = _unit(name, read[name], dimensions[stem], units)
+        if unit and UNITS[unit].dimension not in dimensions[stem]:
+            accepted = f"one of {' or '.join(dimensions[stem]) or 'no unit'}; units are in the row below the names"
+            raise InputError("the header", f"column '{name}' ({meaning(stem)}) in {unit}", accepted)
         new = f"{stem}_{unit}" if unit else stem
         if new in columns:
             other = next(each.column for each in meant if each.name == new)
@@ -402,21 +405,6 @@ def _under_our_names(
         accepted = "names with units, such as q1_deg and x_mm, in the header or as --columns"
         raise InputError("the header", f"no known column ({listed(list(table))})", accepted)
     return columns, meant
-
-
-def _in_our_unit(
-    name: str, cells: Sequence[Any], read: Reading, dimensions: Sequence[str], units: Mapping[str, tuple[str, str]]
-) -> tuple[Sequence[Any], str, str]:
-    """Return the cells of a column in one of our units, this unit, and why it is meant."""
-    unit, why = _unit(name, read, dimensions, units)
-    if unit and dimension_of(unit) not in dimensions:
-        accepted = f"one of {' or '.join(dimensions) or 'no unit'}; units are in the row below the names"
-        raise InputError("the header", f"column '{name}' ({meaning(read.stem)}) in {unit}", accepted)
-    if unit not in FOREIGN:
-        return cells, unit, why
-    ours, size = FOREIGN[unit]
-    values = ["" if np.isnan(value) else repr(float(size * value)) for value in _values(cells, name)]
-    return values, ours, f"{why}; {unit} is {size:g} {ours}"
 
 
 def meaning(stem: str) -> str:
