@@ -110,7 +110,7 @@ BAD = {
         ["problem.toml", "key identification", "found nothing"],
     ),
     "no TOML": (TOML, "[noise]", "[noise", ["problem.toml", "TOML"]),
-    "unknown pattern": (TOML, '"alpha?"', '"alfa?"', ["problem.toml", "'alfa?'", "alpha1..6", "base_x"]),
+    "unknown pattern": (TOML, '"alpha?"', '"alfa?"', ["problem.toml", "'alfa?'", "did you mean alpha?"]),
     "unknown formulation": (
         TOML,
         'formulation = "tikhonov"',

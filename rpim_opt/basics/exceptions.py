@@ -15,7 +15,7 @@ Named = TypeVar("Named")
 Answer = TypeVar("Answer")
 Options = ParamSpec("Options")
 LONGEST = 1000  # characters of a part of a sentence
-MANY = 24  # names that are listed one by one
+MANY = 32  # names that are listed one by one
 LONGEST_COMPARED = 200
 """Characters of what is found: names are shorter, and comparing takes as long as both of them together."""
 

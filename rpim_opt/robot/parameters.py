@@ -101,15 +101,8 @@ def reflectors(names: Iterable[str]) -> list[str]:
 
 
 def known_patterns(names: Sequence[str], pattern: str) -> str:
-    """List the known names, those of all joints in short: ``alpha1..6``, ``bend2_2x..bend6_6y``."""
-    runs: dict[str, list[str]] = {}
-    for name in names:
-        match = re.fullmatch(r"(.*?[a-z])(\d+)(?:_\d+[xyz])?", name)
-        runs.setdefault(match[1] if match else name, []).append(name)
-    known = [own[0] if len(own) == 1 else f"{own[0]}..{own[-1].removeprefix(stem)}" for stem, own in runs.items()]
-    # of what `choices` says of all the names only the guess: the list itself is shorter in runs
-    _, guess, close = choices(pattern, names).partition(" (did")
-    return "names or patterns of " + ", ".join(known) + guess + close
+    """Return the patterns of the known names as text: ``alpha?``, ``bend?_?x``, ``base_x``."""
+    return "names, or patterns such as " + choices(pattern, dict.fromkeys(re.sub(r"\d", "?", name) for name in names))
 
 
 # The table
