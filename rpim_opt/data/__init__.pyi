@@ -11,5 +11,4 @@ from .record import HeldOut as HeldOut
 from .record import Record as Record
 from .record import Requirement as Requirement
 from .tables.formats.registry import TableOptions as TableOptions
-from .tables.reading import LaserTracker as LaserTracker
 from .tables.reading import read_data as read_data

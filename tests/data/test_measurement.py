@@ -16,7 +16,6 @@ from rpim_opt.data.measurements.camera import CAMERAS
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.pose import quaternion, rotation_between
 from rpim_opt.data.measurements.registry import MEASUREMENTS
-from rpim_opt.data.tables.reading import LaserTracker
 
 KINDS = [name for name in MEASUREMENTS if name not in CAMERAS]  # whose points have to be in sight: test_camera
 TYPES = ("revolute", "prismatic")
@@ -151,17 +150,6 @@ def test_other_forms_of_a_rotation_are_the_same_rotation() -> None:
         assert np.abs(np.abs(np.sum(got[:, 3:] * want, axis=1)) - 1).max() < 1e-14
     with pytest.raises(ro.InputError, match="row 1: found a matrix that violates R R' = I by"):
         from_matrices(np.hstack([xyz, 1.01 * R.as_matrix().reshape(20, 9)]))
-
-
-def test_a_trackers_covariance_is_along_and_across_the_beam() -> None:
-    tracker = LaserTracker(range=3e-6, range_ppm=1e-6, transverse=2e-5, angle=1e-5, x=1.0)
-    C = tracker.covariance(np.array([[1.0, 4.0, 0.0]]))[0]
-    assert np.sqrt(np.diag(C)) == pytest.approx([2e-5 + 4e-5, 3e-6 + 4e-6, 2e-5 + 4e-5])
-    slanted = tracker.covariance(np.array([[3.0, 2.0, 2.0]]))[0]
-    beam = np.ones(3) / np.sqrt(3)
-    D = np.sqrt(12)
-    assert beam @ slanted @ beam == pytest.approx((3e-6 + 1e-6 * D) ** 2)
-    assert np.linalg.eigvalsh(slanted)[1:] == pytest.approx(np.full(2, (2e-5 + 1e-5 * D) ** 2))
 
 
 def test_positions_of_one_reflector_and_distances_of_another_in_one_calibration() -> None:

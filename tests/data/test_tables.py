@@ -203,6 +203,10 @@ def test_a_tracker_adds_to_the_declared_noise_and_a_rows_own_replaces_both() -> 
     tracker = {"range_um": 10, "range_ppm": 5, "transverse_um": 20, "angle_urad": 10, "x_m": -2}
     C = read(HEAD, "a,1,2,0,0,0", {"position_mm": 0.03, "tracker": tracker}).blocks[0].covariance[0]
     assert np.diag(C) == pytest.approx([9e-10 + 4e-10, 9e-10 + 16e-10, 9e-10 + 16e-10])
+    tracker |= {"range_um": 3, "range_ppm": 1, "x_m": 1}
+    C = read(HEAD, "a,1,2,3000,2000,2000", {"tracker": tracker}).blocks[0].covariance[0]  # 2 m along x, y and z
+    assert np.sqrt(np.ones(3) @ C @ np.ones(3) / 3) == pytest.approx(3e-6 + 1e-6 * np.sqrt(12))
+    assert np.linalg.eigvalsh(C)[1:] == pytest.approx(np.full(2, (2e-5 + 1e-5 * np.sqrt(12)) ** 2))
     own = read(HEAD + ",sigma_mm", "a,1,2,0,0,0,0.5", {"tracker": tracker}).blocks[0].covariance[0]
     assert own == pytest.approx(2.5e-7 * np.eye(3))
     with pytest.raises(ro.InputError, match=r"noise.tracker: found unknown key 'rang_um'.*did you mean range_um"):

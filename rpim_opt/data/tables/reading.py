@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import combinations_with_replacement
 from typing import Any
 
@@ -50,7 +50,8 @@ def read_data(
     column names to cells. Number and types of the ``robot``'s joints decide the joint columns, ``measurement`` those of
     measured values. ``noise`` has standard deviations where no column states them: ``{"position_mm": 0.03}``,
     ``{"x_mm": 0.03, ...}``, and ``{"tracker": {"range_um": 15, "range_ppm": 6, ...}}`` for a laser tracker
-    (`LaserTracker`), added to them. InputError names the file, the row or column, what was found and what is accepted.
+    (its data sheet's terms along and across the beam), added to them. InputError names the file, the row or column,
+    what was found and what is accepted.
 
     >>> import numpy as np
     >>> import rpim_opt as ro
@@ -239,42 +240,19 @@ def require_unique(names: Sequence[str], column: str) -> None:
 # --- noise ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True)
-class LaserTracker:
-    """The covariance of what a laser tracker measures, from the terms of its data sheet.
+def _tracker_covariances(points: Array, terms: Mapping[str, float]) -> Array:
+    """Return the covariances (N, 3, 3) [m^2] of points (N, 3) [m] in a laser tracker's frame, from its data sheet.
 
-    With u the unit vector from the tracker to the point at distance D::
+    With u the unit vector from the tracker's place x, y, z to the point at distance D::
 
         C = (range + range_ppm D)^2 u u' + (transverse + angle D)^2 (1 - u u')
-
-    ``range`` and ``transverse`` are standard deviations along and across the beam at zero distance [m], ``range_ppm``
-    (1e-6 for 1 ppm) [1] and ``angle`` [rad] how they grow; ``x``, ``y``, ``z`` the tracker's place in the instrument's
-    frame [m], its origin by default.
-
-    >>> import numpy as np
-    >>> import rpim_opt as ro
-    >>> tracker = ro.data.LaserTracker(range=10e-6, range_ppm=1e-6, transverse=15e-6, angle=6e-6)
-    >>> covariance = tracker.covariance(np.array([[3.0, 0.0, 0.0]]))
-    >>> (1e6 * np.sqrt(np.diag(covariance[0]))).round(3)  # along x the beam, [um]
-    array([13., 33., 33.])
     """
-
-    range: float = 0.0
-    range_ppm: float = 0.0
-    transverse: float = 0.0
-    angle: float = 0.0
-    x: float = 0.0
-    y: float = 0.0
-    z: float = 0.0
-
-    def covariance(self, points: Array) -> Array:
-        """Return the covariances (N, 3, 3) [m^2] of points (N, 3) [m] in the instrument's frame."""
-        beam = points - np.array([self.x, self.y, self.z])
-        D = np.linalg.norm(beam, axis=1)
-        u = beam / np.maximum(D, 1e-9)[:, None]
-        along = ((self.range + self.range_ppm * D) ** 2)[:, None, None]
-        across = ((self.transverse + self.angle * D) ** 2)[:, None, None]
-        return across * np.eye(3) + (along - across) * (u[:, :, None] * u[:, None, :])
+    beam = points - [terms.get(axis, 0.0) for axis in "xyz"]
+    D = np.linalg.norm(beam, axis=1)
+    u = beam / np.maximum(D, 1e-9)[:, None]
+    along = (terms.get("range", 0.0) + terms.get("range_ppm", 0.0) * D) ** 2
+    across = (terms.get("transverse", 0.0) + terms.get("angle", 0.0) * D) ** 2
+    return across[:, None, None] * np.eye(3) + (along - across)[:, None, None] * (u[:, :, None] * u[:, None, :])
 
 
 def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any]:
@@ -289,7 +267,7 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
         terms = {"range_ppm" if of == "ratio" else stem: value for (stem, of), value in of_tracker.items()}
         if not any(terms.get(term, 0) > 0 for term in ("range", "transverse")):
             raise InputError("table noise.tracker", "no range_um and no transverse_um", "at least one of them > 0")
-        declared["tracker"] = LaserTracker(**terms)
+        declared["tracker"] = terms
     accepted = {name: (dimension,) for name, dimension in {**kind.noise, **kind.components}.items()}
     for (stem, _), value in quantities(plain, accepted, "table noise").items():
         if not value >= SMALLEST:
@@ -312,7 +290,7 @@ def covariances(
     if "tracker" in declared:
         instrument = np.zeros((len(y), k, k))
         axes = [list(kind.columns).index(axis) for axis in "xyz"]
-        instrument[:, :3, :3] = declared["tracker"].covariance(y[:, axes])
+        instrument[:, :3, :3] = _tracker_covariances(y[:, axes], declared["tracker"])
     spread: list[Any] = []
     lacking = np.zeros(k, dtype=bool)
     for i, (name, dimension) in enumerate(kind.components.items()):
