@@ -51,9 +51,8 @@ class Instance(Tabled):
     ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None where hyperparameters
     are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result says of
     the data, with the validation data; ``published`` are mean errors [mm] that the source prints for the same table, by
-    role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
-    tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,
-    all rows are used.
+    role (identification, validation) and method; ``held_out`` is whether the validation data were drawn from the same
+    table: once they have validated, all rows are used.
     """
 
     problem: CalibrationProblem
@@ -64,7 +63,6 @@ class Instance(Tabled):
     noise: str = "robot"
     record: Record = field(default_factory=Record)
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
-    reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     held_out: bool = False
 
     @property
@@ -136,9 +134,6 @@ def load(
     for file in table.published:
         if not inside(path.parent, file, "table published", path).is_file():
             raise InputError("table published", f"'{file}'", "the name of a table in this folder", path)
-    for key, pair in table.reference.items():
-        if len(pair) != 2:
-            raise InputError(f"key reference.{key}", f"{pair}", "[value, tolerance]", path)
     robot = find_robot(table.robot, path.parent)
     named = [file for names in files.values() for file in names]
     if isinstance(table.target, str):
@@ -167,7 +162,6 @@ def load(
         noise=table.repeatability if isinstance(table.repeatability, str) else "declared",
         record=record,
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
-        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         held_out=table.held_out,
     )
 

@@ -226,6 +226,7 @@ class GridTable(Table):
 
 
 Pair = Annotated[list[Name], Field(min_length=2, max_length=2)]
+Figure = Annotated[list[float], Field(min_length=2, max_length=2)]
 
 
 class DistanceTable(Table):
@@ -299,7 +300,7 @@ class ProblemTable(Table):
     base: dict[str, Any] | Literal["auto"] = Field({})  # Start of the base frame, or auto (registration).
     tool: dict[str, Any] = Field({})  # Start of the tool frame; of several reflectors by marker.
     published: dict[str, dict[str, float]] = Field({})  # Mean errors [mm] that the source prints.
-    reference: dict[str, list[float]] = Field({})  # Figures that a run must reproduce: [value, tolerance].
+    reference: dict[str, Figure] = Field({})  # Figures that a run must reproduce: [value, tolerance].
     simulation: dict[str, Any] = Field({})  # How the tables were simulated.
     record: dict[str, Any] = Field({})  # Who measured, when, with what.
     reading: dict[str, str] = Field({})  # How tables are to be read where joints or frames need another reading.

@@ -29,7 +29,7 @@ PROBLEMS = {
     "a published table that is missing": (
         "position", "[noise]", '[published."other.csv"]\nmean_mm = 1.0\n[noise]', "the name of a table in this folder"
     ),
-    "a reference without tolerance": ("position", "[0.", "[1.0, 2.0, 0.", "[value, tolerance]"),
+    "a reference without tolerance": ("position", "[0.", "[1.0, 2.0, 0.", "a list of at most 2 items"),
     "all rows excluded": ("position", "[noise]", "[exclude]\nALL\n[noise]", "no remaining row (all are excluded)"),
     "repeatability below zero": (
         "position", "[noise]", "[repeatability]\njoint_mrad = -1.0\n[noise]", "greater than or equal"
