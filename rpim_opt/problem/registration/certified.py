@@ -184,9 +184,7 @@ def _equations(
 
 # --- quadratic forms of rotations: relaxation, rounding, refinement and a lower bound -----------------------------
 
-TOLERANCE, FINE = 1e-8, 1e-12
-"""Of gap and feasibility, the form being of size one: what follows refines rotations and multipliers; the finer one
-where moments are those of several rotations."""
+TOLERANCE = 1e-8  # of gap and feasibility, the form being of size one: what follows refines rotations and multipliers
 SPREAD = 1e-3
 """Second over first eigenvalue from which moments are those of several rotations, and a few are drawn from them."""
 CROSS = -np.cross(np.eye(3)[:, None], np.eye(3))  # the matrices of the cross products e_a x
@@ -225,7 +223,7 @@ class Moments(NamedTuple):
     rank_ratio: float  # second eigenvalue of the matrix over the first: zero where it is of rank one
 
 
-def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
+def relax(Q: Array) -> Moments:
     """Return the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), with 20 k + 1 unknowns.
 
     ::
@@ -254,7 +252,7 @@ def relax(Q: Array, tolerance: float = TOLERANCE) -> Moments:
     settings.verbose = False
     settings.max_threads = 1
     settings.iterative_refinement_enable = False  # half of the time, for digits that are refined later
-    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = tolerance
+    settings.tol_gap_abs = settings.tol_gap_rel = settings.tol_feas = TOLERANCE
     P = scipy.sparse.csc_matrix((len(q), len(q)))
     solution = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
     M = np.zeros((n, n))
@@ -305,15 +303,12 @@ def smallest(L: Array) -> Smallest:
     """
     Q = L.T @ L
     moments = relax(Q)
-    if moments.rank_ratio > SPREAD:  # several rotations, or one of which the form is large where others hardly differ
-        moments = relax(Q, FINE)
     lifts = [moments.matrix[:, 0]]  # the mean of the rotations that the moments stand for
     if moments.rank_ratio > SPREAD:  # and some that are drawn from them
         eigenvalues, vectors = np.linalg.eigh(moments.matrix)
         normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
-        drawn = normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T
-        lifts += [np.copysign(1.0, v[0]) * v for v in (*vectors.T[::-1][:4], *drawn)]
-    rounded = [_refined(L, proper(lift[1:].reshape(-1, 3, 3))) for lift in lifts]
+        lifts += [*(normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T)]
+    rounded = [_refined(L, proper(np.copysign(1.0, lift[0]) * lift[1:].reshape(-1, 3, 3))) for lift in lifts]
     best = min(rounded, key=lambda R: _value(L, R))
     value = _value(L, best)
     x = lifted(best)
