@@ -22,7 +22,7 @@ from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, Reweigh
 from rpim_opt.problem.noise import Equations, Repeatability, Stack, equation_numbers
 from rpim_opt.problem.row_functions import (
     Functions,
-    RowFunctions,
+    Kept,
     Structure,
     loads_in,
     loads_of,
@@ -30,6 +30,7 @@ from rpim_opt.problem.row_functions import (
     needed,
     require_loads,
     require_same_torques,
+    row_functions,
 )
 from rpim_opt.robot.chain import NEAR_PARALLEL, ORIGIN, carried_by
 from rpim_opt.robot.kinematics import call_rows
@@ -55,7 +56,7 @@ class RobotModel(Tabled):
     keeps_rows: ClassVar[bool] = True  # whether `linearize` returns the equations themselves, and not their QR factor
     robots: Robot | Mapping[str, Robot]
     parameters: Parameters
-    frozen_functions: RowFunctions | None = field(default=None, repr=False, kw_only=True)
+    frozen_functions: Kept | None = field(default=None, repr=False, kw_only=True)
     repeatability: Repeatability | None = field(default=None, kw_only=True)
 
     def sample(self) -> CalibrationProblem:
@@ -147,7 +148,7 @@ class RobotModel(Tabled):
         """
         if self.frozen_functions is not None:
             return self
-        copy = replace(self, frozen_functions=RowFunctions())
+        copy = replace(self, frozen_functions={})
         for block in copy.sample().data.blocks:
             copy.sample().functions(block)
         return copy
@@ -310,7 +311,8 @@ class CalibrationProblem(RobotModel):
                 robot.joint_types, names, p.identified.tobytes(), absent.tobytes(), block.markers, block.fixture, loads,
                 tuple(robot.model.terms), len(self.arms) > 1, self._sessions[block.robot],
             )  # fmt: skip
-        return (self.frozen_functions or RowFunctions())(self._structures[block], block.measurement)
+        kept = {} if self.frozen_functions is None else self.frozen_functions
+        return row_functions(self._structures[block], block.measurement, kept)
 
     @cached_property
     def _sessions(self) -> dict[str, tuple[str, ...]]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import lru_cache
-from types import MappingProxyType
 from typing import NamedTuple
 
 import casadi as ca
@@ -54,25 +53,19 @@ class Structure(NamedTuple):
     sessions: tuple[str, ...] = ()
 
 
-class RowFunctions:
-    """Functions of rows: of ready measurements built once, of a user's by its first return value.
+Kept = dict[tuple[Structure, Measurement], str]
+"""A user's functions as their first return value was, as texts: in another process the function may be another one."""
 
-    A calibration works with one from its first iteration to its last. It is sent to other processes with its
-    expressions as text (``serialized``): there a user's function may be another one.
-    """
 
-    def __init__(self, serialized: Mapping[tuple[Structure, Measurement], str] = MappingProxyType({})) -> None:
-        self.serialized = dict(serialized)
-
-    def __call__(self, structure: Structure, measurement: Measurement) -> Functions:
-        """Return the functions as they were when they were first asked for."""
-        if measurement in _READY and all(term.ready for term in structure.terms):  # they depend on nothing else
-            return _ready(structure, measurement)
-        with SYMBOLS:
-            if (structure, measurement) not in self.serialized:
-                inputs, outputs = _expressions(structure, measurement)
-                self.serialized[structure, measurement] = ca.Function("row", inputs, outputs).serialize()
-            return _built(self.serialized[structure, measurement])
+def row_functions(structure: Structure, measurement: Measurement, kept: Kept) -> Functions:
+    """Return the functions of a row: of ready measurements built once, of a user's as they are, or will be, kept."""
+    if measurement in _READY and all(term.ready for term in structure.terms):  # they depend on nothing else
+        return _ready(structure, measurement)
+    with SYMBOLS:
+        if (structure, measurement) not in kept:
+            inputs, outputs = _expressions(structure, measurement)
+            kept[structure, measurement] = ca.Function("row", inputs, outputs).serialize()
+        return _built(kept[structure, measurement])
 
 
 @lru_cache(maxsize=MANY)
