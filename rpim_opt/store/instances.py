@@ -51,8 +51,9 @@ class Instance(Tabled):
     ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None where hyperparameters
     are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result says of
     the data, with the validation data; ``published`` are mean errors [mm] that the source prints for the same table, by
-    role (identification, validation) and method; ``held_out`` is whether the validation data were drawn from the same
-    table: once they have validated, all rows are used.
+    role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
+    tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,
+    all rows are used.
     """
 
     problem: CalibrationProblem
@@ -63,6 +64,7 @@ class Instance(Tabled):
     noise: str = "robot"
     record: Record = field(default_factory=Record)
     published: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+    reference: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     held_out: bool = False
 
     @property
@@ -162,6 +164,7 @@ def load(
         noise=table.repeatability if isinstance(table.repeatability, str) else "declared",
         record=record,
         published={role: table.published.get(names[0], {}) for role, names in files.items() if names},
+        reference={key: (value, spread) for key, (value, spread) in table.reference.items()},
         held_out=table.held_out,
     )
 
