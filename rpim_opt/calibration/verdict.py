@@ -530,13 +530,12 @@ def _explanations(result: Outcome, problem: CalibrationProblem, ordered: Calibra
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(diagnosis.rows_without_values(problem.data, problem.arms))
     better = better_reading(ordered)
-    read = list(diagnosis.part_way(ordered)) if better is None else [better.sentence]
+    # beside single rows, which may be the ones where something changed
+    read = first(diagnosis.part_way(ordered), diagnosis.moved_far(problem)) if better is None else [better.sentence]
     causes = [*_single_rows(result, ordered), *read]
     if causes:
         return causes
-    causes = first(
-        diagnosis.moved_far(problem), diagnosis.mixed_reflectors(problem), _shown_without_outliers(result, ordered)
-    )
+    causes = first(diagnosis.mixed_reflectors(problem), _shown_without_outliers(result, ordered))
     error = rms(problem.errors(result.x)[kept_rows(result)])
     causes = first(causes, diagnosis.rounded(problem, error))
     unrelated = diagnosis.unrelated_rows(problem, error)

@@ -190,6 +190,21 @@ def test_rows_of_another_reflector_are_named() -> None:
     assert not inspect(problem).warnings
 
 
+def test_reflectors_that_were_swapped_from_a_row_on_are_named_beside_single_rows() -> None:
+    problem = ro.load("markers").problem
+    data = problem.data
+    y = np.empty((len(data), 3))
+    marker = np.empty(len(data), dtype=object)
+    for block in data.blocks:
+        y[block.row] = block.y
+        marker[block.row] = block.markers[0]
+    marker[:40] = [{"A": "B", "B": "A"}.get(name, name) for name in marker[:40]]
+    swapped = ro.Dataset.of(data.q, y, data.blocks[0].covariance[:1], marker=marker, label=data.label)
+    wrong = problem.on(replace(swapped, configuration=data.configuration))
+    for texts in (inspect(wrong).warnings, ro.calibrate(wrong).verdict.reasons):
+        assert any("the points fit another reflector" in text for text in texts), texts
+
+
 def test_the_change_point_is_where_the_instrument_moved() -> None:
     for robot in ROBOTS:
         (text,) = [text for text in likely(robot, "tracker moved by 1 mm")[0] if "from row" in text]

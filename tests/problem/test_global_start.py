@@ -218,3 +218,17 @@ def test_a_left_handed_frame_with_a_reversed_joint_is_named_beside_the_descripti
     both = ro.calibrate(problem.on(replace(problem.data, blocks=(replace(block, q=q, y=y),))))
     assert not both.verdict.delivered
     assert "left-handed measured frame with joint 5 reversed" in str(both.verdict)
+
+
+@pytest.mark.parametrize("name", ["a3", "d4"])
+def test_a_length_of_the_wrong_sign_is_no_matter_of_the_joints_alone(name: str) -> None:
+    """Half a turn of joints explains it as well: then the robot file is to be checked, too."""
+    problem = ro.load("position").problem
+    joint, column = int(name[1:]) - 1, ["alpha", "a", "theta", "d", "beta"].index(name[0])
+    mdh, nominal = problem.robot.mdh.copy(), problem.parameters.nominal.copy()
+    mdh[joint, column] *= -1
+    nominal[problem.parameters.names.index(name)] *= -1
+    parameters = replace(problem.parameters, nominal=nominal)
+    result = ro.calibrate(ro.CalibrationProblem(replace(problem.robot, mdh=mdh), parameters, problem.data))
+    assert result.caution.endswith("of the wrong sign in the robot file looks like zeros of 180 deg: check them first.")
+    assert not ro.calibrate(problem).caution

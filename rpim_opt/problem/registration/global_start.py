@@ -107,11 +107,17 @@ class JointMapping:
         if self.same:
             far = ", or ".join(f"{three_digits(1e3 * each.moved)} mm" for each in (self, *self.same))
             equally = f" (these explain the data equally well, with a reflector {far} from its stated place)"
-        return (
+        text = (
             f"Table and robot file count joint values differently: {self.explanations}{equally}. The result holds for "
             f"joint values as the table counts them. Check the pendant: if the controller counts so, {WRITE}; if it "
             "counts as the robot file does, correct the table's columns and calibrate again before using this robot."
         )
+        half_turns = np.isclose(np.abs(self.zero), np.pi) & (np.array(self.joint_types) == "revolute")
+        if half_turns.any():
+            text += (
+                " A length (a, d) of the wrong sign in the robot file looks like zeros of 180 deg: check them first."
+            )
+        return text
 
     @property
     def sentence(self) -> str:
