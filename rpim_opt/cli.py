@@ -23,7 +23,7 @@ from typer.core import TyperGroup
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
-from rpim_opt.basics.files import inside, refused, sha256_of
+from rpim_opt.basics.files import inside, sha256_of
 from rpim_opt.basics.text import listed, progress_bar, table
 from rpim_opt.report import console
 
@@ -168,17 +168,19 @@ class Answer(NamedTuple):
     document: dict[str, Any]
     code: int = 0
     written: Sequence[Path] | None = None
-    left_out: Sequence[str] | None = None
-    notes: Sequence[str] = ()
+    read: Any = None
 
     def show(self, as_json: bool) -> None:
         """Print the text, or the document as JSON."""
-        lines = [*filter(None, [str(self.text)]), *self.notes]
-        if self.left_out:
-            lines.append(f"Ignored columns: {', '.join(self.left_out)}.")
-        lines += [f"Written: {file}" for file in self.written or ()]
-        more = {"left_out": self.left_out, "tables": self.notes or None, "written": self.written}
-        document = {**self.document, **{key: value for key, value in more.items() if value is not None}}
+        lines, document = [*filter(None, [str(self.text)])], dict(self.document)
+        if self.read is not None:
+            lines += self.read.notes
+            lines += [f"Ignored columns: {', '.join(self.read.left_out)}."] * bool(self.read.left_out)
+            document["left_out"] = self.read.left_out
+            document |= {"tables": self.read.notes} if self.read.notes else {}
+        if self.written is not None:
+            lines += [f"Written: {file}" for file in self.written]
+            document["written"] = self.written
         console.show(document if as_json else "\n".join(lines))
 
 
@@ -265,7 +267,7 @@ def new(
     as_json: bool = False,
 ) -> Answer:
     """Make a problem folder from a table and a robot, with comments on all keys and reasons for all guesses."""
-    with console.progress(), refused(folder):
+    with console.progress():
         made = ro.store.new_problem(
             folder, robot, data, measurement=measurement, options=tables.options, validation=validation,
             hold_out=hold_out, seed=seed, urdf_base=urdf_base, urdf_tip=urdf_tip, chain=chain, target=target, dh=dh,
@@ -368,19 +370,17 @@ def report(
     """
     with _loaded(result) as (loaded, say):
         _require_data(register, data)
-        new, notes = {}, ()
+        new, read = {}, None
         if data:
             read = ro.use.read_measurements(loaded, data, measurement, tables.options)
             names = ", ".join(f"{file.name} (SHA-256 {sha256_of(file)[:12]})" for file in data)
             new = {names: ro.use.validate(loaded, read.data, register)}
-            notes = read.notes
         say("writing the report")
         if out is None:
             folder = result if result.is_dir() else result.parent
             out = inside(folder, "report.html", "the file", folder)
-        with refused(out):
-            ro.report.write_report(loaded, out, new=new)
-    return Answer("", {}, written=[out], notes=notes)
+        ro.report.write_report(loaded, out, new=new)
+    return Answer("", {}, written=[out], read=read)
 
 
 @command
@@ -410,7 +410,7 @@ def validate(
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
     failed = within is False or validation.mistake or validation.worse
     written = console.written_to(out, validation.csv())
-    return Answer("\n".join([str(validation), *text]), document, int(bool(failed)), written, read.left_out, read.notes)
+    return Answer("\n".join([str(validation), *text]), document, int(bool(failed)), written, read)
 
 
 @command
@@ -429,13 +429,12 @@ def accept(
     """
     with _loaded(result) as (loaded, say):
         _require_data(register, data)
-        left_out, notes, measured = (), (), None
-        if data:
-            read = ro.use.read_measurements(loaded, data, measurement, tables.options, register)
-            left_out, notes, measured = read.left_out, read.notes, read.data
+        options = loaded, data, measurement, tables.options, register
+        read = ro.use.read_measurements(*options) if data else None
         say("searching for the maximum uncertainty")
-        acceptance = ro.calibration.accept(loaded, console.required(limit, box, loaded.record.requirement), measured)
-    return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], left_out=left_out, notes=notes)
+        requirement = console.required(limit, box, loaded.record.requirement)
+        acceptance = ro.calibration.accept(loaded, requirement, read and read.data)
+    return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], read=read)
 
 
 @command
@@ -486,7 +485,7 @@ def update(
         updated = recalibration.result
         updated = replace(updated, record=replace(updated.record, files={file.name: sha256_of(file) for file in data}))
     failed = not (recalibration.explained and updated.verdict.delivered)
-    return Answer(recalibration, recalibration.content(), int(failed), _saved(updated, out), read.left_out, read.notes)
+    return Answer(recalibration, recalibration.content(), int(failed), _saved(updated, out), read)
 
 
 @command
@@ -506,10 +505,9 @@ def monitor(
         read = ro.use.read_measurements(loaded, checks, measurement, tables.options, register)
         monitoring = ro.use.monitor(loaded, read.data, read.when, read.clock[1] if read.clock else ())
         if out is not None:
-            with refused(out):
-                ro.report.write_checks(monitoring, out, loaded.record.title)
+            ro.report.write_checks(monitoring, out, loaded.record.title)
     written = [] if out is None else [out]
-    return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read.left_out, read.notes)
+    return Answer(monitoring, monitoring.content(), int(monitoring.drifts), written, read)
 
 
 @command
@@ -579,8 +577,8 @@ def compensate(
             payload=read.payload if mass is None else mass, payload_centre=centre, despite_verdict=despite_verdict,
             limit=None if limit is None else 1e-3 * limit,
         )  # fmt: skip
-    more = {"code": int(bool(compensation.missed)), "left_out": understood.left_out, "notes": understood.notes}
-    return _with_table(compensation, compensation.csv(), out, compensation.content(), **more)
+    code = int(bool(compensation.missed))
+    return _with_table(compensation, compensation.csv(), out, compensation.content(), code=code, read=understood)
 
 
 @command
@@ -592,9 +590,7 @@ def simulate(
     """Simulate the tables of a problem, and write its true parameters."""
     from rpim_opt.store.simulation import write_simulation
 
-    with refused(out or problem):
-        written = write_simulation(problem, seed, out)
-    return Answer("", {}, written=written)
+    return Answer("", {}, written=write_simulation(problem, seed, out))
 
 
 @command
@@ -759,8 +755,7 @@ def _saved(result: "ro.calibration.Calibration", out: Path | None) -> list[Path]
     if out is None:
         return []
     file = inside(out, "result.json", "the file", out)
-    with refused(file):
-        ro.store.save_result(result, file)
+    ro.store.save_result(result, file)
     return [file]
 
 

@@ -115,7 +115,7 @@ def _solvers(count: int) -> dict[str, Any]:
 
 def _arm(bounds: bool) -> CalibrationProblem:
     """Return the problem that the peers get."""
-    problem = ro.study.simulated_arm(0, 52, load_study(find_study("peers")).NOISE, 0.0, 0.0).problem
+    problem = ro.study.simulated_arm(0, 52, load_study(find_study("peers")).NOISE).problem
     if not bounds:
         return problem
     tolerances = {"length_mm": 0.4, "angle_mrad": 1.0, "tool_mm": 0.5, "base_mm": 0.5, "base_mrad": 1.0}

@@ -24,6 +24,8 @@ import tempfile
 import venv
 import warnings
 from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,8 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import RpimError
 from rpim_opt.basics.files import write_files, write_json, write_text
 from rpim_opt.basics.text import markdown
+from rpim_opt.robot.extensions import gravity_torques
+from rpim_opt.robot.mdh import Gravity, Robot
 from rpim_opt.study import Metric, Report
 
 QUESTION = "Is rpim_opt more accurate than pybotics, robotkinecal, figaroh and SciPy on the same measurements?"
@@ -245,6 +249,26 @@ def by_method(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     return found
 
 
+def bent(size: float, seed: int, robot: Robot, q: Array) -> Array:
+    """Return joint values (N, dof) [rad] at those of the encoders, which no geometry holds, of up to a size [rad].
+
+    Joints sag under the weight of all that they carry, and their encoders are off by a third of the size times the
+    cosine of their angle. Links weigh what they please: each as much as the one behind it or more.
+    """
+    rng = np.random.default_rng([seed, 5])
+    masses = np.asarray(np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1], dtype=float).tolist()
+    phase = rng.uniform(0, 2 * np.pi, robot.dof)
+    compliance = rng.uniform(0.3, 1.0, robot.dof)
+    alpha, a, _, d, _ = robot.mdh.T
+    halves = np.column_stack([a, -d * np.sin(alpha), d * np.cos(alpha)]) / 2  # of the way to the next joint
+    centres = [(x, y, z) for x, y, z in halves[1:].tolist()] + [(0.0, 0.0, 0.0)]
+    heavy = replace(robot, gravity=Gravity(masses=tuple(masses), centres=tuple(centres)))
+    largest = np.abs(gravity_torques(heavy, rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
+    sag = compliance * gravity_torques(heavy, q) / np.maximum(largest, 1e-9 * largest.max())
+    off = size * (sag + np.cos(q @ robot.joint_map.T + phase) / 3)
+    return np.asarray(q + off @ np.linalg.inv(robot.joint_map).T)
+
+
 def write_problem(folder: Path, situation: str, seed: int) -> Array:
     """Write one problem as every tool reads it, and return where the arm is at other configurations (200, 3) [mm].
 
@@ -252,7 +276,7 @@ def write_problem(folder: Path, situation: str, seed: int) -> Array:
     """
     count, more = SITUATIONS[situation]
     offset = np.radians((seed // 3) % 2)
-    arm = ro.study.simulated_arm(seed, count, NOISE, offset, more.get("physics", 0.0))
+    arm = ro.study.simulated_arm(seed, count, NOISE, offset, partial(bent, more.get("physics", 0.0), seed))
     problem = arm.problem
     turned = problem.robot.joint_map.T
     points = problem.data.blocks[0].y.copy()

@@ -16,7 +16,7 @@ from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-from rpim_opt.basics.exceptions import InputError, RpimError, choices
+from rpim_opt.basics.exceptions import InputError, choices
 
 LARGEST_TEXT = 2**24
 """Bytes that a description may have: a hundred times what the largest public ones need."""
@@ -130,14 +130,13 @@ def sha256_of(path: Path) -> str:
 
 
 @contextmanager
-def refused(path: object) -> Iterator[None]:
-    """Turn errors of the operating system during writing of ``path`` into an InputError."""
+def writing(*paths: Path) -> Iterator[None]:
+    """Let errors of the operating system name the files that could not be written, in the place of temporary ones."""
     try:
         yield
-    except BrokenPipeError:  # of what is printed meanwhile, not of the file
-        raise
     except OSError as error:
-        raise RpimError(f"{path}: cannot be written: {error}.") from None
+        text = f"cannot be written: {error.strerror or error}"
+        raise OSError(error.errno, text, ", ".join(map(str, paths))) from None
 
 
 def write_text(path: Path, text: str) -> None:
@@ -152,7 +151,7 @@ def write_files(contents: Mapping[Path, bytes]) -> None:
     or pipe gets the bytes as they are.
     """
     streams = [path for path in contents if path.exists() and not (path.is_file() or path.is_dir())]
-    with undoing() as folders, ExitStack() as stack, undoing() as renames:
+    with writing(*contents), undoing() as folders, ExitStack() as stack, undoing() as renames:
         made: dict[Path, Path] = {}
         for path in contents:
             if path in streams:

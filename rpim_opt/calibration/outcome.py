@@ -441,11 +441,8 @@ class Outcome:
     def covariance(self) -> Array:
         """Covariance of the deviations (n, n) [SI]: C = sigma^2 S (A'A + weight I)^-1 S + D D'.
 
-        The first term is the Bayesian covariance with the prior that the penalty stands for; D D' is the uncertainty
-        of estimated hyperparameters (`Learned.drift`), zero with a weight of your own. `Uncertainty` takes both apart;
-        `monte_carlo` is to be compared with ``spread.noise``. The formula holds for a squared loss, or for the rows
-        that a robust loss keeps, and a squared penalty, conditional on the active constraints. Variances that neither
-        data nor penalty decide are infinite.
+        `Uncertainty` says what is in it and what it holds for; D D' is zero with a weight of your own. It is
+        conditional on active constraints; variances that neither data nor penalty decide are infinite.
         """
         return self.spread.covariance
 

@@ -6,7 +6,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from rpim_opt.basics.exceptions import pick
 from rpim_opt.basics.tables import frame_of
 from rpim_opt.basics.text import html_table
 from rpim_opt.calibration import words
@@ -83,19 +82,15 @@ class Calibration(Outcome):
         """Return a sentence on the weight and its origin."""
         return " ".join(words.weight_lines(self))
 
-    def to_frame(self, what: str = "parameters") -> Any:
-        """Return one of the result's tables as a data frame (pandas, or polars if pandas is not installed).
-
-        ``what`` is ``"parameters"``, ``"errors"`` (of every row, before and after), ``"history"`` (iterations),
-        ``"flags"`` (outlying rows), ``"bounds"`` (active ones) or ``"shadow_prices"`` (of statements of a drawing).
-        InputError for another name, or where no data frames are installed.
+    def to_frame(self) -> Any:
+        """Return the parameters as a data frame (pandas, or polars if pandas is not installed).
 
         >>> import rpim_opt as ro
         >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=1.0)
         >>> list(result.to_frame().columns)
         ['parameter', 'unit', 'nominal', 'identified', 'deviation', 'std']
         """
-        return frame_of(pick(words.FRAMES, what, "to_frame")(self))
+        return frame_of(self.parameter_rows())
 
     def __str__(self) -> str:
         return "\n".join([words.parameter_table(self), "", *words.sentences(self, self.verdict)])

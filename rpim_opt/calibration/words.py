@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -268,22 +268,6 @@ def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
     if size.spread <= VAGUE:
         return _figure(size, factor, unit)
     return f"at most {factor * size.value * np.exp(ONE_SIDED * size.spread):.2g} {unit} (95 % confidence)"
-
-
-FRAMES: dict[str, Callable[[Outcome], list[dict[str, Any]]]] = {
-    "parameters": Outcome.parameter_rows,
-    "errors": lambda result: [
-        {"label": label, "nominal_mm": float(before), "identified_mm": float(after)}
-        for label, before, after in zip(
-            result.problem.labels, 1e3 * result.nominal_errors(), 1e3 * result.errors(), strict=True
-        )
-    ],
-    "history": lambda result: [dict(vars(each)) for each in result.history],
-    "flags": lambda result: [flag._asdict() for flag in result.flagged],
-    "bounds": lambda result: [held._asdict() for held in result.active_bounds],
-    "shadow_prices": lambda result: [price._asdict() for price in result.shadow_prices],
-}
-"""Tables of a result by name."""
 
 
 def camera_remarks(result: Outcome) -> list[str]:

@@ -13,7 +13,7 @@ from threading import Timer
 from typing import TYPE_CHECKING, Any, TextIO
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.files import json_text, refused, write_text
+from rpim_opt.basics.files import json_text, write_text
 from rpim_opt.basics.text import visible
 from rpim_opt.basics.units import LARGEST
 
@@ -87,8 +87,7 @@ def written_to(path: Path | None, text: str) -> list[Path]:
     """Write a text if a path is given, and return the paths written."""
     if path is None:
         return []
-    with refused(path):
-        write_text(path, text)
+    write_text(path, text)
     return [path]
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -12,9 +11,8 @@ import scipy
 from rpim_opt.basics.arrays import Array
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.robot.extensions import gravity_torques
 from rpim_opt.robot.formats.tables import read_robot
-from rpim_opt.robot.mdh import Gravity, Robot
+from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import model_parameters
 
 KINDS = {"ur10e": ["beta[23]"], "irb120": ["beta2"], "iiwa7": []}
@@ -40,7 +38,11 @@ class SimulatedArm(NamedTuple):
 
 
 def simulated_arm(
-    seed: int, count: int, noise: float = 3e-5, offset: float = 0.0, effects: float = 0.0
+    seed: int,
+    count: int,
+    noise: float = 3e-5,
+    offset: float = 0.0,
+    joints: Callable[[Robot, Array], Array] = lambda _, q: q,
 ) -> SimulatedArm:
     """Return a simulated arm; successive seeds cycle through three robots.
 
@@ -50,10 +52,8 @@ def simulated_arm(
 
     The ``seed`` is that of the arm; ``count``, the number of configurations to identify from, changes neither its truth
     nor those it shares with a smaller one. ``noise`` is the standard deviation of a coordinate [m], declared as it is,
-    ``offset`` the angle [rad] by which one joint, neither the first nor the last, is off besides. ``effects`` is the
-    angle [rad] of what no geometry holds: joints sag by up to so much under the weight of all that they carry, and
-    their encoders are off by a third of it times the cosine of their angle. Links weigh what they please: each as much
-    as the one behind it or more, by an unknown factor.
+    ``offset`` the angle [rad] by which one joint, neither the first nor the last, is off besides. ``joints`` are the
+    robot's joint values at those of the encoders (N, dof) [rad]: what no geometry holds.
 
     >>> import rpim_opt as ro
     >>> arm = ro.study.simulated_arm(seed=1, count=25, offset=0.017)
@@ -77,13 +77,11 @@ def simulated_arm(
     there = np.random.default_rng([seed, 3]).uniform(limits[:, 0], limits[:, 1], (VALIDATION_COUNT, robot.dof))
     q = np.random.default_rng([seed, 1]).uniform(limits[:, 0], limits[:, 1], (count, robot.dof))
 
-    moved = _moved(robot, effects, np.random.default_rng([seed, 5]))
-
-    def measured(joints: Array, level: float, stream: int) -> Dataset:
-        T = base @ flange(robot, moved(joints), errors)
+    def measured(encoders: Array, level: float, stream: int) -> Dataset:
+        T = base @ flange(robot, joints(robot, encoders), errors)
         points = T[:, :3, :3] @ tool + T[:, :3, 3]
         draws = np.random.default_rng([seed, stream]).standard_normal(points.shape)
-        return Dataset.of(joints, points + level * draws, noise)
+        return Dataset.of(encoders, points + level * draws, noise)
 
     parameters = model_parameters(robot, base=list(BASE), tools={"": list(TOOL)}).scaled(SCALES)
     identified = ["alpha?", "a?", "d?", "theta?", *KINDS[name], "base_*", "tool_[xyz]"]
@@ -100,27 +98,6 @@ def flange(robot: Robot, q: Array, errors: Array) -> Array:
         behind = _small(np.array([0, 0, d, 0, beta, 0]))
         T = T @ _small(np.array([a, 0, 0, alpha, 0, 0])) @ turn @ behind @ _small(error)
     return T
-
-
-def _moved(robot: Robot, size: float, rng: np.random.Generator) -> Callable[[Array], Array]:
-    """Return the function from encoder to joint values (N, dof) [rad]: sag under gravity, and eccentric encoders."""
-    masses = np.asarray(np.cumprod(rng.uniform(1.0, 2.0, robot.dof))[::-1], dtype=float).tolist()
-    phase = rng.uniform(0, 2 * np.pi, robot.dof)
-    compliance = rng.uniform(0.3, 1.0, robot.dof)
-    alpha, a, _, d, _ = robot.mdh.T
-    halves = np.column_stack([a, -d * np.sin(alpha), d * np.cos(alpha)]) / 2  # of the way to the next joint
-    centres = [(x, y, z) for x, y, z in halves[1:].tolist()] + [(0.0, 0.0, 0.0)]
-    heavy = replace(robot, gravity=Gravity(masses=tuple(masses), centres=tuple(centres)))
-    largest = np.abs(gravity_torques(heavy, rng.uniform(-np.pi, np.pi, (200, robot.dof)))).max(axis=0)
-
-    def joints(q: Array) -> Array:
-        if not size:
-            return q
-        sag = compliance * gravity_torques(heavy, q) / np.maximum(largest, 1e-9 * largest.max())
-        off = size * (sag + np.cos(q @ robot.joint_map.T + phase) / 3)
-        return q + off @ np.linalg.inv(robot.joint_map).T
-
-    return joints
 
 
 def _small(numbers: Array) -> Array:

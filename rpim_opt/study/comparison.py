@@ -16,7 +16,6 @@ import numpy as np
 from scipy.special import ndtr, stdtrit
 
 from rpim_opt.basics.exceptions import InputError, choices, pick
-from rpim_opt.basics.files import refused
 from rpim_opt.basics.tables import csv_text, frame_of
 from rpim_opt.basics.text import counted, html_table, listed, markdown, progress_bar, table, three_digits
 from rpim_opt.report.plot import logarithmic
@@ -138,8 +137,7 @@ def compare(
         inputs = {"problems given": asked, "methods": compared, "metrics": (tuple(figured), own)}
         hashes = {f"set of {name}": studies.content_hash(value, "journal") for name, value in inputs.items()}
         code = studies.package_code() | studies.script_code() | hashes
-        with refused(path):
-            path.parent.mkdir(parents=True, exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
     with progress_bar("comparing", progress) as say:
         rows = studies.run_cases(cases, work, workers, say, path, code, resume)
     axes = {

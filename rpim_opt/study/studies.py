@@ -26,7 +26,7 @@ from types import ModuleType
 from typing import Any
 
 from rpim_opt.basics.exceptions import InputError, RpimError, choices
-from rpim_opt.basics.files import LARGEST_DATA, json_text, read_bytes, read_json, refused, require_file, write_files
+from rpim_opt.basics.files import LARGEST_DATA, json_text, read_bytes, read_json, require_file, write_files, writing
 from rpim_opt.basics.tables import library
 from rpim_opt.basics.text import Progress, version_of
 from rpim_opt.data.record import PACKAGES
@@ -190,8 +190,7 @@ def run_study(
     parquet = library("pyarrow.parquet", "the study", "studies")
     study = load_study(path)
     folder = out or path.parent / "results" / _label(path, quick)
-    with refused(folder):
-        folder.mkdir(parents=True, exist_ok=True)
+    folder.mkdir(parents=True, exist_ok=True)
     if redraw:
         path = folder / f"{REPLICATES}.parquet"
         if not path.exists():
@@ -220,8 +219,7 @@ def run_study(
     stream = io.BytesIO()
     parquet.write_table(table.replace_schema_metadata({"made": made}), stream)
     write(folder, study.QUESTION, report, made, {f"{REPLICATES}.parquet": stream.getvalue()})
-    with refused(journal):
-        journal.unlink()
+    journal.unlink()
     return report, folder
 
 
@@ -245,8 +243,7 @@ def write(folder: Path, question: str, report: Report, made: str, replicates: Ma
         with rc_context({"svg.hashsalt": title}):  # the same file for the same figure
             figure.savefig(stream, format=kind, metadata={"Date": None} if kind == "svg" else None)
         files[f"{title}.{kind}"] = stream.getvalue()
-    with refused(folder):
-        write_files({folder / name: content for name, content in files.items()})
+    write_files({folder / name: content for name, content in files.items()})
 
 
 def regressions(name: str | Path, quick: bool, metrics: Mapping[str, float]) -> list[str]:
@@ -291,13 +288,12 @@ def run_cases(
     done = {key: stored[key] for key, _ in keyed if key in stored}
     if journal is not None:  # anew: without a line that was not finished
         lines = "".join(f"{json.dumps(line)}\n" for line in {"code": code, **stored}.items())
-        with refused(journal):
-            write_files({journal: lines.encode()})
+        write_files({journal: lines.encode()})
     with Path(journal or os.devnull).open("ab", buffering=0) as stream:
         progress(len(done), len(cases))
         tasks = [(key, work(case)) for key, case in keyed if key not in done]
         for key, row in compute(tasks, workers):
-            with refused(journal):
+            with writing(Path(stream.name)):
                 stream.write(f"{json.dumps([key, row])}\n".encode())
             done[key] = row
             progress(len(done), len(cases))

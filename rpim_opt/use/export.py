@@ -16,7 +16,7 @@ import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
-from rpim_opt.basics.files import json_text, read_bytes, refused, write_files, write_text
+from rpim_opt.basics.files import json_text, read_bytes, write_files, write_text
 from rpim_opt.basics.tables import csv_text
 from rpim_opt.basics.text import counted, joined, listed, percent
 from rpim_opt.basics.units import numeral
@@ -524,6 +524,5 @@ def write_all(writers: Sequence[Writer], notes: Sequence[str] = ()) -> list[str]
                 raise InputError(error.where, error.found, error.accepted, file) from None
             messages += own
             contents[target] = noted(read_bytes(path), path.suffix.lower(), [*notes, *own])
-    with refused(", ".join(str(target) for target in contents)):
-        write_files(contents)
+    write_files(contents)
     return messages

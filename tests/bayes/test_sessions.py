@@ -31,9 +31,9 @@ def turned(points: Array, shift: Array, turn: Array) -> Array:
     return (points - base) @ Rotation.from_rotvec(turn).as_matrix().T + base + shift
 
 
-def in_sessions(seed: int, names: list[str], size: float = 1.0, physics: float = 0.0) -> ro.CalibrationProblem:
+def in_sessions(seed: int, names: list[str], size: float = 1.0) -> ro.CalibrationProblem:
     """Return a simulated arm whose rows were measured in the sessions of these names, one a row."""
-    problem = ro.study.simulated_arm(seed, len(names), effects=physics).problem
+    problem = ro.study.simulated_arm(seed, len(names)).problem
     rng = np.random.default_rng([seed, 99])
     y = problem.data.blocks[0].y.copy()
     for name in dict.fromkeys(names):

@@ -83,14 +83,9 @@ def test_frames_hold_what_the_tables_say() -> None:
     frame = RESULT.to_frame()
     assert list(frame["parameter"]) == list(INSTANCE.problem.parameters.free.names)
     assert np.allclose(frame["identified"] - frame["nominal"], frame["deviation"]) is False  # angles of frames compose
-    assert np.allclose(RESULT.to_frame("errors")["identified_mm"], 1e3 * RESULT.errors())
-    assert len(RESULT.to_frame("history")) == len(RESULT.history)
-    assert len(RESULT.to_frame("flags")) == len(RESULT.flagged)
     budget = ro.calibration.Uncertainty(RESULT).to_frame()
     assert np.allclose(budget["u"] ** 2, budget["u_noise"] ** 2 + budget["u_prior"] ** 2)
     assert np.allclose(INSTANCE.problem.data.to_frame()["x_mm"], 1e3 * INSTANCE.problem.data.blocks[0].y[:, 0])
-    with pytest.raises(InputError, match="history"):
-        RESULT.to_frame("histroy")
 
 
 @pytest.mark.parametrize(
