@@ -90,6 +90,8 @@ class Spread:
         if no parameter alone is known.
         """
         covariance = J @ (self.noise + self.prior) @ J.transpose(0, 2, 1)
+        variances = np.einsum("nkk->nk", covariance)
+        np.maximum(variances, 0.0, out=variances)  # along what a constraint fixes rounding is left
         slopes = J * self.linear.parameters.scale
         moved = np.linalg.norm(slopes @ self.form.undecided(self.weight), axis=2)
         size = np.linalg.norm(slopes, axis=(1, 2))

@@ -402,10 +402,9 @@ class Program(Brief):
         """Return an orthonormal basis (n, k) of the active constraints' null space at z.
 
         Equations, and inequalities and cones with a multiplier, linearized at z; own variables move along. None where
-        no constraint is active, and where it is not known: of constraints on positions, and with own variables that
-        the loss shares.
+        no constraint is active, and with own variables that the loss shares, where it is not known.
         """
-        if not self.formulation.constraints or self.structure.predicts or self.structure.joint:
+        if not self.formulation.constraints or self.structure.joint:
             return None
         try:
             optimum = minimum(self._rows, WarmStart(self.structure).begin(z), weight)

@@ -234,6 +234,19 @@ def test_a_bound_on_positions_holds_of_the_identified_robot(lower: float) -> Non
     assert result.forward(q)[:, 2, 3].max() == pytest.approx(highest, abs=1e-8)
 
 
+def test_a_position_that_a_constraint_fixes_has_no_interval() -> None:
+    problem, home = ro.load("position").problem, np.zeros((1, 6))
+    free = ro.calibrate(problem, ro.tikhonov, 1.0)
+    height = free.forward(home)[0, 2, 3] + 2e-5
+    fixed = ro.calibrate(
+        problem, replace(ro.tikhonov, constraints=(lambda _, p: p.positions(home)[0, 2] == height,)), 1.0
+    )
+    before, after = (result.predict(home, of="mean").standard[0] for result in (free, fixed))
+    assert before[2] > 1e-5
+    assert after[2] == pytest.approx(0, abs=1e-9)  # the constraint is linearized to 1e-4 of its own size
+    assert (after[:2] > 0.9 * before[:2]).all()  # a height tells nothing about x and y
+
+
 def moving(text: str, places: dict[str, object]) -> Calibration:
     demand = ro.constraints.parse(text, places)
     return ro.calibrate(ro.load("position").problem, replace(ro.tikhonov, constraints=(demand,)), weight=1.0)
