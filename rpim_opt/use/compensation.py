@@ -41,7 +41,8 @@ EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared w
 LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is said
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
-POSITION = np.diag([1.0, 1, 1, 0, 0, 0])[None]  # weights where of position and orientation the first one counts
+FIRST = np.diag([1.0, 1, 1, 1e-2, 1e-2, 1e-2])[None]  # weights [m/rad] with which the position comes first
+POSITION = np.diag([1.0, 1, 1, 0, 0, 0])[None]  # what is left of an error where orientations stay as they are
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which a pose without a start looks for near ones; how many it tries
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
@@ -241,9 +242,10 @@ def compensate(
     **Targets.** ``q`` (N, dof) are commands of the nominal controller [rad or m], ``poses`` targets in the base, (N, 7)
     x, y, z [m] and unit quaternion, w first, or (N, 3) positions. With both, ``q`` is where to look for the poses;
     without ``q`` every pose is looked for from several configurations within the limits that come near. ``label`` names
-    the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: w stays out
-    of the sum where its standard uncertainty is larger (RMS of all rows), as where positions of one reflector hardly
-    determine it. ``orientation=True`` corrects them all the same, with ``False`` those of targets are ignored.
+    the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: where the
+    standard uncertainty of w is larger (RMS of all rows), as where positions of one reflector hardly determine it, w
+    is instead the turn by which the correction changes the orientation. ``orientation=True`` corrects them all the
+    same, with ``False`` those of targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
     frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
@@ -321,8 +323,8 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
         turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
         if turn < of_turn < np.inf:
             why = (
-                f" Orientation is not corrected: the correction, {turn:.2f} mrad, is smaller than its standard "
-                f"uncertainty, {of_turn:.2f} mrad (RMS; --orientation corrects it all the same)."
+                f" Orientation stays as uncorrected commands have it: its correction, {turn:.2f} mrad, is smaller than "
+                f"its standard uncertainty, {of_turn:.2f} mrad (RMS; --orientation makes it all the same)."
             )
     ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
     return {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}, why
@@ -435,7 +437,8 @@ class _Begun(NamedTuple):
     commands: Array  # (N, dof)
     wanted: Array  # poses (N, c)
     missed: Array  # error (N, k) of the controller's robot
-    before: Array  # error (N, k) of the identified robot,
+    reached: Array  # pose (N, c) of the identified robot,
+    before: Array  # its error (N, k)
     J: Array  # and its Jacobian (N, k, dof)
     beside: Array  # as in a `Compensation`
 
@@ -517,25 +520,27 @@ class _Cell(NamedTuple):
             missed = self.nominal.at(commands, load, poses)[1]
             if q is not None:
                 beside = self.norms(self.nominal.at(q, load, poses)[1])[0]
-        return _Begun(targets, load, commands, target, missed, *self.identified.at(commands, load, target)[1:], beside)
+        return _Begun(targets, load, commands, target, missed, *self.identified.at(commands, load, target), beside)
 
     def ended(self, begun: _Begun, largest: float, turning: bool) -> dict[str, Array]:
-        """Return the fields of a `Compensation` for some targets; ``turning`` corrects orientations, too."""
-        targets, load, commands, wanted, missed, before, J, beside = begun
-        reached = self._reached(missed, attainable(J))
-        W = attainable(J) if turning else POSITION
-        due = np.where(reached[:, None], before - missed, 0.0)
+        """Return the fields of a `Compensation` for some targets; without ``turning`` orientations stay as they are."""
+        targets, load, commands, target, missed, pose_before, before, J, beside = begun
+        W = attainable(J)
+        reached = self._reached(missed, W)
+        wanted, due = target, np.where(reached[:, None], before - missed, 0.0)
+        if not turning:
+            wanted, due, W = np.hstack([target[:, :3], pose_before[:, 3:]]), times(POSITION, due), W @ FIRST
         P = correction_weights(W @ J, times(W, due), largest)
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        cases = {"ok": self._reached(left, W), "limited": at_limit, UNREACHABLE: ~reached}
+        cases = {"ok": self._reached(left, attainable(J)), "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields["position_before"], fields["orientation_before"] = self.norms(before)
-        fields["position_error"], fields["orientation_error"] = self.norms(left)
+        fields["position_error"], fields["orientation_error"] = self.norms(self.identified.at(corrected, load, target)[1])
         fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
 
