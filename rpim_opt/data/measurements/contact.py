@@ -38,7 +38,10 @@ revisit_plane = Measurement(
     planar=True,
     names=TOUCHED,
     words=Words(
+        thing="a tip",
         thing_at="The tip that touches, a ball's centre,",
+        noise_of="a good robot, a tight fit",
+        wrong="the tip slipped",
         columns={"point": "touched point", "plane": "touched plane"},
     ),
 )

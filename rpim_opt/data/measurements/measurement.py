@@ -24,11 +24,17 @@ XYZ = {"x": "length", "y": "length", "z": "length"}  # a position's coordinates
 
 
 class Words(NamedTuple):
-    """Wording of a measurement type: target, reference frame, meaning of columns."""
+    """Wording of a measurement type: target, reference frame, typical noise and mistake, meaning of columns."""
 
+    thing: str = "a reflector"
     thing_at: str = "The reflector"
     frame: str = "so the instrument has a frame of its own"
+    noise_of: str = "a laser tracker, and a robot that repeats well"
+    wrong: str = "the reflector was bumped"
     columns: Mapping[str, str] = MappingProxyType({})
+
+
+REFLECTOR = Words()
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -99,7 +105,7 @@ class Measurement(Brief):
     variants: Mapping[str, Measurement] = field(default_factory=dict)
     parts: tuple[Measurement, ...] = ()
     accepted: Mapping[str, str] = field(default_factory=dict)
-    words: Words = field(default_factory=Words)
+    words: Words = REFLECTOR
     shown_by: Callable[[Sequence[Columns]], bool] | None = None
     registers: bool = False
     turning: bool = False
