@@ -176,7 +176,7 @@ class Term:
             where = f"term, scales, parameter '{entry.name}'"
             if not _STEM.fullmatch(entry.name) or _FRAME.fullmatch(entry.name):
                 accepted = "letters, digits and _, no digit at the end, nothing like base_, tool_ and _rx of frames"
-                raise InputError(where, "a reserved name", accepted)
+                raise InputError(where, "a name that parameters cannot have", accepted)
             if self.at in ENDS and "{}" in entry.name:
                 accepted = f"none: the {self.at} has one parameter"
                 raise InputError(where, "a placeholder for the joint's number", accepted)

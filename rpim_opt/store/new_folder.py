@@ -329,7 +329,7 @@ def _problem_text(
     arm: RobotSetup, source: Path, found: Understanding, rows: Dataset, **context: Any
 ) -> tuple[str, str]:
     """Return the text of ``problem.toml``, and what was guessed of the base in a sentence."""
-    from jinja2 import Environment
+    from jinja2 import Environment, StrictUndefined
 
     robot, kind = arm.robot, found.kind
     markers = sorted({marker for block in rows.blocks for marker in block.markers})
@@ -348,7 +348,8 @@ def _problem_text(
     if kind.touching:
         touched = [str(name) for block in rows.blocks if block.touched is not None for name in block.touched[:, 0]]
     known = {direction: word for word, direction in MOUNTINGS.items()}
-    template = Environment(trim_blocks=True, lstrip_blocks=True, keep_trailing_newline=True, autoescape=False)
+    options = {"trim_blocks": True, "lstrip_blocks": True, "keep_trailing_newline": True, "undefined": StrictUndefined}
+    template = Environment(autoescape=False, **options)
     bare = re.compile(r"[\w-]+", re.ASCII)
     template.filters |= {"toml": toml, "frame": _frame, "key": lambda k: k if bare.fullmatch(k) else toml(k)}
     text = template.from_string(TEMPLATE.read_text(encoding="utf-8")).render(

@@ -309,11 +309,13 @@ def _resumed(path: Path, code: Mapping[str, str], resume: bool | None) -> dict[s
         stored = dict(json.loads(line) for line in content[: content.rfind(b"\n") + 1 or None].splitlines())
         known = dict(stored.pop("code", {}))
     except (TypeError, ValueError):
-        raise InputError("the file", "no journal of replicates", "--no-resume to start again", path) from None
+        raise InputError(
+            "the file", "no journal of replicates", "--no-resume (resume=False) to start again", path
+        ) from None
     if not stored:
         return {}
     if resume is None:
-        accepted = "--resume to continue with them, or --no-resume to start again"
+        accepted = "--resume (resume=True) to continue with them, or --no-resume (resume=False) to start again"
         raise InputError("resume", f"{len(stored)} replicates of an interrupted run", accepted, path)
     for part in [*code, *known]:
         if code.get(part) != known.get(part):

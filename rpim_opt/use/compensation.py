@@ -540,7 +540,9 @@ class _Cell(NamedTuple):
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields["position_before"], fields["orientation_before"] = self.norms(before)
-        fields["position_error"], fields["orientation_error"] = self.norms(self.identified.at(corrected, load, target)[1])
+        fields["position_error"], fields["orientation_error"] = self.norms(
+            self.identified.at(corrected, load, target)[1]
+        )
         fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
 
