@@ -728,13 +728,11 @@ def _calibrated(
     instance: "ro.store.Instance", selector: Text, formulation: Text, words: dict[str, Text], say: Callable[[str], None]
 ) -> "ro.calibration.Calibration":
     """Calibrate as a problem's file says, or as the options say; name likely causes where there is no solution."""
-    from rpim_opt.store.problem_file import named_formulation, named_weight
+    from rpim_opt.store.problem_file import named_weight
 
-    changes: dict[str, Any] = {key: word for key, word in words.items() if word}
+    changes: dict[str, Any] = {key: word for key, word in {**words, "formulation": formulation}.items() if word}
     if selector:
         changes["weight"] = named_weight(selector)
-    if formulation:
-        changes["formulation"] = named_formulation(formulation)
     say("estimating the prior's scales" if changes.get("weight", instance.weight) is None else "choosing the weight")
     try:
         return instance.calibrate(

@@ -22,7 +22,7 @@ from rpim_opt.calibration import identify
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.convex.arguments import arguments_of
 from rpim_opt.convex.constraints import Box, Parsed
-from rpim_opt.convex.formulation import Formulation
+from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.rules.selection import Selector
 from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.camera import on_board
@@ -225,7 +225,7 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 
 def _formulation(stated: problem_file.ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
-    formulation = problem_file.named_formulation(stated.table.formulation, stated.path)
+    formulation = formulation_of(stated.table.formulation)
     own = stated.table.constraints.all(problem.robot, problem.data)
     formulation = replace(formulation, constraints=(*formulation.constraints, *own))
     parameters = problem.identified

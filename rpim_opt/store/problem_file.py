@@ -22,7 +22,6 @@ from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import FRAMES
 from rpim_opt.bayes.prior_terms import JOINT_OFFSET as FACTOR
 from rpim_opt.convex.constraints import BOX, WORKSPACE, Constraint, at_nominal, equal, parse, signed
-from rpim_opt.convex.formulation import FORMULATIONS, Formulation
 from rpim_opt.convex.rules.selection import Selector, require_weight
 from rpim_opt.convex.select import LEARNED, SELECTORS
 from rpim_opt.data.dataset import Dataset
@@ -82,11 +81,6 @@ def find_problem(name: str | Path) -> Path:
         return problems_folder() / str(name)
     accepted = "a folder with problem.toml, or " + choices(str(name), known)
     raise InputError("the problem", f"no folder '{name}'", accepted)
-
-
-def named_formulation(text: str, file: Path | None = None) -> Formulation:
-    """Return the ready formulation of that name."""
-    return pick(FORMULATIONS, text, "key formulation", file)
 
 
 def named_weight(text: str, file: Path | None = None) -> float | Selector | None:

@@ -20,12 +20,13 @@ from rpim_opt.basics.layout import TableOptions
 from rpim_opt.basics.tables import csv_text, read_columns
 from rpim_opt.basics.units import parse_units
 from rpim_opt.convex.constraint_parser import sentence
+from rpim_opt.convex.formulation import formulation_of
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.reading import read_data
 from rpim_opt.report.console import carried, listed_numbers, tool_frame
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.library import find_robot
-from rpim_opt.store.problem_file import named_formulation, named_weight, problems_folder
+from rpim_opt.store.problem_file import named_weight, problems_folder
 from rpim_opt.store.raw import understand_of, usual_noise
 from rpim_opt.store.result_file import digest
 
@@ -246,7 +247,7 @@ def result(data: bytes, folder: Path) -> None:
 def options(data: bytes, folder: Path) -> None:
     """Read what options of commands mean."""
     text = _sentence(data)
-    for read in (parse_units, tool_frame, carried, named_weight, named_formulation):
+    for read in (parse_units, tool_frame, carried, named_weight, formulation_of):
         with suppress(ro.InputError):
             read(text)
     listed_numbers(text)
