@@ -8,6 +8,7 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike
 
 from rpim_opt.basics.arrays import Array
@@ -149,15 +150,11 @@ class Dataset(Tabled):
 
     def by_session(self) -> list[np.ndarray]:
         """Return the configurations (k,) of every session, of those that share one together, and of unnamed rows."""
-        parts: list[np.ndarray] = []
-        for name in ("", *self.sessions):
-            mine = [self.configuration[block.row[block.session_names == name]] for block in self.blocks]
-            part = np.unique(np.concatenate(mine))
-            shared = [other for other in parts if np.isin(other, part).any()]
-            parts = [other for other in parts if not np.isin(other, part).any()]
-            if len(part):
-                parts.append(np.unique(np.concatenate([part, *shared])))
-        return parts
+        session = np.full(len(self), "", dtype=object)
+        for block in self.blocks:
+            session[block.row] = block.session_names
+        part = _united(_numbered(session), np.arange(len(self)), self.configuration)
+        return [np.unique(self.configuration[part == i]) for i in range(part.max() + 1)]
 
     def of_robot(self, robot: str) -> Dataset:
         """Return the rows of one of several robots, as that robot's own."""
@@ -206,20 +203,10 @@ class Dataset(Tabled):
         Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
         configuration: a fold of a cross-validation has all of them or none.
         """
-        group: dict[Any, Any] = {}
-
-        def root(of: Any) -> Any:
-            while group.setdefault(of, of) != of:
-                of = group[of]
-            return of
-
-        for block in self.blocks:
-            if block.touched is not None:
-                for row, names in zip(block.row, block.touched, strict=True):
-                    for name in names:
-                        group[root(("point", name))] = root(("rows", self.configuration[row]))
-        joined = [root(("rows", number)) for number in self.configuration]
-        return replace(self, configuration=_numbered(joined))
+        touches = (zip(block.row, block.touched, strict=True) for block in self.blocks if block.touched is not None)
+        pairs = [(row, name) for rows in touches for row, names in rows for name in names]
+        keys = _numbered(name for _, name in pairs)
+        return replace(self, configuration=_united(self.configuration, [row for row, _ in pairs], keys))
 
     def without(self, labels: Collection[str]) -> Dataset:
         """Return the rows whose label is not among ``labels``."""
@@ -320,17 +307,21 @@ class Dataset(Tabled):
         """Return several datasets of a robot as one (`concatenated`); equal joint values are one configuration."""
         whole = cls.concatenated(parts, names)
         stop = np.unique(whole.q, axis=0, return_inverse=True)[1].reshape(-1)
-        first = np.full(len(whole), len(whole))
-        np.minimum.at(first, stop, whole.configuration)  # of rows at equal joint values
-        joined = np.full(int(whole.configuration.max()) + 1, len(whole))
-        np.minimum.at(joined, whole.configuration, first[stop])
-        return replace(whole, configuration=joined[whole.configuration])
+        return replace(whole, configuration=_united(whole.configuration, np.arange(len(whole)), stop))
 
 
 def _numbered(keys: Iterable[Any]) -> np.ndarray:
     """Return numbers (N,) from 0 of N keys, the same of equal ones, in the order of their first."""
     number: dict[Any, int] = {}
     return np.array([number.setdefault(key, len(number)) for key in keys], dtype=int)
+
+
+def _united(group: np.ndarray, rows: ArrayLike, keys: np.ndarray) -> np.ndarray:
+    """Return numbers (N,) of N rows' groups, where groups of which ``rows`` (K,) have equal ``keys`` (K,) are one."""
+    groups = int(group.max(initial=-1)) + 1
+    count = groups + int(keys.max(initial=-1)) + 1
+    shared = scipy.sparse.coo_array((np.ones(len(keys)), (group[rows], groups + keys)), shape=(count, count))
+    return _numbered(scipy.sparse.csgraph.connected_components(shared, directed=False)[1][group].tolist())
 
 
 def _covariances(sigma: float | Array, N: int, k: int) -> Array:

@@ -144,13 +144,6 @@ class Parameters(Tabled):
     own_frames: tuple[str, ...] = ()
     terms: tuple[str, ...] = ()
 
-    def __post_init__(self) -> None:
-        """Refuse fields of different lengths."""
-        for key in ("dimensions", *NUMBERS):
-            count = len(getattr(self, key))
-            if count != len(self):
-                raise InputError(key, f"{count} entries", f"{len(self)}, one for every name")
-
     def _short(self) -> str:
         shown = ", ".join([*self.names[:SHOWN], "..."] if len(self) > SHOWN else self.names)
         return f"{shown}: {np.count_nonzero(self.identified)} of {len(self)} identified"
