@@ -50,7 +50,7 @@ def read(text):
     ]
 
 
-FORMATS = (TableFormat("MELFA variables", (".prg",), lambda text: JOINTS.search(text) is not None, read),)
+FORMATS = (TableFormat("MELFA variables", (".prg",), read),)
 '''
 COUNT = 80
 NOISE = 0.01

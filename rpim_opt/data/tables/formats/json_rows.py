@@ -91,7 +91,7 @@ def _flat(prefix: str, value: Any) -> Iterator[tuple[str, Any]]:
 
 
 FORMATS = (
-    TableFormat("JSON", (".json", ".jsonl", ".ndjson"), lambda text: text.lstrip()[:1] in "[{", read),
-    TableFormat("YAML", (".yaml", ".yml"), lambda text: ":" in text, read_yaml),
-    TableFormat("ROS messages", (".txt", ".log"), MESSAGE.search, read_yaml),
+    TableFormat("JSON", (".json", ".jsonl", ".ndjson"), read),
+    TableFormat("YAML", (".yaml", ".yml"), read_yaml),
+    TableFormat("ROS messages", (".txt", ".log"), lambda text: read_yaml(text) if MESSAGE.search(text) else ()),
 )

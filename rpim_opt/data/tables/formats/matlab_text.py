@@ -31,4 +31,4 @@ def read(text: str) -> Rows:
     return records(columns)
 
 
-FORMATS = (TableFormat("MATLAB text", (".m",), MATRIX.search, read),)
+FORMATS = (TableFormat("MATLAB text", (".m",), read),)

@@ -24,7 +24,6 @@ FANUC = re.compile(r'P\[(\d+)(?::"([^"]*)")?\]\s*\{(.*?)\};', re.DOTALL)
 KUKA = re.compile(r"(?:(?:E6AXIS|AXIS|E6POS|POS|FRAME)\s+(\w+)\s*=|PTP|LIN)\s*\{([^{}]{0,500})\}", re.IGNORECASE)
 ABB_JOINTS = re.compile(r"(?:jointtarget\s+(\w+)\s*:=|MoveAbsJ)\s*\[\s*\[([^\]]*)\]", re.IGNORECASE)
 ABB_POSES = re.compile(r"(?:robtarget\s+(\w+)\s*:=|Move[JL])\s*\[\s*\[([^\]]*)\]\s*,\s*\[([^\]]*)\]", re.IGNORECASE)
-ABB_TARGET = re.compile(f"{ABB_JOINTS.pattern}|{ABB_POSES.pattern}", re.IGNORECASE)
 UR = re.compile(rf"(?:(\w+)\s*=|move[jlp]\s*\()\s*(p?)\[\s*((?:{NUMBER}\s*,\s*){{5}}{NUMBER})\s*\]", re.IGNORECASE)
 YASKAWA = re.compile(r"^[ \t]*([BCP]+\d+)[ \t]*=[ \t]*([-+\d.][-+\d., \t]*)$", re.MULTILINE)
 KAWASAKI = re.compile(r"^\.JOINTS[^\n]*\n(.*?)^\.END", re.MULTILINE | re.DOTALL | re.IGNORECASE)
@@ -80,16 +79,11 @@ def read_abb(text: str) -> Rows:
     return _rows([_listed(name, cells) for name, cells in ABB_JOINTS.findall(text)] or poses)
 
 
-def _plain_urscript(text: str) -> str:
-    """Return a program without comments, its angles in rad."""
-    radians = re.sub(r"d2r\(\s*([+-]?[\d.]+)\s*\)", lambda degrees: repr(math.radians(float(degrees[1]))), text)
-    return re.sub(r"#.*", "", radians)
-
-
 def read_urscript(text: str) -> Rows:
     """Return the targets that are commanded or named."""
+    radians = re.sub(r"d2r\(\s*([+-]?[\d.]+)\s*\)", lambda degrees: repr(math.radians(float(degrees[1]))), text)
     targets = []
-    for name, pose, cells in UR.findall(_plain_urscript(text)):
+    for name, pose, cells in UR.findall(re.sub(r"#.*", "", radians)):
         if not pose:
             targets.append(_listed(name.removesuffix("_q"), cells, [f"J{i} [rad]" for i in range(1, 7)]))
         elif name.lower() != "set_tcp":
@@ -102,11 +96,12 @@ def read_urscript(text: str) -> Rows:
 
 def read_yaskawa(text: str) -> Rows:
     """Return the points; refuse encoder pulses, which need the robot's gear ratios."""
+    points = YASKAWA.findall(text)
     kind = re.search(r"///POSTYPE\s+(\w+)", text)
-    if kind is None or kind[1] == "PULSE":
+    if points and (kind is None or kind[1] == "PULSE"):
         raise InputError("the positions", "encoder pulses", "a job that was exported with ///POSTYPE ANGLE or BASE")
-    headers = () if kind[1] == "ANGLE" else PLACE
-    return _rows([_listed(name, cells, headers) for name, cells in YASKAWA.findall(text)])
+    headers = PLACE if kind and kind[1] != "ANGLE" else ()
+    return _rows([_listed(name, cells, headers) for name, cells in points])
 
 
 def read_kawasaki(text: str) -> Rows:
@@ -139,12 +134,12 @@ def read_mitsubishi(text: str) -> Rows:
 
 
 FORMATS = (
-    TableFormat("FANUC program", (".ls",), FANUC.search, read_fanuc),
-    TableFormat("KUKA data list", (".dat", ".src"), KUKA.search, read_kuka),
-    TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), ABB_TARGET.search, read_abb),
-    TableFormat("URScript", (".script", ".urscript"), lambda text: UR.search(_plain_urscript(text)), read_urscript),
-    TableFormat("Yaskawa job", (".jbi",), YASKAWA.search, read_yaskawa),
-    TableFormat("Kawasaki AS program", (".as", ".pg"), KAWASAKI.search, read_kawasaki),
-    TableFormat("MELFA program", (".prg", ".mb4", ".mb5", ".mb6"), MITSUBISHI.search, read_mitsubishi),
-    TableFormat("VAL3 data", (".dtx",), lambda text: "<Value" in text, read_staubli),
+    TableFormat("FANUC program", (".ls",), read_fanuc),
+    TableFormat("KUKA data list", (".dat", ".src"), read_kuka),
+    TableFormat("RAPID module", (".mod", ".modx", ".prg", ".sys"), read_abb),
+    TableFormat("URScript", (".script", ".urscript"), read_urscript),
+    TableFormat("Yaskawa job", (".jbi",), read_yaskawa),
+    TableFormat("Kawasaki AS program", (".as", ".pg"), read_kawasaki),
+    TableFormat("MELFA program", (".prg", ".mb4", ".mb5", ".mb6"), read_mitsubishi),
+    TableFormat("VAL3 data", (".dtx",), read_staubli),
 )

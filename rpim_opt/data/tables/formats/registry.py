@@ -25,13 +25,12 @@ NO_TABLES = (".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".
 class TableFormat(NamedTuple):
     """A format of tables: a module of this folder lists its own in ``FORMATS``.
 
-    ``endings`` are those of its files, ``shown_by(text)`` tells its texts from others with such an ending, and
-    ``read(text)`` returns the rows. What a program commands is called so, ``commanded x [mm]``: no measurement.
+    ``endings`` are those of its files, and ``read(text)`` returns the rows, none of a text of another format with such
+    an ending. What a program commands is called so, ``commanded x [mm]``: no measurement.
     """
 
     name: str
     endings: tuple[str, ...]
-    shown_by: Callable[[str], object]
     read: Callable[[str], Rows]
 
 
@@ -50,14 +49,13 @@ def read_raw(path: Path, options: TableOptions | None = None) -> RawTable:
     with in_file(path):
         require_file(path, LARGEST_DATA)
         text, _ = decoded(path, options.encoding if options else "")
-        format = next((each for each in fitting if each.shown_by(text)), None)
-        if format is None and ending in TEXTS:
+        name, rows = next(((each.name, rows) for each in fitting if (rows := each.read(text))), ("", ()))
+        if not rows and ending in TEXTS:
             return read_table(path, options)
-        rows = format.read(text) if format else ()
-        if format is None or not rows:
+        if not rows:
             accepted = f"{' or '.join(each.name for each in fitting)} with at least one"
             raise InputError("the file", "neither targets nor rows", accepted)
     names = dict.fromkeys(name for row in rows for name in row)
     columns = {name: ["" if row.get(name) is None else str(row[name]) for row in rows] for name in names}
     raw = read_table(path, options, columns)
-    return replace(raw, notes=(f"read as {format.name}.", *raw.notes))
+    return replace(raw, notes=(f"read as {name}.", *raw.notes))
