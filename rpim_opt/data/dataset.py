@@ -205,8 +205,8 @@ class Dataset(Tabled):
         """
         touches = (zip(block.row, block.touched, strict=True) for block in self.blocks if block.touched is not None)
         pairs = [(row, name) for rows in touches for row, names in rows for name in names]
-        keys = _numbered(name for _, name in pairs)
-        return replace(self, configuration=_united(self.configuration, [row for row, _ in pairs], keys))
+        rows = np.array([row for row, _ in pairs], dtype=int)
+        return replace(self, configuration=_united(self.configuration, rows, _numbered(name for _, name in pairs)))
 
     def without(self, labels: Collection[str]) -> Dataset:
         """Return the rows whose label is not among ``labels``."""
@@ -316,7 +316,7 @@ def _numbered(keys: Iterable[Any]) -> np.ndarray:
     return np.array([number.setdefault(key, len(number)) for key in keys], dtype=int)
 
 
-def _united(group: np.ndarray, rows: ArrayLike, keys: np.ndarray) -> np.ndarray:
+def _united(group: np.ndarray, rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
     """Return numbers (N,) of N rows' groups, where groups of which ``rows`` (K,) have equal ``keys`` (K,) are one."""
     groups = int(group.max(initial=-1)) + 1
     count = groups + int(keys.max(initial=-1)) + 1
