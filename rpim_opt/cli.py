@@ -408,7 +408,7 @@ def validate(
         validation = ro.use.validate(loaded, read.data, register)
     text, within = _against(limit, "error", validation.largest)
     document = {**validation.content(), "limit_mm": limit, "within_limit": within}
-    failed = within is False or validation.mistake or validation.worse
+    failed = within is False or validation.failure
     written = console.written_to(out, validation.csv())
     return Answer("\n".join([str(validation), *text]), document, int(bool(failed)), written, read)
 

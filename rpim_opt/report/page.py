@@ -118,7 +118,7 @@ def write_checks(found: Monitoring, path: str | Path, title: str = "") -> None:
     table = Table("In chronological order", list(columns), list(zip(*columns.values(), strict=True)))
     charts = [figure(partial(plot.checks, found), "Residual of every check and its limit", "Individual checks.")]
     title_of_sum = "Cumulative sum of the checks and its limit"
-    charts.append(figure(partial(plot.cumulative_sum, found), title_of_sum, "Cumulative sum of the checks (CUSUM)."))
+    charts.append(figure(partial(plot.checks, found, sums=True), title_of_sum, "Cumulative sum of the checks (CUSUM)."))
     sections: list[tuple[str, list[Block]]] = [
         ("Verdict", [("lead", {"text": verdict, "alarm": found.drifts}), *(("text", [line]) for line in details)]),
         ("Over time", [("figures", charts)]),

@@ -255,26 +255,18 @@ def uncertainty_map(at: Array, bound: Array, box: Array | None, limit: float | N
     ax.set(xlabel=f"{'xyz'[across]} [mm]", ylabel=f"{'xyz'[up]} [mm]", aspect="equal")
 
 
-def checks(found: Monitoring, ax: Axes) -> None:
-    """Draw every check against its limit."""
+def checks(found: Monitoring, ax: Axes, sums: bool = False) -> None:
+    """Draw every check, or their cumulative sum (CUSUM), against its limit."""
     place = _times(found, ax)
-    ax.plot(place, found.allowed, color=COLORS["mark"], lw=1.5, label="limit, checks beyond it")
-    _dots(ax, place, found.sigmas, "after", "check")
-    beyond = list(found.beyond)
-    _dots(ax, place[beyond], found.sigmas[beyond], "mark")
-    ax.set(ylabel="residual [standard deviations]")
-    ax.set_ylim(bottom=0)
-    _with_legend(ax)
-
-
-def cumulative_sum(found: Monitoring, ax: Axes) -> None:
-    """Draw the cumulative sum of the checks (CUSUM) against its limit."""
-    place = _times(found, ax)
-    ax.axhline(found.limit, color=COLORS["mark"], lw=1.5, label="limit, alarm")
-    ax.plot(place, found.sums, color=COLORS["after"], lw=1.5, label="sum")
-    if found.alarm is not None:
-        _dots(ax, [place[found.alarm]], [found.sums[found.alarm]], "mark")
-    ax.set(ylabel="cumulative sum")
+    values, allowed, beyond = found.sigmas, found.allowed, list(found.beyond)
+    if sums:
+        values, allowed = found.sums, np.full(len(place), found.limit)
+        beyond = [] if found.alarm is None else [found.alarm]
+    ax.plot(place, allowed, color=COLORS["mark"], lw=1.5, label="limit")
+    ax.plot(place, values, color=COLORS["after"], lw=0.8)
+    _dots(ax, place, values, "after", "sum" if sums else "check")
+    _dots(ax, place[beyond], values[beyond], "mark")
+    ax.set(ylabel="cumulative sum" if sums else "residual [standard deviations]")
     ax.set_ylim(bottom=0)
     _with_legend(ax)
 

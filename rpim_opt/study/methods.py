@@ -238,20 +238,16 @@ def methods_of(formulations: Any, selectors: Any, functions: Any, options: Mappi
 
 def _weight(label: str, each: Any) -> tuple[str, dict[str, Any]]:
     """Return the name of a selector or weight, and the setting that it is; the folder's own is none."""
-    if each is None:
-        each = LEARNED
     if each == FOLDER:
         return label or FOLDER, {}
-    if isinstance(each, str):
-        return label or each, {"weight": weight_of(each)}
+    if each is None or isinstance(each, str):
+        return label or each or LEARNED, {"weight": weight_of(each)}
     if callable(each):
         ready = next((name for name, known in SELECTORS.items() if known is each), _name(each))
         return label or ready, {"weight": each}
     if isinstance(each, bool) or not isinstance(each, int | float | np.number):
         raise InputError("selectors", f"{each!r}", f"a number, a selector, {LEARNED}, {FOLDER}, {', '.join(SELECTORS)}")
-    if isinstance(each, int):
-        each = number(each, "selectors")
-    weight = require_weight(float(each), "selectors")
+    weight = require_weight(number(each, "selectors") if isinstance(each, int) else float(each), "selectors")
     return label or f"{weight:g}", {"weight": weight}
 
 

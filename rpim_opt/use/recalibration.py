@@ -249,7 +249,12 @@ def update(
             released += cause.members
         start = updated.x
     if not after.likely:
-        _refuse_another_robot(result, updated, data)
+        refuse_misread(result, data)
+        furthest, missed = float(np.nanmax(result.nominal_errors())), rms(updated.errors(data))
+        if missed > STRANGE * furthest:
+            same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
+            found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
+            raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
@@ -268,16 +273,6 @@ def update(
 
 def _robots(result: Calibration) -> str:
     return " and ".join(robot.name for robot in result.problem.arms.values())
-
-
-def _refuse_another_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
-    """Refuse readings in another unit or order, or further off than the robot ever was uncalibrated."""
-    refuse_misread(result, data)
-    furthest, missed = float(np.nanmax(result.nominal_errors())), rms(updated.errors(data))
-    if missed > STRANGE * furthest:
-        same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
-        found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
-        raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
 
 
 def _carried_on(record: Record, last: Earlier, source: str) -> Record:
