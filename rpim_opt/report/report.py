@@ -466,9 +466,11 @@ def _provenance(content: Content) -> Iterator[Block]:
 def _formulation(result: Calibration) -> str:
     """Return what is minimized, in the terms of the result's file."""
 
+    def long(value: Any) -> bool:
+        return isinstance(value, list | tuple) and (len(value) > FEW_NUMBERS or any(map(long, value)))
+
     def argument(value: Any) -> str:
-        long = isinstance(value, list | tuple) and len(value) > FEW_NUMBERS
-        return f"{len(value)} rows" if long else str(value)
+        return f"{len(value)} rows" if long(value) else str(value)
 
     def term(part: Any) -> str:
         if isinstance(part, list):

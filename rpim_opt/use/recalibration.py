@@ -179,7 +179,7 @@ class Update:
                 "robot; if so, calibrate it without the previous result."
             )
         rows = [[c.name, c.kind, three_digits(c.gain), f"{c.p_value:.2g}", f"{c.probability:.2g}"] for c in self.causes]
-        head = ["may have changed", "kind", "chi-squared falls by", "p-value", "posterior"]
+        head = ["may have changed", "kind", "chi-squared falls by", "p-value", "probability"]
         verdict = [] if self.result.verdict.delivered else [str(self.result.verdict)]
         return "\n".join([*lines, *verdict, "", table(head, rows[:SHOWN]), "", self.result.message])
 

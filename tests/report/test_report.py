@@ -176,6 +176,14 @@ def test_other_formulations_have_a_report(formulation) -> None:
     assert ("L-curve: residual norm" in text) == (formulation is not ro.least_squares)
 
 
+def test_matrices_of_a_stated_prior_are_named_by_their_size() -> None:
+    problem, _ = simulated(("a?", "theta?", "base_*"), noise=5e-5)
+    stated = ro.bayes.Prior.known("a2 + a3 = nominal +- 0.01 mm").stated(problem.parameters)
+    text = page(ro.calibrate(problem, stated.penalized(ro.tikhonov), 1.0))
+    assert f"prior_penalty(sum_squares, {len(problem.parameters.free)} rows, " in text
+    assert "0.0, 0.0" not in text
+
+
 SLOW = [pytest.param(name, marks=pytest.mark.slow) for name in ("cable", "joints", "markers", "scara", "seven_axis")]
 
 
