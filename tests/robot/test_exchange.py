@@ -729,9 +729,17 @@ def test_tables_come_back_to_the_last_bit(tmp_path: Path, ending: str, coupled: 
         assert equal(ro.read_robot(path), robot)
 
 
-def test_limits_of_a_sheet_may_be_minimum_and_maximum(tmp_path: Path) -> None:
-    header = "alpha [deg],a [mm],theta [deg],d [mm],min [deg],max [deg],convention"
-    (tmp_path / "r.csv").write_text(f"{header}\n0,100,0,300,-170,165,modified\n")
+@pytest.mark.parametrize(
+    ("columns", "cells"),
+    [
+        ("min [deg],max [deg]", "-170,165"),
+        ("Range min [deg],Range max [deg]", "-170,165"),
+        ("lower limit [deg],upper limit [deg]", "-170,165"),
+    ],
+)
+def test_limits_of_a_sheet_stand_in_two_columns(tmp_path: Path, columns: str, cells: str) -> None:
+    header = f"alpha [deg],a [mm],theta [deg],d [mm],{columns},convention"
+    (tmp_path / "r.csv").write_text(f"{header}\n0,100,0,300,{cells},modified\n")
     assert np.degrees(ro.read_robot(tmp_path / "r.csv").limits) == pytest.approx(np.array([[-170, 165]]))
 
 
@@ -752,6 +760,7 @@ def test_a_table_is_written_as_a_person_would(tmp_path: Path) -> None:
         ("r.csv", "alpha_deg,a_mm,d_mm,convention\nninety,1,2,modified\n", "joint 1.alpha_deg: found 'ninety'"),
         ("r.csv", "alpha_deg,a_mm,d_mm,convention\nnan,1,2,modified\n", "joint 1.alpha_deg"),
         ("r.csv", "a_mm,d_mm,type,convention\n1,1,screw,modified\n", "joint 1.type: found 'screw'"),
+        ("r.csv", "d_mm,Range [deg],convention\n1,±170,modified\n", r"both limits in a column, 'Range \[deg\]'"),
         ("r.csv", "d_mm,lower_deg,convention\n1,5,modified\n", "joint 1.limits_deg: found None"),
         ("r.csv", "", "an empty file"),
         ("r.json", "[]", "found list"),

@@ -41,6 +41,8 @@ INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
 SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
          "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper"}  # fmt: skip
 """Other names of columns."""
+RANGE = re.compile(r"[\s_]*(?:range|limits?)[\s_]*")
+"""Beside the word of a limit, ``range min``, ``lower limit``; alone a column of both, which cells cannot hold."""
 SHEET_ORDER = ("theta", "d", "a", "alpha", "beta")  # of a data sheet in the standard convention
 JOINT_NAMES = ("joint", "i", "link", "no", "no.", "axis", "achse", "gelenk")  # columns of the joints' own names
 ANGLE_OF = re.compile(r"(?:q|θ|theta|t|th)_?\{?\d+\}?\*?\s*([+-]?\s*[\d.]*)\s*°?", re.IGNORECASE)
@@ -205,6 +207,8 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
             continue
         if stem in ANGLES and not unit and any("°" in text for text in texts):
             unit = "deg"
+        if stem == "limits":
+            raise InputError("the header", f"both limits in a column, '{name}'", "columns lower [deg] and upper [deg]")
         key = stem + (f"_{unit}" if unit else "")
         if key in columns:
             raise InputError("the header", ", ".join(raw.columns), "every column once")
@@ -232,6 +236,7 @@ def _stem(name: str) -> tuple[str, str]:
     """Return what a column of a sheet is called in ``robot.toml``, without indices, and its unit."""
     stem, unit = split(name)
     stem = INDEX.sub("", INDEX_BEFORE.sub("", stem).strip().lower())
+    stem = RANGE.sub("", stem) or "limits"
     return SHEET.get(stem, stem), unit
 
 
