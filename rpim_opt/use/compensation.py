@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import Any, NamedTuple
 
@@ -10,7 +11,7 @@ import casadi as ca
 import numpy as np
 import scipy
 
-from rpim_opt.basics.arrays import Array, statistics
+from rpim_opt.basics.arrays import Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError, RowError, choices, pick
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import joined, listed, table
@@ -26,6 +27,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
+from rpim_opt.problem.registration.closed_forms import register
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
@@ -50,6 +52,7 @@ STEP_TOLERANCE = 1e-10
 DECREASE_TOLERANCE = 1e-6
 """A row has converged when its step is shorter [rad or m], or lowers the objective by a smaller part."""
 MAX_ITERATIONS = 50
+MOVED = 6  # targets from which on one motion of all of them says something
 WEIGHED = "a calibration with compliances identified from torques of gravity, or a term that depends on the payload"
 
 
@@ -72,7 +75,8 @@ class Compensation:
     ranges; ``outside`` are all rows there. ``note`` says why a robot is not delivered, and how joints count whose signs
     or zeros were estimated; ``point`` which point is moved, and why orientations are not corrected; ``source`` names
     the calibration. ``beside`` (N,) [m] is how far a stated position is from that of the nominal robot at the joint
-    values stated beside it, NaN where there are none.
+    values stated beside it, NaN where there are none. ``after_motion`` is the RMS of uncorrected position errors [m]
+    that one motion of all targets leaves, NaN for fewer than `MOVED` of them or targets on a line.
     """
 
     robot: Robot
@@ -92,6 +96,13 @@ class Compensation:
     point: str = ""
     limit: float = np.inf
     source: str = ""
+    after_motion: float = np.nan
+
+    def _moved(self) -> str:
+        """Say what a common motion of all targets leaves of the uncorrected errors, where it is most of them."""
+        if not self.after_motion < rms(self.position_before) / 2:
+            return ""
+        return f" (a common motion of all targets, or another base, leaves {1e3 * self.after_motion:.4f} mm RMS)"
 
     def __str__(self) -> str:
         figures = []
@@ -110,7 +121,8 @@ class Compensation:
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
-            "Uncorrected errors refer to the identified base, nominal errors of a report to refitted base and tool.",
+            f"Uncorrected errors refer to the identified base, where targets hold{self._moved()}; nominal errors of a "
+            "report to refitted base and tool.",
         ]
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():
@@ -327,7 +339,14 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
                 f"its standard uncertainty, {of_turn:.2f} mrad (RMS; --orientation makes it all the same)."
             )
     ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
-    return {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}, why
+    fields: dict[str, Any] = {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}
+    there = np.concatenate([part.reached[:, :3] for part in parts])
+    errors = np.concatenate([part.before[:, :3] for part in parts])
+    if len(there) >= MOVED:
+        with suppress(InputError):
+            T = register(there, there + errors)
+            fields["after_motion"] = rms(np.linalg.norm(errors - (there @ T[:3, :3].T + T[:3, 3] - there), axis=1))
+    return fields, why
 
 
 def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:

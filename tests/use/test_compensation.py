@@ -144,6 +144,17 @@ def test_orientation_is_corrected_where_it_is_known_better_than_nominally() -> N
     assert np.array_equal(place.q, ro.use.compensate(sure, q, orientation=True).q)
 
 
+def test_what_is_one_motion_of_all_targets_is_said() -> None:
+    """The zero of the first joint, about a vertical axis, turns all targets as another base would."""
+    result, q = known(), commands(ARM)
+    free = result.problem.parameters.free.names
+    turned = replace(result, x=np.where([name == "theta1" for name in free], 2e-3, 0.0))
+    found = ro.use.compensate(turned, q, despite_verdict=True)
+    assert rms(found.position_before) > 1e-4
+    assert found.after_motion == pytest.approx(0, abs=1e-9)
+    assert "a common motion of all targets, or another base, leaves 0.0000 mm RMS" in str(found)
+
+
 def test_the_limit_of_a_result_holds_for_its_commands() -> None:
     result, q = calibrated()[0], commands(ARM, 5)
     required = replace(result, record=replace(result.record, requirement=ro.data.Requirement(2e-4)))
