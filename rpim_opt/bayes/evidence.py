@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
@@ -172,30 +173,121 @@ def whitened(data: Linearized, repeatability: Repeatability, noise: Sequence[str
 class Point:
     """The marginal likelihood at logarithms of hyperparameters (s,): scales of deviations, then q of noise.
 
-    ``value`` is -2 ln of the restricted likelihood and of the hyperprior, with ``gradient`` (s,) and ``curvature``
-    (s, s). ``z`` (p,), ``C`` (p, p) are posterior mean and covariance of the deviations, ``v`` (p,) the variances of a
-    Tikhonov program with these, ``slopes`` (p, s) those of z. The information C^-1 falls by diag(``own`` (p, s)),
-    and by noise in the equations of the ``parts``.
+    ``value`` is -2 ln of the restricted likelihood and of the hyperprior. ``z`` (p,), ``C`` (p, p) are posterior mean
+    and covariance of the deviations, ``v`` (p,) the variances of a Tikhonov program with these. Derivatives are taken
+    when they are asked for: each order costs as much as all before.
     """
 
+    evidence: Evidence
     logs: Array
     value: float
-    gradient: Array
-    curvature: Array
     z: Array
     C: Array
     v: Array
-    slopes: Array
-    own: Array
     parts: Sequence[Whitened]
 
+    @cached_property
+    def gradient(self) -> Array:
+        """Derivatives (s,) of the value."""
+        evidence, prior, heavy = self.evidence, self.evidence.prior, self.evidence.heavy
+        size2, of_size, _ = prior.variances(self.logs)
+        slope = 2 * (1 - (self.z**2 + self.C.diagonal()) / self.v)
+        slope[heavy] = (2 * prior.tails * (size2 / self.v - 1))[heavy]
+        gradient = slope @ of_size / 2 + 2 * (evidence.root @ (self.logs - evidence.centre)) @ evidence.root
+        gradient[len(prior.hyperparameters) :] += self._by_noise[0]
+        return gradient
+
+    @property
+    def curvature(self) -> Array:
+        """Second derivatives (s, s) of the value."""
+        return self._second[0]
+
+    @property
+    def slopes(self) -> Array:
+        """Derivatives (p, s) of the posterior mean."""
+        return self._second[1]
+
     def falls(self, M: Array) -> Array:
-        """Return the decreases (s,) of tr(M C^-1) for a symmetric M (p, p)."""
-        derivative = M.diagonal() @ self.own
+        """Return the decreases (s,) of tr(M C^-1) for a symmetric M (p, p): by local variances, and by noise."""
+        derivative = M.diagonal() @ self._second[2]
         for part in self.parts:
             blocks = part.X @ M @ part.X.transpose(0, 2, 1)
             derivative[len(derivative) - len(part.noise) :] += np.einsum("anij,nij->a", part.noise, blocks)
         return np.asarray(derivative, dtype=float)
+
+    @cached_property
+    def _by_noise(self) -> tuple[Array, Array, Array, list[Array]]:
+        """The gradient (q,), X'R^-1 R_a u (q, p), 2 u'R_a R^-1 R_b u - tr(P R_a P R_b) but `_weighed_twice`, X C."""
+        q, p = len(self.evidence.noise), len(self.z)
+        gradient, f, among, products = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), []
+        for part in self.parts:
+            X, residual = part.X.reshape(-1, p), part.y - part.X @ self.z
+            moved = (part.noise @ residual[:, :, None]).reshape(q, len(X))
+            f += moved @ X
+            XC = (X @ self.C).reshape(part.X.shape)  # one product: those of configurations take three times as long
+            products.append(XC)
+            weighed = part.noise - 2 * XC @ part.X.transpose(0, 2, 1) @ part.noise
+            gradient += np.einsum("ankk->a", part.noise + weighed) / 2 - moved @ residual.ravel()
+            among += 2 * moved @ moved.T - np.einsum("anij,bnij->ab", part.noise, weighed)
+        return gradient, f, among, products
+
+    def _weighed_twice(self) -> tuple[Array, Array]:
+        """Return tr(H R_a H R_b) (q, q), H = R^-1 X C X'R^-1, and diagonals (p, q) of C X'R^-1 R_a R^-1 X C."""
+        q, p = len(self.evidence.noise), len(self.z)
+        X = np.concatenate([part.X.reshape(-1, p) for part in self.parts])
+        if len(X) < p:  # among equations: a third of the time
+            diagonals, rows = np.zeros((p, q)), []
+            for part, XC in zip(self.parts, self._by_noise[3], strict=True):
+                H = (XC.reshape(-1, p) @ X.T).reshape(*part.y.shape, -1)
+                rows.append((part.noise @ H).reshape(q, part.y.size, -1))
+                diagonals += np.einsum("ankp,nkp->pa", part.noise @ XC, XC)
+            M = np.concatenate(rows, axis=1)
+            return np.einsum("aij,bji->ab", M, M), diagonals
+        M = np.zeros((q, p, p))
+        for part in self.parts:
+            sizes, U = np.linalg.eigh(part.noise)
+            roots = np.sqrt(np.maximum(sizes, 0.0))[..., None] * U.transpose(0, 1, 3, 2)
+            for a, root in enumerate(roots):  # products of a matrix with itself take half the time
+                half = (root @ part.X).reshape(-1, p)
+                M[a] += half.T @ half
+        M = self.C @ M
+        return np.einsum("aij,bji->ab", M, M), np.einsum("aij,ji->ia", M, self.C)
+
+    @cached_property
+    def _second(self) -> tuple[Array, Array, Array]:
+        """The curvature, the mean's slopes, and the decreases (p, s) of 1 / v."""
+        evidence, z, C, v = self.evidence, self.z, self.C, self.v
+        prior, heavy = evidence.prior, evidence.heavy
+        s, e2 = len(prior.hyperparameters), z**2 + C.diagonal()
+        size2, of_size, bend = prior.variances(self.logs)
+        by_noise, f, among, _ = self._by_noise
+        twice, C_by_noise = self._weighed_twice()
+        # how the mean follows noise, and e^2 at constant local variances
+        z_by_noise = -C @ f.T
+        direct = np.zeros_like(of_size)
+        direct[:, s:] = C_by_noise + 2 * z[:, None] * z_by_noise
+        information = np.where(prior.replaced, 0.0, 1 / v)
+        follows = C * (C + 2 * np.outer(z, z)) * information
+        log_v = of_size.copy()  # derivatives (p, s) of ln v, an implicit equation for Student-t deviations
+        log_v[heavy] = 0.0
+        wanted = prior.tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ log_v
+        system = np.diag((prior.tails + 1) * v[heavy]) - follows[np.ix_(heavy, heavy)]
+        log_v[heavy] = np.linalg.solve(system, wanted)
+        slopes = 2 * (e2[:, None] * of_size - direct - follows @ log_v) / v[:, None]
+        slopes[heavy] = (2 * prior.tails * (size2 / v)[:, None] * (of_size - log_v))[heavy]
+        curvature = 2 * evidence.root.T @ evidence.root
+        of_scales = of_size[:, :s].T @ slopes / 2
+        curvature[:s] += of_scales
+        curvature[s:, :s] += of_scales[:, s:].T
+        precision = information[:, None] * log_v
+        curvature[s:, s:] += among - twice - direct[:, s:].T @ precision[:, s:]
+        curvature[s:, s:] += 2 * (f @ z_by_noise + np.diag(by_noise))
+        if prior.spectrum is not None:
+            curves = slice(s - len(CURVES), s)
+            curvature[curves, curves] += np.tensordot((1 - e2 / v)[len(v) - len(bend) :], bend, axes=1)
+        of_z = C @ (z[:, None] * precision)
+        of_z[:, s:] += z_by_noise
+        return curvature, of_z, precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -262,67 +354,25 @@ class Evidence:
 
     def at(self, logs: Array, near: Point | None = None) -> Point:
         """Return the marginal likelihood at (s,); the iteration for local variances starts from those of ``near``."""
-        prior = self.prior
-        s = len(prior.hyperparameters)
+        prior, heavy = self.prior, self.heavy
         parts = whitened(self.data, self.repeatability(logs), self.noise)
-        size2, of_size, bend = prior.variances(logs)
-        v = size2
-        if near is not None:
-            v = near.v * size2 / prior.variances(near.logs)[0]
+        size2 = prior.variances(logs)[0]
+        v = size2 if near is None else near.v * size2 / prior.variances(near.logs)[0]
         z, C, logdet, v = self._settled(parts, size2, v)
-        e2 = z**2 + C.diagonal()
-        residuals = [part.y - part.X @ z for part in parts]
         own = ~prior.replaced
-        normal = own & ~prior.heavy
-        value = logdet + sum(part.logdet for part in parts) + float(np.sum((prior.rows @ z - prior.values) ** 2))
-        value += sum(float(np.sum(residual**2)) for residual in residuals)
-        value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[normal])))
-        nu, t2, t = prior.tails, size2[self._heavy], e2[self._heavy]
-        of_tails = (nu + 1) * np.log((nu * t2 + t) / (nu + 1)) - nu * np.log(t2) + 1 - t / v[self._heavy]
-        value += float(np.sum(of_tails))
-        slope = 2 * (1 - e2 / v)
-        slope[self._heavy] = (2 * nu * (size2 / v - 1))[self._heavy]
-        gradient = slope @ of_size / 2
-        by_noise, f, among, C_by_noise = _by_noise(parts, residuals, C)
-        gradient[s:] = by_noise
-        # how the mean follows noise, and e^2 at constant local variances
-        z_by_noise = -C @ f.T
-        direct = np.zeros_like(of_size)
-        direct[:, s:] = C_by_noise + 2 * z[:, None] * z_by_noise
-        information = np.where(own, 1 / v, 0.0)
-        follows = C * (C + 2 * np.outer(z, z)) * information
-        log_v = self._log_variances(of_size, direct, follows, size2, v)
-        slopes = 2 * (e2[:, None] * of_size - direct - follows @ log_v) / v[:, None]
-        slopes[self._heavy] = (2 * nu * (size2 / v)[:, None] * (of_size - log_v))[self._heavy]
-        curvature = np.zeros((len(logs), len(logs)))
-        curvature[:s] = of_size[:, :s].T @ slopes / 2
-        curvature[s:, :s] = curvature[:s, s:].T
-        precision = information[:, None] * log_v
-        curvature[s:, s:] = among + 2 * (f @ z_by_noise + np.diag(by_noise)) - direct[:, s:].T @ precision[:, s:]
-        if prior.spectrum is not None:
-            curves = slice(s - len(CURVES), s)
-            curvature[curves, curves] += np.tensordot((1 - e2 / v)[len(v) - len(bend) :], bend, axes=1)
         off = self.root @ (logs - self.centre)
-        of_z = C @ (z[:, None] * precision)
-        of_z[:, s:] += z_by_noise
-        return Point(
-            logs=logs,
-            value=value + float(off @ off),
-            gradient=gradient + 2 * off @ self.root,
-            curvature=curvature + 2 * self.root.T @ self.root,
-            z=z,
-            C=C,
-            v=v,
-            slopes=of_z,
-            own=precision,
-            parts=parts,
-        )
+        value = logdet + sum(part.logdet for part in parts) + float(np.sum((prior.rows @ z - prior.values) ** 2))
+        value += sum(float(np.sum((part.y - part.X @ z) ** 2)) for part in parts) + float(off @ off)
+        value += float(np.sum(z[own] ** 2 / v[own]) + np.sum(np.log(v[own & ~prior.heavy])))
+        nu, t2, t = prior.tails, size2[heavy], (z**2 + C.diagonal())[heavy]
+        of_tails = (nu + 1) * np.log((nu * t2 + t) / (nu + 1)) - nu * np.log(t2) + 1 - t / v[heavy]
+        return Point(self, logs, value + float(np.sum(of_tails)), z, C, v, parts)
 
     def optima(self, starts: Sequence[Array | Point], accuracy: float = 1e-5) -> list[Point]:
         """Return the local optima reached from some starts, logarithms (s,) or points there, the best first.
 
-        By Newton's steps in a trust region (Conn, Gould and Toint 2000), until no slope by the logarithms is above the
-        accuracy.
+        By Newton's steps in a trust region (Conn, Gould and Toint 2000), to the first point where no slope by the
+        logarithms is above the accuracy: its value may be above that of the one before by rounding.
         """
         known: list[Point] = []
 
@@ -330,23 +380,24 @@ class Evidence:
             nonlocal last
             if not np.array_equal(logs, last.logs):
                 last = self.at(logs.copy(), last)
+            if np.linalg.norm(last.gradient) <= accuracy:
+                raise StopIteration
             return last
 
         for start in starts:
             last = start if isinstance(start, Point) else self.at(start)
-            if not len(last.logs):
+            with suppress(StopIteration):
+                optimum = scipy.optimize.minimize(
+                    lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
+                    last.logs,
+                    method="trust-exact",
+                    jac=lambda logs: ask(logs).gradient,
+                    hess=lambda logs: ask(logs).curvature,
+                    options={"gtol": 0.0, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
+                )
+                ask(optimum.x)
+            if all(np.abs(last.logs - point.logs).max(initial=0.0) > BASIN for point in known):
                 known.append(last)
-                continue
-            optimum = scipy.optimize.minimize(
-                lambda logs: float(np.nan_to_num(ask(logs).value, nan=np.inf)),
-                last.logs,
-                method="trust-exact",
-                jac=lambda logs: ask(logs).gradient,
-                hess=lambda logs: ask(logs).curvature,
-                options={"gtol": accuracy, "initial_trust_radius": FIRST_RADIUS, "max_trust_radius": LARGEST_RADIUS},
-            )
-            if all(np.abs(optimum.x - point.logs).max() > BASIN for point in known):
-                known.append(ask(optimum.x))
         return sorted(known, key=lambda point: point.value)
 
     def starts(self) -> list[Array]:
@@ -393,7 +444,7 @@ class Evidence:
     # --- local variances ----------------------------------------------------------------------------------------
 
     @cached_property
-    def _heavy(self) -> np.ndarray:
+    def heavy(self) -> np.ndarray:
         """Which deviations have local variances."""
         return np.flatnonzero(self.prior.heavy & ~self.prior.replaced)
 
@@ -420,7 +471,7 @@ class Evidence:
         Local variances of Student-t deviations are a fixed point, found by Newton's steps for ln v:
         d C_ij / d v_k = C_ik C_kj / v_k^2, d z_j / d v_k = C_jk z_k / v_k^2.
         """
-        heavy, tails = self._heavy, self.prior.tails
+        heavy, tails = self.heavy, self.prior.tails
         own = np.where(self.prior.replaced[: len(v)], 0.0, 1.0)
         t2 = size2[heavy]
         widest = WIDEST * np.maximum(t2, 1.0)
@@ -442,65 +493,6 @@ class Evidence:
                 step = _step(change, C_heavy * (C_heavy + 2 * np.outer(z_heavy, z_heavy)), weighed, local)
             local = np.minimum(local * np.exp(step), widest)
             before = min(before, largest)
-
-    def _log_variances(self, of_size: Array, direct: Array, follows: Array, size2: Array, v: Array) -> Array:
-        """Return the derivatives (p, s) of ln v, an implicit equation for Student-t deviations."""
-        heavy, tails = self._heavy, self.prior.tails
-        logs = of_size.copy()
-        logs[heavy] = 0.0
-        if len(heavy):
-            wanted = tails * size2[heavy, None] * of_size[heavy] + direct[heavy] + follows[heavy] @ logs
-            system = np.diag((tails + 1) * v[heavy]) - follows[heavy][:, heavy]
-            logs[heavy] = np.linalg.solve(system, wanted)
-        return logs
-
-
-def _by_noise(parts: Sequence[Whitened], residuals: Sequence[Array], C: Array) -> tuple[Array, Array, Array, Array]:
-    """Return derivatives by logarithms of noise: the gradient (q,), X'R^-1 R_a u (q, p), and parts of the second's.
-
-    Those are 2 u'R_a R^-1 R_b u - tr(P R_a P R_b) (q, q), but for what of u follows the noise, and the diagonals (p, q)
-    of C X'R^-1 R_a R^-1 X C.
-    """
-    q, p = len(parts[0].noise), len(C)
-    gradient, f, among, S = np.zeros(q), np.zeros((q, p)), np.zeros((q, q)), np.zeros((q, p, p))
-    if not q:
-        return gradient, f, among, np.zeros((p, 0))
-    if sum(residual.size for residual in residuals) < p:
-        return _by_noise_of_few(parts, residuals, C)
-    for part, residual in zip(parts, residuals, strict=True):
-        X = part.X.reshape(-1, p)
-        moved = (part.noise @ residual[:, :, None]).reshape(q, -1)
-        f += moved @ X
-        XC = (X @ C).reshape(part.X.shape)  # one product: those of configurations take three times as long
-        weighed = part.noise - 2 * XC @ part.X.transpose(0, 2, 1) @ part.noise
-        gradient += np.einsum("ankk->a", part.noise + weighed) / 2 - moved @ residual.ravel()
-        among += 2 * moved @ moved.T - part.noise.reshape(q, -1) @ weighed.reshape(q, -1).T
-        S += X.T @ (part.noise @ part.X).reshape(q, -1, p)  # X'R^-1 R_a R^-1 X
-    M = C @ S
-    among -= M.reshape(q, -1) @ M.transpose(0, 2, 1).reshape(q, -1).T
-    return gradient, f, among, np.einsum("aij,ji->ia", M, C)
-
-
-def _by_noise_of_few(
-    parts: Sequence[Whitened], residuals: Sequence[Array], C: Array
-) -> tuple[Array, Array, Array, Array]:
-    """Return the same from W_a = R_a P (m, m): a third of the time where deviations outnumber equations."""
-    q, p = len(parts[0].noise), len(C)
-    X = np.concatenate([part.X.reshape(-1, p) for part in parts])
-    XC = X @ C
-    P = np.eye(len(X)) - XC @ X.T
-    W, moved, C_by_noise, first = np.zeros((q, *P.shape)), np.zeros((q, len(X))), np.zeros((p, q)), 0
-    for part, residual in zip(parts, residuals, strict=True):
-        own = slice(first, first + residual.size)
-        first = own.stop
-        shape = (*part.noise.shape[1:3], -1)
-        W[:, own] = (part.noise @ P[own].reshape(shape)).reshape(q, residual.size, -1)
-        moved[:, own] = (part.noise @ residual[:, :, None]).reshape(q, -1)
-        C_by_noise += np.einsum("ankp,nkp->pa", part.noise @ XC[own].reshape(shape), XC[own].reshape(shape))
-    u = np.concatenate([residual.ravel() for residual in residuals])
-    gradient = np.einsum("amm->a", W) - moved @ u
-    among = 2 * moved @ moved.T - W.reshape(q, -1) @ W.transpose(0, 2, 1).reshape(q, -1).T
-    return gradient, moved @ X, among, C_by_noise
 
 
 # --- linear algebra ---------------------------------------------------------------------------------------------
@@ -540,6 +532,12 @@ def _eliminated(U: Array, equations: Array, v: Array) -> tuple[Array, Array, Arr
     Return the information G'(I + U diag(v) U')^-1 G of the equations, the regression C U'G of the coefficients on them,
     C = (U'U + diag(1 / v))^-1 and -ln|C|.
     """
+    if len(U) < len(v):  # among equations: I + U diag(v) U' = L L'
+        L = np.linalg.cholesky(np.eye(len(U)) + (U * v) @ U.T)
+        Y = solve_triangular(L, np.hstack([U * v, equations]), lower=True, check_finite=False)
+        follow, left = Y[:, : len(v)], Y[:, len(v) :]
+        logdet = 2 * float(np.sum(np.log(L.diagonal()))) - float(np.sum(np.log(v)))
+        return left.T @ left, follow.T @ left, np.diag(v) - follow.T @ follow, logdet
     if not len(v):
         return equations.T @ equations, np.zeros((0, equations.shape[1])), np.zeros((0, 0)), 0.0
     right = U.T @ equations
@@ -557,11 +555,8 @@ def _step(change: Array, M: Array, weighed: Array, v: Array) -> Array:
     if np.abs(change).max() <= COUPLED:
         root = np.sqrt(weighed * v)
         ratio = np.sqrt(weighed / v)
-        try:
+        with suppress(np.linalg.LinAlgError):
             L = np.linalg.cholesky(np.eye(len(v)) - M / np.outer(root, root))
-        except np.linalg.LinAlgError:
-            pass
-        else:
             step = scipy.linalg.cho_solve((L, True), change * ratio, check_finite=False) / ratio
             if np.abs(step).max() <= LONGEST_COUPLED:
                 return np.asarray(step, dtype=float)

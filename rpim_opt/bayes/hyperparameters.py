@@ -33,6 +33,7 @@ from rpim_opt.robot.terms import Curve
 MOST = 1000  # configurations that hyperparameters are estimated from, drawn at random where there are more
 SAME_SIZE, SAME_PLACE = 0.02, 0.01
 """Largest change of the logarithms of hyperparameters, and of deviations over their scales (RMS), at the end."""
+SLOPES = 1e-2, 1e-5  # of -2 ln L by logarithms of hyperparameters, at the first linearization and at later ones
 CLOSE = 0.1  # scales (RMS) up to which the posterior mean at one linearization stands for a fit
 ITERATIONS = 6  # of the first fit between two estimates, twice as many in every later one: the first change soon
 VAGUE = 1.0  # standard deviation of a logarithm from which on a scale of the geometry is hardly identified
@@ -225,11 +226,11 @@ class Estimator:
         From x (n,) [SI] and logarithms of hyperparameters, or None. Several optima are all continued, since where few
         data leave frames far from their start, their order changes with the linearization.
         """
-        first = self._once(problem, x, before, ITERATIONS)
-        fits = [first, *(self._once(problem, x, other.logs, ITERATIONS) for other in first.others)]
+        first = self._once(problem, x, before, 0)
+        fits = [first, *(self._once(problem, x, other.logs, 0) for other in first.others)]
         for i, fit in enumerate(fits):
             for k in range(1, rounds):
-                again = self._once(problem, fit.x, fit.point.logs, ITERATIONS * 2**k)
+                again = self._once(problem, fit.x, fit.point.logs, k)
                 moved = _distance(again.x, fit.x, again.laid)
                 resized = np.abs(again.point.logs - fit.point.logs).max(initial=0.0)
                 fit = fits[i] = again
@@ -237,12 +238,12 @@ class Estimator:
                     break
         return min(fits, key=lambda fit: fit.point.value)
 
-    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, iterations: int) -> Fit:
-        """Estimate hyperparameters at one linearization, starting from given values (s,), or from several starts."""
+    def _once(self, problem: CalibrationProblem, x: Array, known: Array | None, k: int) -> Fit:
+        """Estimate hyperparameters at linearization k, starting from given values (s,), or from several starts."""
         p = problem.parameters
         prior = self.prior.stated(p)
         evidence = self.evidence(problem, x, prior)
-        point, *others = evidence.optima(evidence.starts() if known is None else [known])
+        point, *others = evidence.optima(evidence.starts() if known is None else [known], SLOPES[min(k, 1)])
         scale = p.scale.copy()
         scale[p.identified] *= prior.scale * np.sqrt(point.v)
         repeatability = replace(evidence.repeatability(point.logs), at=p.values_at(x))
@@ -251,7 +252,7 @@ class Estimator:
         fit = Fit(problem, prior, evidence, point, others, laid, mean)
         if self.refit is None or _distance(mean, x, laid) <= CLOSE:  # near enough for one linearization
             return fit
-        return replace(fit, x=self.refit(laid, fit.inside.penalized(tikhonov), x, iterations))
+        return replace(fit, x=self.refit(laid, fit.inside.penalized(tikhonov), x, ITERATIONS * 2**k))
 
 
 def spectrum_of(curves: Sequence[Curve], unit: Array) -> Spectrum:

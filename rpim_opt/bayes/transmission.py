@@ -82,8 +82,7 @@ def admitted(
         model = rest.restricted(models.members(extensions))
         best = model.optima(model.starts()[:1])[0]
         penalty = EXTENSION_GAIN * complexity(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
-        if not kept.issubset(extensions):
-            penalty = np.inf
+        penalty = penalty if kept.issubset(extensions) else np.inf
         return Candidate(best.value + penalty, extensions, model, best)
 
     compared = sorted(models.compared(fitted), key=lambda each: each.criterion)
@@ -93,7 +92,7 @@ def admitted(
     geometry = problem.parameters.free.scale * (prior.centre + prior.scale * best.point.z)
     x = np.append(geometry, point.z[len(point.z) - columns.shape[1] :])
     logs = np.append(best.point.logs, point.logs)
-    joint = replace(estimator, curves=curves).fit(problem.with_transmission(curves), x, logs, ROUNDS)
+    joint = replace(estimator, curves=curves, refit=None).fit(problem.with_transmission(curves), x, logs, ROUNDS)
     gain = plain.value - point.value
     shift = trials[0].value - gain - best.point.value
     with_curves = [Trial((*each.extensions, TRANSMISSION), each.point.value + shift) for each in compared]

@@ -97,7 +97,12 @@ class LinearModel(Brief):
 
 
 def svd(A: Array) -> tuple[Array, Array, Array]:
-    """Return U, s, V' of A (m, n), of min(m, n) singular values."""
+    """Return U, s, V' of A (m, n), of min(m, n) singular values; in less time where its last rows are zero."""
+    k, rows = min(A.shape), int(np.max(np.flatnonzero(A.any(axis=1)), initial=-1)) + 1
+    if rows < k:  # as those of the R of fewer equations than parameters
+        U, (above, s, Vt) = np.eye(len(A), k), np.linalg.svd(A[:rows])
+        U[:rows, :rows] = above
+        return U, np.append(s, np.zeros(k - rows)), Vt[:k]
     try:
         return np.linalg.svd(A, full_matrices=False)
     except np.linalg.LinAlgError:  # as LAPACK's quicker driver ends with 514 parameters of 80 sessions

@@ -17,6 +17,7 @@ from rpim_opt.bayes.evidence import (
     Evidence,
     Hierarchy,
     Linearized,
+    Point,
     Spectrum,
     widening,
 )
@@ -64,6 +65,29 @@ def hyperprior(evidence: Evidence, logs: Array) -> float:
     sizes = len(evidence.prior.names)
     of_sizes = off[:sizes] @ np.linalg.solve(evidence.prior.covariance, off[:sizes])
     return float(of_sizes + np.sum((off[sizes:] / NOISE_SD) ** 2))
+
+
+@pytest.mark.parametrize("rounding", [0.0, 3e-11])
+def test_an_optimum_takes_few_evaluations_where_values_are_rounded(
+    rounding: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Below rounding, values do not say whether a step leads on; and an optimum needs no second derivatives."""
+    evidence = Evidence(linearized(3, 60, 8), hierarchy([0] * 4 + [1] * 4, [True] * 8, ("a", "b")), NOISE)
+    (want,) = evidence.optima([evidence.centre])
+    at, rng = Evidence.at, np.random.default_rng(0)
+    points: list[Point] = []
+
+    def rounded(self: Evidence, logs: Array, *near: Point) -> Point:
+        point = at(self, logs, *near)
+        points.append(replace(point, value=point.value * (1 + rounding * rng.uniform(-1, 1))))
+        return points[-1]
+
+    monkeypatch.setattr(Evidence, "at", rounded)
+    (point,) = evidence.optima([evidence.centre])
+    assert len(points) <= 12
+    assert np.allclose(point.logs, want.logs, atol=1e-4)
+    assert "_second" not in vars(point)
+    assert sum("_second" in vars(other) for other in points) < len(points)
 
 
 def test_normal_deviations_give_the_textbooks_likelihood() -> None:
