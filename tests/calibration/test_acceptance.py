@@ -246,6 +246,14 @@ def test_rows_that_miss_reject_only_when_chance_does_not_make_so_many(result) ->
     assert accept(one, Requirement(1e-3)).verdict == "inconclusive"
 
 
+def test_errors_that_the_instrument_may_make_do_not_reject(result) -> None:
+    """Rows are off by 5 mm in x, y and z; a reading's standard deviation is 10 mm in each."""
+    (block,) = moved(result.record.validation, list(range(12)), 5e-3).blocks
+    coarse = replace(result.record.validation, blocks=(replace(block, covariance=1e-4 * np.eye(3)[None]),))
+    found = accept(replace(result, record=replace(result.record, validation=coarse)), Requirement(1e-3))
+    assert found.verdict != "rejected"
+
+
 def test_a_penalty_without_covariance_has_no_bound(instance) -> None:
     found = accept(ro.calibrate(instance.problem, ro.lasso, 1.0), Requirement(1e-3), instance.validation)
     assert found.verdict == "inconclusive"

@@ -70,6 +70,12 @@ REFUSED: dict[str, tuple[str, dict[str, Any], str]] = {
 }  # fmt: skip
 
 
+def test_ignored_rows_without_labels_are_named_by_their_numbers(tmp_path: Path) -> None:
+    rows = "1,2,401,5,6\n3,4,-,-,-\n5,6,402,6,7\n"
+    found = read(write(tmp_path, HEAD.removeprefix("Point,") + rows))
+    assert "rows without measured values are ignored: 2." in found.notes
+
+
 def test_points_of_several_arrays_are_named_by_array_and_key(tmp_path: Path) -> None:
     homes = '<Data name="home"><Value key="0" j1="1"/></Data><Data name="cell"><Value key="0" x="7"/></Data>'
     path = write(tmp_path, homes + '<Data name="calib"><Value j1="2"/><Value j1="3"/></Data>', "raw.dtx")

@@ -437,6 +437,15 @@ def test_a_report_is_written_whole_and_again(tmp_path: Path) -> None:
     assert "<table>" in found._repr_html_()
 
 
+def test_the_command_takes_all_configurations_unless_told(monkeypatch, capsys) -> None:
+    from tests.test_cli import run
+
+    asked = ["compare", "position", "--formulations", "tikhonov", "--selector", "1", "--json"]
+    assert run(monkeypatch, *asked) == 0
+    (row,) = json.loads(capsys.readouterr().out)["replicates"]
+    assert row["configurations"] == len(POSITION.problem.data)
+
+
 @pytest.mark.slow
 def test_the_command(tmp_path: Path, monkeypatch, capsys) -> None:
     from tests.test_cli import run

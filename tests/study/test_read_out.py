@@ -86,6 +86,12 @@ def test_ratios_beyond_the_figure_are_arrows_at_its_edge() -> None:
     assert arrows == [[("<", pytest.approx(1 / 30)), (">", pytest.approx(30))], []]
 
 
+def test_marks_tell_by_colour_what_is_better_and_what_worse() -> None:
+    axes = compared({"a": even(1.0), "b": even(2.0), "c": even(0.5)}).plot().axes[0]
+    marks = {round(line.get_xdata()[0], 6): line.get_color() for line in axes.lines if line.get_marker() == "D"}
+    assert marks == {1.0: "0.3", 2.0: "C3", 0.5: "C2"}
+
+
 def test_a_method_without_figures_is_not_drawn() -> None:
     lost = compared({"a": even(1.0), "b": dict.fromkeys(SIX)})
     assert [text.get_text() for text in lost.plot().axes[0].get_yticklabels()] == ["a"]

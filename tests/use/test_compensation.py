@@ -509,6 +509,8 @@ def test_tables_of_targets_in_and_of_commands_out(tmp_path: Path, orientation: s
     assert [row["status"] for row in rows] == list(found.status)
     written = np.array([[float(row[name]) for name in names] for row in rows]) * unit
     assert written == pytest.approx(found.q, abs=1e-10)
+    largest = np.abs(found.q - q).max(axis=0) / unit
+    assert found.content()["largest_corrections"] == pytest.approx(dict(zip(names, largest, strict=True)), abs=1e-9)
     assert float(rows[0]["std_mm"]) == pytest.approx(1e3 * found.std[0], abs=1e-6)
     again = compensated(result, tmp_path / "both.csv")
     assert again.position_error.max() < 1e-7

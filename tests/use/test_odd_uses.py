@@ -286,7 +286,7 @@ def test_what_no_file_holds_is_named_and_counted() -> None:
 def test_a_file_is_no_folder(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="a folder, accepted: a unique name for every file"):
         write_all([(tmp_path, lambda path: None)])
-    with pytest.raises(ro.InputError):
+    with pytest.raises(ro.InputError, match="two files with this name"):
         write_all([(tmp_path / "a", lambda path: None)] * 2)
 
 
