@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import inspect, odd_column
+from rpim_opt.problem.diagnosis import inspect, moved_far, odd_column
 from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
@@ -55,6 +55,13 @@ def test_a_ready_robot_of_nearly_the_same_drawing_is_named() -> None:
     older = ro.read_robot(find_robot("ur10"))
     (text,) = [each for each in inspect(replace(problem, robots=older)).warnings if "times better" in each]
     assert "the ready robot ur10e" in text
+
+
+def test_the_row_from_which_on_the_base_stood_elsewhere_is_named() -> None:
+    """Not where no part of the table fits better than the whole: where measured values are of other rows."""
+    (said,) = moved_far(changed("position", y=lambda y: y + 0.05 * (np.arange(len(y)) >= 20)[:, None]))
+    assert said.startswith("from about row c20 on the points fit another base")
+    assert list(moved_far(changed("position", y=lambda y: np.random.default_rng(1).permutation(y)))) == []
 
 
 def test_rows_that_stand_out_are_named() -> None:

@@ -56,6 +56,8 @@ def test_flagged_rows_are_marked(ax) -> None:
     labels = result.problem.data.label
     assert {labels[round(x) - 1] for x in marked.get_xdata()} == {flag.label for flag in result.flagged}
     assert len(marked.get_xdata()) == 5
+    errors = 1e3 * result.errors(result.problem.data)
+    assert marked.get_ydata() == pytest.approx([errors[round(x) - 1] for x in marked.get_xdata()], rel=1e-12)
     assert ax.get_ylabel() == "error [mm]"
 
 

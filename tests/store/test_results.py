@@ -101,6 +101,12 @@ def test_ready_made_formulations_can_be_solved_again(tmp_path: Path, formulation
     assert np.array_equal(repeated.x, result.x)
 
 
+def test_the_weight_that_a_rule_of_a_script_chose_is_kept(tmp_path: Path) -> None:
+    problem, _ = simulated(noise=5e-5)
+    again = saved(tmp_path, ro.calibrate(problem, ro.tikhonov, lambda program: 3.0))
+    assert again.calibrate_again(again.problem).weight == 3.0
+
+
 def test_functions_of_a_script_are_missing_and_nothing_else(tmp_path: Path) -> None:
     instance = ro.load("blunders")
     mine = ro.Formulation("mine", lambda v: cp.sum(cp.huber(v, 2)), cp.sum_squares, loss_over="configuration")  # ty: ignore
