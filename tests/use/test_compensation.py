@@ -252,11 +252,11 @@ def test_corrections_stay_small_at_a_singular_wrist() -> None:
 
 
 def limited() -> tuple[ro.calibration.Calibration, np.ndarray]:
-    """Return an exactly known robot and commands, of which every second stands at a limit of some joint."""
+    """Return an exactly known robot and commands, of which every second stands at a limit of some joint, or near it."""
     q = commands(ARM, 40)
     limits = np.tile([-2.0, 2.0], (6, 1))
     q[::2, 1] = 2.0
-    q[::4, 3] = -2.0
+    q[::4, 3] = -2.0 + 2e-4 * np.arange(10)
     result = known()
     problem = ro.CalibrationProblem(
         ro.robot.Robot("limited", ARM.mdh, limits=limits), result.problem.parameters, result.problem.data
