@@ -39,6 +39,7 @@ from rpim_opt.problem.workspace import in_base, markers, within
 from rpim_opt.robot.parameters import of_session
 
 Conclusion = Literal["accepted", "rejected", "inconclusive"]
+MEASURED = 1000  # measured configurations of a block at which the uncertainty is compared with that of the region
 MOST = 3  # joints or rows that a reason names
 STATED = 1e9  # degrees of freedom of an uncertainty that is stated
 WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
@@ -210,7 +211,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
         'known of the reflector ([prior] known = ["tool_x = 95 +- 0.5 mm", ...]).'
     )
     if any(map(of_session, result.problem.parameters.free.names)):
-        advice = _missing(result, nominal, found.largest, 0.0)
+        advice = _missing(result, nominal, found, 0.0)
     return (
         f"Inconclusive: the median U over the region, {1e3 * found.typical:.3f} mm, is above the error of the "
         f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. {advice}"
@@ -355,7 +356,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
             "more repeatable robot reduces it."
         )
     if not mapped.largest <= limit:
-        lacking.append(_missing(result, limit, mapped.largest, repeatability))
+        lacking.append(_missing(result, limit, mapped, repeatability))
     verdict: Conclusion = "accepted"
     if against or lacking:
         verdict = "rejected" if against else "inconclusive"
@@ -363,8 +364,9 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     return Acceptance(requirement, verdict, reasons, mapped, repeatability, held_out, caution)
 
 
-def _missing(result: Calibration, limit: float, bound: float, repeatability: float) -> str:
-    """Say what is missing for a bound [m] within the limit [m]."""
+def _missing(result: Calibration, limit: float, found: Workspace, repeatability: float) -> str:
+    """Say what is missing for a bound within the limit [m]."""
+    bound = found.largest
     if not np.isfinite(bound):
         return "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
     if repeatability > limit:
@@ -384,8 +386,16 @@ def _missing(result: Calibration, limit: float, bound: float, repeatability: flo
             f"reduce the bound of {1e3 * bound:.3f} mm. Survey the base or the anchor, and state the result in [prior] "
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
+    q = np.concatenate([b.q[:MEASURED, 0] for part in result.problem.rows() for b in part.data.blocks])
+    measured = reaching(result, found.region, q, found.requirement.confidence)[1].max()
+    apart = ""
+    if measured < bound / 2:
+        apart = (
+            f", with joint values in other combinations than measured: at measured configurations it is at most "
+            f"{1e3 * measured:.3f} mm (another region: --box)"
+        )
     return (
-        f"Missing: more measurements. The bound is {1e3 * bound:.3f} mm; with all parameters known the robot's "
+        f"Missing: more measurements. The bound is {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "
         "configurations that help most."
     )

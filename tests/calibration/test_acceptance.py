@@ -136,6 +136,22 @@ def test_a_repeatability_that_is_known_rejects_what_no_calibration_can_keep() ->
     assert found.repeatability > 2e-4
 
 
+def test_joints_that_were_moved_together_do_not_bound_other_combinations() -> None:
+    problem, rng = ro.load("position").problem, np.random.default_rng(0)
+    q = rng.uniform(-1, 1, (60, 1)) * np.ones(6) + rng.uniform(-0.15, 0.15, (60, 6))
+    there = problem.on(ro.Dataset.of(q, np.zeros((60, 3)), 5e-5))
+    y = there.modelled(np.zeros(len(problem.parameters.free)))[0] + 5e-5 * rng.normal(size=(60, 3))
+    moved_together = ro.calibrate(problem.on(ro.Dataset.of(q, y, 5e-5)), ro.tikhonov, 1.0)
+    found = ro.calibration.accept(moved_together, ro.data.Requirement(1e-4))
+    assert found.verdict == "inconclusive"
+    measured = reaching(moved_together, region_of(moved_together, found.requirement), q, 0.95)[1].max()
+    assert f"other combinations than measured: at measured configurations it is at most {1e3 * measured:.3f} mm" in str(
+        found
+    )
+    assert found.bound is not None
+    assert found.bound > 2 * measured
+
+
 def test_the_mean_of_the_errors_does_not_decide(result) -> None:
     """A limit well above every error that was measured is not yet kept where nothing was."""
     largest = result.errors(result.record.validation).max()
