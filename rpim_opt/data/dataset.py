@@ -206,7 +206,8 @@ class Dataset(Tabled):
         touches = (zip(block.row, block.touched, strict=True) for block in self.blocks if block.touched is not None)
         pairs = [(row, name) for rows in touches for row, names in rows for name in names]
         rows = np.array([row for row, _ in pairs], dtype=int)
-        return replace(self, configuration=_united(self.configuration, rows, _numbered(name for _, name in pairs)))
+        united = _united(self.configuration, rows, _numbered(name for _, name in pairs))
+        return replace(self, configuration=_numbered(united.tolist()))
 
     def without(self, labels: Collection[str]) -> Dataset:
         """Return the rows whose label is not among ``labels``."""
@@ -317,11 +318,14 @@ def _numbered(keys: Iterable[Any]) -> np.ndarray:
 
 
 def _united(group: np.ndarray, rows: np.ndarray, keys: np.ndarray) -> np.ndarray:
-    """Return numbers (N,) of N rows' groups, where groups of which ``rows`` (K,) have equal ``keys`` (K,) are one."""
+    """Return numbers (N,) of N rows' groups, where groups of which ``rows`` (K,) have equal ``keys`` (K,) are one.
+
+    They are in the order of the groups: an order of sums that changes would change last digits of results.
+    """
     groups = int(group.max(initial=-1)) + 1
     count = groups + int(keys.max(initial=-1)) + 1
     shared = scipy.sparse.coo_array((np.ones(len(keys)), (group[rows], groups + keys)), shape=(count, count))
-    return _numbered(scipy.sparse.csgraph.connected_components(shared, directed=False)[1][group].tolist())
+    return scipy.sparse.csgraph.connected_components(shared, directed=False)[1][group]
 
 
 def _covariances(sigma: float | Array, N: int, k: int) -> Array:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -134,3 +135,13 @@ def test_standard_deviations_of_rows() -> None:
     assert of_components[0] == pytest.approx(np.diag([1e-5, 2e-5, 3e-5]) ** 2)
     with pytest.raises(ro.InputError, match="sigma"):
         ro.Dataset.of(q, y, [1e-5, 2e-5, 0.0, 4e-5])
+
+
+def test_configurations_at_the_same_joint_values_are_one_in_the_order_that_they_had() -> None:
+    """Also over a chain of configurations; their numbers are those of the first table's, not of the rows."""
+    q = np.array([[0.3, 0.0], [0.1, 0.0], [0.2, 0.0]])
+    first = replace(ro.Dataset.of(q, np.zeros((3, 3)), 1e-5), configuration=np.array([2, 0, 1]))
+    second = replace(ro.Dataset.of(q[[0, 1]], np.zeros((2, 3)), 1e-5), configuration=np.array([0, 0]))
+    assert ro.Dataset.together([first, second], ["a", "b"]).configuration.tolist() == [0, 0, 1, 0, 0]
+    second = ro.Dataset.of(q[[0, 1]], np.zeros((2, 3)), 1e-5)
+    assert ro.Dataset.together([first, second], ["a", "b"]).configuration.tolist() == [2, 0, 1, 2, 0]
