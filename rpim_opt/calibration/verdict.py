@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import chain
 from typing import cast
 
 import numpy as np
@@ -389,13 +390,17 @@ def _beside_a_good_fit(
     beyond the noise.
     """
     kept = kept_rows(result)
-    causes = _single_rows(result, ordered) if result.excluded is not None or not kept.all() else []
-    if not causes and together:
-        causes = list(diagnosis.part_way(ordered))
-        together = [] if causes else together
+    causes = []
+    if result.excluded is not None and len(problem.arms) == 1:
+        by_result = replace(ordered, robots=result.robot)
+        causes = first(
+            diagnosis.single_rows(ordered), diagnosis.other_places(by_result), diagnosis.other_rows(by_result)
+        )
+    elif result.excluded is not None or not kept.all():
+        causes = list(diagnosis.single_rows(ordered))
     if causes:
         causes[-1] += " The other rows fit: calibrate again with these corrected, or left out ([exclude])."
-        return causes, together
+        return causes, []
     if len(problem.arms) > 1:
         return [], together
     limits = [*_held(result, problem), *_limited_by_formulation(result, problem, kept)] if noticed else []
@@ -516,32 +521,20 @@ def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
     ]
 
 
-def _single_rows(result: Outcome, ordered: CalibrationProblem) -> list[str]:
-    """Return what is wrong with single rows, by themselves or by the calibrated robot."""
-    causes = [*diagnosis.rows_without_values(ordered.data, ordered.arms), *diagnosis.filled_rows(ordered.data)]
-    causes += diagnosis.exchanged_rows(ordered)
-    if not causes and result.excluded is not None and len(ordered.arms) == 1:
-        causes += diagnosis.turned_joint(replace(ordered, robots=result.robot))
-    return causes
-
-
 def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
     """Return what explains the fit of a calibration that is judged bad: something of all rows, else of some."""
     if len(problem.arms) > 1:  # a table is read anew with the nominal model of one robot
         return list(diagnosis.rows_without_values(problem.data, problem.arms))
-    better = better_reading(ordered)
-    # beside single rows, which may be the ones where something changed
-    read = first(diagnosis.part_way(ordered), diagnosis.moved_far(problem)) if better is None else [better.sentence]
-    causes = [*_single_rows(result, ordered), *read]
-    if causes:
-        return causes
-    causes = first(diagnosis.mixed_reflectors(problem), _shown_without_outliers(result, ordered))
     error = rms(problem.errors(result.x)[kept_rows(result)])
-    causes = first(causes, diagnosis.rounded(problem, error))
-    unrelated = diagnosis.unrelated_rows(problem, error)
-    if causes or error < LARGEST["length"]:  # which a robot's own effects may be
-        return first(causes, unrelated)
-    return first(diagnosis.odd_column(problem), unrelated)
+    beyond = error >= LARGEST["length"]  # what a robot's own effects may be
+    # beside single rows, which may be the ones where something changed
+    return first(
+        chain(diagnosis.single_rows(ordered), diagnosis.other_readings(ordered)),
+        _shown_without_outliers(result, ordered),
+        diagnosis.rounded(problem, error),
+        diagnosis.odd_column(problem) if beyond else (),
+        diagnosis.unrelated_rows(problem, error),
+    )
 
 
 def _without_outliers(

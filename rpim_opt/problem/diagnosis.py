@@ -25,15 +25,13 @@ from rpim_opt.problem.noise import UNITS, Equations
 from rpim_opt.problem.problem import SHIFTED, CalibrationProblem, near_parallel
 from rpim_opt.problem.registration.closed_forms import transformed
 from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
-from rpim_opt.problem.registration.points import Fit, Points, fit_points, lengths_of, misfit, points_of
+from rpim_opt.problem.registration.points import FAR, Fit, Points, agreeing, fit_points, lengths_of, misfit, points_of
 from rpim_opt.problem.row_functions import about_means, repeated
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
 
 LEAST_TRAVEL = {"revolute": np.radians(10), "prismatic": 0.01}  # a joint that moves less [rad, m] is hardly seen
-FAR = 5.0
-"""A row is in question from so many medians of the errors on, or robust standard deviations above their median."""
 ALIKE = (0.4, 2.5)  # rounding explains errors that are between these multiples of what it makes
 NOTICED = 2**0.5
 """Residuals over the noise from which on half of the squares may be explained, and no less than the noise be left."""
@@ -65,7 +63,9 @@ FLAT_TURN = 0.05
 """Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
 FILLED = 1e-3  # a point that is at least so far from the one before [m] is another one
 COPIES = 0.2  # part of the rows that may repeat others
-MOST_ROUNDS = 20  # of telling rows of one reflector from those of another, and of fitting one joint's values
+MOST_ROUNDS = 20  # of fitting one joint's values
+COMPUTED = "were they computed, not measured? Leave them out ([exclude])."
+MOSTLY = 2 / 3  # share of the rows from one to another that is of one kind, for a change to have come there
 TWO_KINDS, STARTS = 0.4, 30
 """Rows are of two kinds if two calibrations leave less than this part of the residuals of one; starts of the search."""
 OUTLYING, OUTLYING_ROUNDS = 10, 3
@@ -248,15 +248,9 @@ def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> I
         proposals = (f"the axes {pairs} are nearly parallel: add {', '.join(needed)} to `identify`.",)
     # all are identified again, with frames where they were fitted
     whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
-    warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation)]
-    warnings += [*rows_without_values(data, problem.arms), *filled_rows(data)]
     ordered = in_table_order(problem, validation)
-    better = better_reading(ordered)
-    if better is not None:
-        warnings.append(better.sentence)
-    else:
-        warnings += exchanged_rows(ordered)
-        warnings += first(part_way(ordered), moved_far(problem), shown_by_fit(whole))
+    warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation), *single_rows(ordered)]
+    warnings += first(other_readings(ordered), shown_by_fit(whole))
     return Inspection(
         problem=problem,
         residual=residual,
@@ -318,7 +312,7 @@ def _rows(labels: Sequence[str], of_one: str, of_several: str) -> str:
 
 
 def _ranges(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which joints leave their limits or hardly move, and which units or rows may be mistaken."""
+    """Say which joints leave their limits or hardly move, and which rows may be copied."""
     robot = problem.robot
     q = _all_q(problem.data)
     for i, dimension in enumerate(robot.joint_dimensions):
@@ -328,13 +322,6 @@ def _ranges(problem: CalibrationProblem) -> Iterator[str]:
             yield f"joint {i + 1} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
         if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
             yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are poorly identifiable."
-    turning = np.array(robot.joint_dimensions) == "angle"
-    if turning.any():
-        largest = np.abs(q[:, turning]).max()
-        if largest > 4 * np.pi:
-            yield f"joints reach {np.degrees(largest):.0f} deg: degrees read as radians?"
-        if largest < np.radians(2 * np.pi):
-            yield "no joint exceeds 6.3 deg: radians read as degrees?"
     for block in problem.data.blocks:
         if block.y.shape[1] < 3:
             continue
@@ -352,6 +339,13 @@ def arm_length(robot: Robot, blocks: Iterable[Block]) -> float:
     moved = blocks if sliding.any() else ()
     strokes = [np.abs(block.q[..., sliding]).max(axis=(0, 1)) for block in moved if block.q.shape[-1] == robot.dof]
     return float(np.abs(robot.mdh[:, [1, 3]]).sum() + np.max(strokes, axis=0, initial=0.0).sum())
+
+
+def single_rows(problem: CalibrationProblem) -> Iterator[str]:
+    """Report what is wrong with single rows by themselves, from data in the order of the table."""
+    yield from rows_without_values(problem.data, problem.arms)
+    yield from filled_rows(problem.data)
+    yield from exchanged_rows(problem)
 
 
 def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[str]:
@@ -422,11 +416,16 @@ def filled_rows(data: Dataset) -> Iterator[str]:
 
     The data are in the order of the table.
     """
+    of: dict[tuple[str, tuple[str, ...]], list[Block]] = {}  # neighbours may be of several blocks
     for block in data.blocks:
-        if block.y.shape[1] < 3:
-            continue
-        order = np.argsort(block.row)
-        q, y, labels = block.q[order, 0], block.y[order, :3], np.array(data.label)[block.row[order]]
+        if block.y.shape[1] >= 3:
+            of.setdefault((block.robot, block.markers), []).append(block)
+    for blocks in of.values():
+        row = np.concatenate([block.row for block in blocks])
+        order = np.argsort(row)
+        labels = np.array(data.label)[row[order]]
+        q = np.concatenate([block.q[:, 0] for block in blocks])[order]
+        y = np.concatenate([block.y[:, :3] for block in blocks])[order]
         moves = np.linalg.norm(np.diff(y, axis=0), axis=1)
         off = np.linalg.norm(y[1:-1] - (y[:-2] + y[2:]) / 2, axis=1)
         decimals = decimals_of(1e3 * y)
@@ -529,21 +528,30 @@ def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
         yield Rounding(what, 1e-3 * made, "export more decimals, or state the rounding as their noise")
     levers = np.sqrt(np.sum((slopes @ problem.robot.joint_map) ** 2, axis=0) / len(problem.data))[turning]
     for name, size in (("deg", np.pi / 180), ("rad", 1.0)):
-        steps = np.array([_step(column) for column in angles.T / size])
-        each = size * steps / np.sqrt(12) * levers
+        steps = np.array([_unit(column, _step(column)) for column in angles.T / size])
+        each = size * np.sqrt(np.mean(steps**2, axis=1) / 12) * levers
         made = float(np.linalg.norm(each))
         of = ", ".join(f"q{i + 1}" for i, part in zip(np.flatnonzero(turning), each, strict=True) if 10 * part > made)
         step = f"{steps.max(initial=0.0):g} {name}"
-        what = f"joint values are rounded to {step} ({of})"
+        up_to = "up to " * bool(np.ptp(steps, axis=1).any())
+        what = f"joint values are rounded to {up_to}{step} ({of})"
         yield Rounding(what, made, "export them with more decimals", step=step if steps.all() else "")
 
 
 def _unit(values: Array, *steps: float) -> Array:
-    """Return to what values (N,) [mm] are rounded: a grid of such a step, or 3 or 4 digits; zeros if to none."""
-    exponents = np.floor(np.log10(np.maximum(np.abs(values), 1.0)))
-    grids = [np.full(values.shape, step) for step in steps]
-    for unit in (*grids, 10.0 ** (exponents - 2), 10.0 ** (exponents - 3)):
-        if np.abs(values / unit - (values / unit).round()).max(initial=0.0) < ON_GRID:
+    """Return to what values (N,) are rounded: 16-bit floats, a grid of such a step, or 3 or 4 digits; zeros if to none.
+
+    16-bit floats have 11 significant bits; of those that were written with few decimals half of the last one may miss.
+    """
+    size = np.abs(values)
+    decimals = decimals_of(values)
+    written = 0.0 if decimals is None else 0.5 * 10.0**-decimals
+    binary = 2.0 ** (np.floor(np.log2(np.maximum(size, ON_GRID))) - 10)
+    digits = 10.0 ** (np.floor(np.log10(np.maximum(size, 1.0))) - 2)
+    grids = [np.full(values.shape, step) for step in steps if step]
+    for unit, missing in ((binary, written), *((each, 0.0) for each in (*grids, digits, digits / 10))):
+        off = np.abs(values - unit * (values / unit).round())
+        if missing < np.median(unit) / 8 and (off <= ON_GRID * unit + missing).all():
             return unit
     return np.zeros(values.shape)
 
@@ -590,9 +598,11 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem)
     if points is None:
         return
-    fit = fit_points(points)
+    own, fit = agreeing(points)
+    if 2 * own.sum() <= len(own):  # of many rows far off some are near any other by chance
+        return
     label = [problem.data.label[i] for i in points.row]
-    limit = FAR * float(np.median(fit.error))  # of many rows far off some are near any other by chance
+    limit = FAR * float(np.median(fit.error[own]))
     far = np.flatnonzero(fit.error > limit)
     away = np.linalg.norm(points.y[far, None] - fit.modelled, axis=2)
     away[points.marker[far, None] != points.marker] = np.inf
@@ -678,37 +688,6 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
     )
 
 
-def turned_joint(problem: CalibrationProblem) -> Iterator[str]:
-    """Report outliers of a calibrated robot that another value of one joint explains, or another interpretation."""
-    points = points_of(problem)
-    if points is None or points.turns is not None:
-        return
-    fit = fit_points(points)
-    limit = FAR * np.median(fit.error)
-    out = points.take(np.flatnonzero(fit.error > limit))
-    if len(out.row) < FEW:
-        return
-    # a joint reaches a random error of size E to within the limit with probability 1 - sqrt(1 - (limit / E)^2)
-    reached = float(np.mean(1 - np.sqrt(1 - (limit / fit.error[fit.error > limit]) ** 2)))
-    best = max(FEW, len(out.row) / 2) - 1
-    said = ""
-    for i in np.flatnonzero(np.array(points.robot.joint_types) == "revolute"):
-        q = _values_that_fit(out, int(i), fit)
-        modelled = transformed(fit.base @ forward_kinematics(points.robot, q), fit.tools[out.marker])
-        explained = np.linalg.norm(out.y - modelled, axis=1) < limit
-        chance = bdtrc(explained.sum() - 1, len(explained), reached) * points.robot.dof
-        if explained.sum() > best and chance < UNLIKELY:
-            best = explained.sum()
-            named = _rows([problem.data.label[row] for row in out.row[explained]], "has", "have")
-            off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))
-            by = f"{off.min():.1f} to {off.max():.1f} deg"
-            said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct column q{i + 1}"
-    if said:
-        yield f"{said}, or leave them out ([exclude])."
-    else:
-        yield from _read_otherwise(problem, out, float(rms(fit.error)) / points.extent)
-
-
 def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Array:
     """Return joint values (N, dof) in which one joint's are those that fit best, with base and reflectors if known."""
     q, width = points.q, np.pi
@@ -727,108 +706,136 @@ def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Ar
     return q
 
 
-def moved_far(problem: CalibrationProblem) -> Iterator[str]:
-    """Report the row from which on points fit another base, anchor or reflector: one that was moved."""
+def other_readings(problem: CalibrationProblem) -> list[str]:
+    """Return what explains a table better than it is stated: another place or interpretation of some rows, or of all.
+
+    Where half of the rows agree with the nominal robot, another interpretation is sought of the others first.
+    """
+    points = points_of(problem) or lengths_of(problem)
+    if points is None:
+        return []
+
+    def of_all() -> Iterator[str]:
+        better = better_reading(problem)
+        if better is not None:
+            yield better.sentence
+
+    both = [of_all(), other_rows(problem)]
+    return first(other_places(problem), *(both[::-1] if 2 * agreeing(points)[0].sum() > len(points.row) else both))
+
+
+def other_places(problem: CalibrationProblem) -> Iterator[str]:
+    """Report rows that fit another base, anchor or reflector: one that was moved, exchanged or not named."""
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    rows = np.arange(len(points.row))
-    whole = misfit(points)
-    if whole < FAR_MOVED:
+    whole = rms(agreeing(points)[1].error)
+    parts: list[tuple[np.ndarray, Fit]] = []
+    rest = np.arange(len(points.row))
+    while whole >= FAR_MOVED * points.extent and len(rest) >= FEWEST:
+        own, fit = agreeing(points.take(rest))
+        part = rest[own]
+        if len(part) < FEWEST or rms(fit.error[own]) >= min(BETTER * whole, WRONG * points.take(part).extent):
+            break
+        parts.append((part, fit))
+        rest = rest[~own]
+        if rms(fit.error[own]) < EXACT:
+            labels = [problem.data.label[i] for i in points.row[part]]
+            yield f"{_rows(labels, 'agrees', 'agree')} with the nominal robot: {COMPUTED}"
+            return
+    if len(parts) < 2 or len(rest) > len(points.row) / OUTLYING:
         return
-    parted = {k: [points.take(part) for part in np.split(rows, [k])] for k in _places(len(rows))}
-    left = {k: max(misfit(part) for part in parts) for k, parts in parted.items()}
-    place = min(left, key=left.__getitem__)
-    if left[place] >= BETTER * whole:
+    in_turn = all(len(part) > MOSTLY * (np.ptp(part) + 1) for part, _ in parts)
+    if len(points.tools) > 1 and not in_turn:  # their names may be exchanged
         return
-    first, second = (fit_points(part) for part in parted[place])
-    remedy = "calibrate one part, and add the other to its result with `update --reset 'base_*'`"
+    (_, first), *others = sorted(parts, key=lambda each: each[0][0])
+    for part, fit in others:
+        labels = [problem.data.label[i] for i in points.row[part]]
+        where = f"from about row {labels[0]} on the points fit" if in_turn else _rows(labels, "fits", "fit")
+        other, joint = _other_place(points, first, fit)
+        if in_turn or joint != 1:  # no base moves to and fro about the first axis
+            yield f"{where} another {other}."
+
+
+def _other_place(points: Points, first: Fit, second: Fit) -> tuple[str, int | None]:
+    """Return which place of the second fit is another one than in the first, and the joint that may be off instead."""
+    reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
     if points.lengths:
         far = float(np.linalg.norm(second.base[:3, 3] - first.base[:3, 3]))
-        other, what = "anchor", "the anchor or the robot's base moved"
-        remedy = "calibrate the two parts separately"
-    else:  # the second part's points by the other base
-        there = transformed(first.base @ np.linalg.inv(second.base), second.modelled)
-        far = float(np.linalg.norm(second.modelled - there, axis=1).mean())
-        other, what = "base", "the instrument or the robot's base moved"
-    reflectors = float(np.linalg.norm(second.tools - first.tools, axis=1).max())
+        other, what = "anchor", "the anchor or the robot's base moved; calibrate the two parts separately"
+        joint, places = 1, np.zeros((0, 2, 3))
+    else:  # the second part's points in the robot's frame, by either base
+        backs: Any = np.linalg.inv(np.stack([first.base, second.base]))
+        joint, places = 1, transformed(backs, second.modelled[:, None])
+        far = float(np.linalg.norm(places[:, 1] - places[:, 0], axis=1).mean())
+        remedy = "calibrate one part, and add the other to its result with `update --reset 'base_*'`"
+        other, what = "base", f"the instrument or the robot's base moved; {remedy}"
     if reflectors > far:
-        other, what, far = "reflector", "the reflector was exchanged", reflectors
+        far, joint, places = reflectors, len(points.robot.mdh), np.stack([first.tools, second.tools], axis=1)
         remedy = "name the reflector of every row in a column `marker` of the raw table (rpim-opt new)"
-    yield (
-        f"from about row {problem.data.label[points.row[place]]} on the points fit another {other}, "
-        f"{three_digits(1e3 * far)} mm away: {what}; {remedy}."
-    )
+        other, what = "reflector", f"the reflector was exchanged; {remedy}"
+    said = f"{other}, {three_digits(1e3 * far)} mm away: {what}"
+    round_axis = np.stack([np.linalg.norm(places[..., :2], axis=2), places[..., 2]])
+    if np.abs(np.diff(round_axis, axis=2)).max(initial=0.0) < FLAT_TURN * far and len(places):
+        turn = np.angle(np.exp(1j * np.diff(np.arctan2(places[..., 1], places[..., 0]), axis=1)).mean())
+        return f"{said}, or correct joint {joint}, which may be {abs(np.degrees(turn)):.0f} deg off in them", joint
+    return said, None
 
 
-def mixed_reflectors(problem: CalibrationProblem) -> Iterator[str]:
-    """Report rows of another, unnamed reflector, from groups of points in the flange frame."""
-    points = points_of(problem)
-    if points is None or len(points.row) < 4 * FEWEST or len(points.tools) > 1 or points.turns is not None:
-        return
-    flange = forward_kinematics(points.robot, points.q)
-    whole = misfit(points)
-    for count in (2, 3) if whole >= FAR_MOVED else ():
-        named, fit = points, fit_points(points)
-        for _ in range(MOST_ROUNDS):
-            back: Any = np.linalg.inv(fit.base @ flange)
-            seen = transformed(back, points.y)
-            tools = fit.tools
-            if named is points:  # to begin with, in parts along the direction in which they spread most
-                along = np.linalg.svd(seen - seen.mean(axis=0), full_matrices=False)[2][0]
-                tools = np.array([seen[part].mean(axis=0) for part in np.array_split(np.argsort(seen @ along), count)])
-            marker = np.linalg.norm(seen[:, None] - tools, axis=2).argmin(axis=1)
-            if named is not points and (marker == named.marker).all():
-                break
-            named = replace(points, marker=marker, tools=tools)
-            fit = fit_points(named)
-        sizes = np.bincount(named.marker, minlength=count)
-        if sizes.min() >= FEWEST // 2 and misfit(named) < BETTER * whole:
-            far = 1e3 * np.linalg.norm(fit.tools - fit.tools[sizes.argmax()], axis=1).max()
-            others = [problem.data.label[i] for i in points.row[named.marker != sizes.argmax()]]
-            instead = "."
-            round_axis = np.column_stack([np.hypot(*fit.tools[:2, :2].T), fit.tools[:2, 2]])
-            if count == 2 and 1e3 * np.abs(np.diff(round_axis, axis=0)).max() < FLAT_TURN * far:
-                angles = np.degrees(np.arctan2(fit.tools[:2, 1], fit.tools[:2, 0]))
-                turn = abs((angles[1] - angles[0] + 180) % 360 - 180)
-                instead = f", or correct joint {len(points.robot.mdh)}, which may be {turn:.0f} deg off in them."
-            yield (
-                f"the rows are of {count} reflectors, up to {three_digits(far)} mm apart: {_rows(others, 'is', 'are')} "
-                f"not of the first; name each row's reflector in a column `marker`{instead}"
-            )
-            return
-
-
-def part_way(problem: CalibrationProblem) -> Iterator[str]:
-    """Report the approximate row from which on another interpretation of the table fits, or in which rows it does."""
+def other_rows(problem: CalibrationProblem) -> Iterator[str]:
+    """Report the row from which on, or rows in which, another interpretation or other values of one joint fit."""
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    whole = float(np.sqrt(np.mean(fit_points(points).error ** 2))) / points.extent  # of all rows, if few are wrong
-    first = {k: points.take(np.arange(k)) for k in _places(len(points.row))}
-    fitting = [k for k, part in first.items() if misfit(part) < BETTER * whole]
-    if not fitting:
+    own, fit = agreeing(points)
+    near, extent = rms(fit.error[own]), points.take(np.flatnonzero(own)).extent
+    if near >= min(BETTER * rms(fit.error), WRONG * extent):
         return
-    error = fit_points(first[max(fitting)]).error
-    far = error > FAR * np.median(error)
-    wrong = np.append(0, np.cumsum(far))
+    wrong = np.append(0, np.cumsum(~own))
     start = int(np.argmin(2 * wrong - np.arange(len(wrong))))  # fewest rows that are on the wrong side of it
-    rest = points.take(np.arange(start, len(points.row)))
-    if wrong[start] < 2 * FEWEST:
-        yield from _read_otherwise(problem, rest, whole, f"from about row {problem.data.label[rest.row[0]]} on")
-    else:
-        yield from _read_otherwise(problem, points.take(np.flatnonzero(far)), whole)
+    some, least, where = points.take(np.flatnonzero(~own)), 2 * FEWEST, ""  # scattered rows were chosen by their errors
+    if wrong[start] < 2 * FEWEST and own[start:].mean() < 1 - MOSTLY:
+        some, least = points.take(np.arange(start, len(own))), FEWEST
+        where = f"from about row {problem.data.label[some.row[0]]} on"
+    several = 2 * len(np.unique(some.y, axis=0)) > len(some.row)  # any model fits one point many times
+    if len(some.row) >= least and several and misfit(some) >= FAR * near / extent:
+        better = better_reading(problem.on(problem.data.take(some.row)), whole=False)
+        if better is not None:
+            labels = [problem.data.label[i] for i in some.row]
+            yield f"{where or _rows(labels, 'fits otherwise:', 'fit otherwise:')} {better.sentence}"
+            return
+    if not points.lengths and points.turns is None:
+        yield from _turned_joint(
+            problem, points.take(np.flatnonzero(~own)), fit, FAR * float(np.median(fit.error[own]))
+        )
 
 
-def _read_otherwise(problem: CalibrationProblem, some: Points, whole: float, where: str = "") -> Iterator[str]:
-    """Report another interpretation of some rows that do not fit as stated either, much better than ``whole``."""
-    least = FEWEST if where else 2 * FEWEST  # scattered rows were chosen by their errors
-    if len(some.row) < least or misfit(some) < BETTER * whole:
+def _turned_joint(problem: CalibrationProblem, out: Points, fit: Fit, limit: float) -> Iterator[str]:
+    """Report rows beyond a limit [m] of a fit to the others that another value of one joint explains."""
+    if len(out.row) < FEW:
         return
-    better = better_reading(problem.on(problem.data.take(some.row)))
-    if better is not None:
-        labels = [problem.data.label[i] for i in some.row]
-        yield f"{where or _rows(labels, 'fits otherwise:', 'fit otherwise:')} {better.sentence}"
+    away = np.linalg.norm(out.y - _modelled(out, fit), axis=1)
+    # a joint reaches a random error of size E to within the limit with probability 1 - sqrt(1 - (limit / E)^2)
+    reached = float(np.mean(1 - np.sqrt(1 - np.minimum(limit / away, 1) ** 2)))
+    best = max(FEW, len(out.row) / 2) - 1
+    said = ""
+    for i in np.flatnonzero(np.array(out.robot.joint_types) == "revolute"):
+        q = _values_that_fit(out, int(i), fit)
+        explained = np.linalg.norm(out.y - _modelled(replace(out, q=q), fit), axis=1) < limit
+        chance = bdtrc(explained.sum() - 1, len(explained), reached) * out.robot.dof
+        if explained.sum() > best and chance < UNLIKELY:
+            best = explained.sum()
+            named = _rows([problem.data.label[row] for row in out.row[explained]], "has", "have")
+            off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))
+            by = f"{off.min():.1f} to {off.max():.1f} deg"
+            said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct column q{i + 1}"
+    if said:
+        yield f"{said}, or leave them out ([exclude])."
+
+
+def _modelled(points: Points, fit: Fit) -> Array:
+    """Return where points (N, 3) are by the nominal robot and a fit [m]."""
+    return transformed(fit.base @ forward_kinematics(points.robot, points.q), fit.tools[points.marker])
 
 
 def _places(count: int, most: int = PLACES) -> list[int]:
@@ -1121,7 +1128,7 @@ def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
     points = points_of(problem)
     part = None if points is None else points.take(np.isin(points.row, rows))
     if part is not None and len(part.row) >= FEWEST and misfit(part) * part.extent < EXACT:
-        return f"{what} and agree with the nominal robot: were they computed, not measured? Leave them out ([exclude])."
+        return f"{what} and agree with the nominal robot: {COMPUTED}"
     return (
         f"{what}: are they of another arm, tool or load, or were their joint values computed for another configuration "
         "of wrist or elbow? Calibrate the two groups separately, or leave one out ([exclude])."
@@ -1247,6 +1254,11 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
         said = "angles of the instrument at the origin are wrong by up to {} mrad (index and eccentricity of circles)"
         of_circles = "measure in both faces, and have it checked"
         yield Addition(circles, lambda c: (said.format(three_digits(1e3 * np.abs(c).max())), of_circles))
+        middle = y - np.mean(y, axis=0)
+        cubic = np.sum(of_axis * middle * np.sum(middle**2, axis=1, keepdims=True), axis=1)
+        lens = "calibrate its lens or its refraction, or measure nearer to its axis"
+        distorted = "measured positions are distorted with the cube of their distance from their middle"
+        yield Addition(cubic[:, None], lambda c: (distorted, lens))
     for i, j in combinations_with_replacement(range(3 * bool(y.any())), 2):
         what = (f"column {'xyz'[i]} is", "check its scale")
         if i != j:

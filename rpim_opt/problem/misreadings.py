@@ -20,7 +20,7 @@ from rpim_opt.data.measurements.position import from_elevation, from_zenith
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import proper, transforms
-from rpim_opt.problem.registration.global_start import QUARTER, WRITE, JointMapping, explained, search
+from rpim_opt.problem.registration.global_start import QUARTER, UNEXPLAINED, WRITE, JointMapping, explained, search
 from rpim_opt.problem.registration.points import Points, fit_points, lengths_of, mirrored, misfit, misfits, points_of
 from rpim_opt.robot.formats.tables import read_robot
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
@@ -233,6 +233,13 @@ def _of_positions() -> Iterator[Misreading]:
         turned = side * np.sign(ahead @ np.linalg.svd(ahead)[2][:1].T)  # beyond 90 degrees the azimuth turns round
         return replace(points, y=turned * np.hstack([ahead * points.y[:, 2:], level]))
 
+    def from_other_angle(points: Points) -> Points:
+        distance = np.linalg.norm(points.y, axis=1)
+        x, y, z = points.y.T
+        polar = np.column_stack([np.arcsin(z / np.maximum(distance, 1e-12)), np.arctan2(y, x), distance])
+        return replace(points, y=from_elevation(polar))
+
+    yield Misreading("azimuths and elevations exchanged", "exchange the names of these columns", from_other_angle)
     for side in (1.0, -1.0):
         remedy = "name the column zenith_deg in place of elevation_deg, or vice versa"
         what = "elevations and zenith angles exchanged"
@@ -250,10 +257,10 @@ def _of_poses() -> Iterator[Misreading]:
     def turned(what: str, remedy: str, change: Callable[[Any], Array]) -> Misreading:
         return Misreading(what, remedy, lambda points: replace(points, turns=change(points.turns)))
 
-    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: float = 1.0) -> Callable[[Array], Array]:
+    def euler(axes: str, columns: Sequence[int] = (0, 1, 2), factor: Any = 1.0) -> Callable[[Array], Array]:
         # angles rx, ry, rz, taken for roll, pitch, yaw, are about other axes or in another unit
         def change(turns: Array) -> Array:
-            angles = factor * Rotation.from_matrix(turns).as_euler("xyz")
+            angles = Rotation.from_matrix(turns).as_euler("xyz") * factor
             return np.asarray(Rotation.from_euler(axes, angles[:, list(columns)]).as_matrix())
 
         return change
@@ -284,6 +291,9 @@ def _of_poses() -> Iterator[Misreading]:
                 yield turned(what, stated, euler(axes, ["xyz".index(axis) for axis in order]))
             if order != "xyz":  # KUKA's A, B, C for instance
                 yield turned(f"{what}, columns in this order", remedy, euler(axes))
+    for sign in list(product((1.0, -1.0), repeat=3))[1:]:
+        named = joined([name for name, each in zip(("rx", "ry", "rz"), sign, strict=True) if each < 0])
+        yield turned(f"Euler angles with the other sign of {named}", "change it", euler("xyz", factor=sign))
     for factor, unit in ((180 / np.pi, "radians"), (0.9, "gon")):
         yield turned(f"Euler angles in {unit}", "convert them to degrees", euler("xyz", factor=factor))
     yield turned("rotation vectors in radians", "convert them to degrees", in_degrees)
@@ -377,14 +387,15 @@ def _factors(points: Points) -> Iterator[Misreading]:
 
 
 def _orders(points: Points) -> Iterator[Misreading]:
-    """Yield all orders of up to six turning joints; of more, those with one elsewhere, as ABB's seventh is third."""
+    """Yield all orders of up to six turning joints; of more, the reverse, and one moved, as ABB's seventh is third."""
     robot = points.robot
     joints = list(range(robot.dof))
     if len(set(robot.joint_dimensions)) > 1:
         return
     orders = permutations(joints)
     if robot.dof > 6:
-        orders = (tuple(np.insert(np.delete(joints, i), place, i).tolist()) for i, place in permutations(joints, 2))
+        moved = (tuple(np.insert(np.delete(joints, i), place, i).tolist()) for i, place in permutations(joints, 2))
+        orders = (tuple(joints[::-1]), *moved)
     for columns in orders:  # the columns that hold joints 1, 2, ...
         names = ", ".join(f"q{columns.index(i) + 1}" for i in range(robot.dof))
 
@@ -429,25 +440,25 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
 # Which of these fits
 
 
-def better_reading(problem: CalibrationProblem) -> Better | None:
+def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | None:
     """Return the interpretation that fits far better than the table as written, or None.
 
     Single mistakes are tried first, then a second and a third one behind the best of them; where the nominal model
-    cannot be right, all orders of up to six joints, and the ready robots. Base or anchor and reflectors are fitted anew
-    for every reading.
+    cannot be right, all orders of up to six joints, and the ready robots, which no part of a ``whole`` table has for
+    itself. Base or anchor and reflectors are fitted anew for every reading.
     """
     points = points_of(problem) or lengths_of(problem)
     if points is None:
         return None
     mapping = None if explained(points) else search(points, problem)
-    if mapping is not None:
+    if mapping is not None and mapping.left <= UNEXPLAINED * points.extent:
         return _of_mapping(mapping)
     # with zeros fitted, as of every other reading, unless they only fit what is wrong with some rows
     present = min(float(misfits([points])[0]), misfit(points))
     if not np.isfinite(present):
         return None
     chain, left = _mistakes(points, present)
-    if present > WRONG and not points.seen:
+    if present > WRONG and not points.seen and whole:
         for further in ((_factors, _other_robots), (_orders,)):
             if left < BETTER * present:
                 break
@@ -457,12 +468,16 @@ def better_reading(problem: CalibrationProblem) -> Better | None:
                 second, size = _best(changed, _readings(changed))
                 if size < BETTER * present:
                     chain, left = [*chain, *second], size
-    if left < BETTER * present and (left <= LEFT or points.seen) and _is_no_chance(points, len(chain), left / present):
+    fits = left < BETTER * present and (left <= LEFT or points.seen)
+    fits = fits and _is_no_chance(points, len(chain), left / present)
+    if mapping is not None and not (fits and left * points.extent < mapping.left):
+        return _of_mapping(mapping)
+    if fits:
         return _told(points, chain, present, left)
-    if points.seen:
+    if points.seen or not whole:
         return None
     behind = _mapping_behind(points) if present > WRONG and not points.lengths else None
-    return behind or _sibling(points)
+    return behind or sibling(problem)
 
 
 def _is_no_chance(points: Points, mistakes: int, left: float) -> bool:
@@ -505,11 +520,9 @@ def _mapping_behind(points: Points) -> Better | None:
 
 def sibling(problem: CalibrationProblem) -> Better | None:
     """Return the ready robot of nearly the same parameters that fits far better, a UR10e for a UR10; or None."""
-    points = points_of(problem)
-    return None if points is None or points.seen else _sibling(points)
-
-
-def _sibling(points: Points) -> Better | None:
+    points = points_of(problem) or lengths_of(problem)
+    if points is None or points.seen:
+        return None
     own = misfit(points)
     for each in _other_robots(points):
         other = each.change(points)

@@ -170,6 +170,15 @@ def moved_otherwise(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     return changed
 
 
+def angles_exchanged(y: np.ndarray) -> np.ndarray:
+    """Compute positions, seen from 1.5 m away, with azimuths as elevations."""
+    ahead = y + np.array([1.5, 0.0, 0.0])
+    distance = np.linalg.norm(ahead, axis=1)
+    azimuth, elevation = np.arctan2(ahead[:, 1], ahead[:, 0]), np.arcsin(ahead[:, 2] / distance)
+    level = np.cos(azimuth) * distance
+    return np.column_stack([level * np.cos(elevation), level * np.sin(elevation), np.sin(azimuth) * distance])
+
+
 def dh_table(change: Callable[[np.ndarray], np.ndarray]) -> Change:
     """Write another DH table (n, 5)."""
 
@@ -286,6 +295,11 @@ IN_TABLES: dict[str, tuple[Change, str]] = {
     "joint 5 stood still": (
         moved_otherwise(lambda q: q * (1, 1, 1, 1, 0, *[1] * (q.shape[-1] - 5))),
         "joint 5 standing",
+    ),
+    "azimuths and elevations exchanged": (values(lambda y: angles_exchanged(y)), "azimuths and elevations exchanged"),
+    "a lens": (
+        values(lambda y: y + 0.02 * (y - y.mean(axis=0)) * np.sum((y - y.mean(axis=0)) ** 2, axis=1, keepdims=True)),
+        "with the cube of their distance",
     ),
     "the reflector on link 4": (
         moved_otherwise(lambda q: q * (np.arange(q.shape[-1]) < 4)),
@@ -424,7 +438,7 @@ IN_TABLES |= {
         of_joint_rows(
             lambda q: q + np.pi * np.outer(np.arange(len(q)) % 3 == 1, np.arange(q.shape[1]) == q.shape[1] - 1)
         ),
-        "of the first; name each row's reflector in a column `marker`, or correct joint ",
+        "the reflector of every row in a column `marker` of the raw table (rpim-opt new), or correct joint ",
     ),
 }
 ROBOTS = ("ur5e", "irb120", "iiwa7")

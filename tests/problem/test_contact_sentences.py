@@ -10,7 +10,7 @@ import pytest
 import rpim_opt as ro
 from rpim_opt.problem.diagnosis import (
     contact_sentences,
-    moved_far,
+    other_places,
     rounded,
     rows_without_values,
     shared_rows,
@@ -57,9 +57,9 @@ def test_rows_of_the_validation_set_that_are_copies_are_named() -> None:
 def test_where_no_points_are_measured_nothing_is_suspected() -> None:
     distance = ro.load("distance").problem
     assert list(rounded(distance, 1e-3)) == []
-    assert list(moved_far(distance)) == []
+    assert list(other_places(distance)) == []
     few = simulated(("theta2",), 8)[0]
-    assert list(moved_far(few)) == []
+    assert list(other_places(few)) == []
 
 
 def test_rounded_values_are_named_where_that_explains_the_fit() -> None:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import inspect, moved_far, odd_column
+from rpim_opt.problem.diagnosis import inspect, odd_column, other_places
 from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
@@ -59,11 +59,10 @@ def test_a_ready_robot_of_nearly_the_same_drawing_is_named() -> None:
 
 def test_the_row_from_which_on_the_base_stood_elsewhere_is_named() -> None:
     """Not where all rows scatter, and no part of the table fits better than the whole."""
-    (said,) = moved_far(changed("position", y=lambda y: y + 0.05 * (np.arange(len(y)) >= 20)[:, None]))
+    (said,) = other_places(changed("position", y=lambda y: y + 0.05 * (np.arange(len(y)) >= 20)[:, None]))
     assert said.startswith("from about row c20 on the points fit another base")
-    assert (
-        list(moved_far(changed("position", y=lambda y: y + np.random.default_rng(1).normal(0.0, 0.05, y.shape)))) == []
-    )
+    scattered = changed("position", y=lambda y: y + np.random.default_rng(1).normal(0.0, 0.05, y.shape))
+    assert list(other_places(scattered)) == []
 
 
 def test_rows_that_stand_out_are_named() -> None:

@@ -31,6 +31,10 @@ FULL_WEIGHT = 3.0
 UNEXPLAINED = 0.01
 """Nominal errors beyond this part of the points' extent (0.3 % of a robot's reach) are not those of a robot."""
 LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
+DRAWS, BEST_DRAWS, LEAST_SHARE = 400, 20, 1 / 3
+"""Few rows that are fitted to find those that agree, how many of these are refined, and the share that has to agree."""
+FAR = 5.0
+"""A row is in question from so many medians of the errors on, or robust standard deviations above their median."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -218,6 +222,52 @@ def fit_points(points: Points) -> Fit:
     every = 1 if points.turns is None else 4
     of_points = {name: getattr(fit, name)[0, ::every] for name in ("modelled", "error", "tools")}
     return Fit(*(each[0] for each in fit))._replace(**of_points)
+
+
+@lru_cache(maxsize=4)
+def agreeing(points: Points) -> tuple[np.ndarray, Fit]:
+    """Return which rows (N,) agree with one base and one place of each reflector, and the fit to them, of all rows.
+
+    Least trimmed squares for the nominal robot: few rows at random, or next to each other, are fitted, then twice the
+    third of the rows that the best such fits are nearest to, and last all rows that are as near as these. It finds a
+    third of the rows wherever they are, and whatever is wrong with the others.
+    """
+    N = len(points.row)
+    size = min(4 + len(points.tools) + 4 * points.lengths, N)
+    most = max(int(np.ceil(LEAST_SHARE * N)), min(2 * size, N))  # so many that base and reflectors cannot fit any
+    rng = np.random.default_rng(0)
+    drawn = rng.permuted(np.tile(np.arange(N), (DRAWS // 2, 1)), axis=1)[:, :size]
+    sets = np.vstack([drawn, rng.integers(0, N - size + 1, (DRAWS // 2, 1)) + np.arange(size)])
+    for _ in range(3):
+        error = _fits_of_all(points, sets).error
+        nearest = np.argsort(error, axis=1)[:, :most]
+        squares = np.sum(np.take_along_axis(error, nearest, axis=1) ** 2, axis=1)
+        sets = nearest[np.argsort(squares)[:BEST_DRAWS]]
+    own = np.isin(np.arange(N), sets[0])
+    fits = _fits_of_all(points, sets[:1])
+    for _ in range(STEPS):
+        before, own = own, fits.error[0] < FAR * np.median(fits.error[0, own])
+        if np.array_equal(own, before):
+            break
+        fits = _fits_of_all(points, np.flatnonzero(own)[None])
+    return own, Fit(*(each[0] for each in fits))
+
+
+def _fits_of_all(points: Points, sets: np.ndarray) -> Fit:
+    """Return the fits to each set (B, K) of rows, with what they say of all rows; errors of poses with their tips."""
+    fits = fit_arms(Candidates.of([points.take(each) for each in sets]), STEPS)
+    every = Candidates.of([points])
+    turn, p, _, _ = _flange(every.robot, every.q)
+    tau = np.moveaxis(fits.tools[:, every.marker[0]], -1, 0)
+    there = p + turn[0] * tau[0] + turn[1] * tau[1] + turn[2] * tau[2]
+    modelled = np.einsum("bij,jbn->bni", fits.base[:, :3, :3], there) + fits.base[:, None, :3, 3]
+    if points.lengths:
+        away = modelled if points.q.shape[1] == 1 else modelled[:, 1::2] - modelled[:, ::2]
+        modelled = np.linalg.norm(away, axis=2, keepdims=True) + fits.offset[:, None, None]
+    error = np.linalg.norm(every.y - modelled, axis=2).reshape(len(sets), len(points.row), -1)
+    tips = error.shape[2]
+    size = np.sqrt(np.mean(error**2, axis=2))
+    return fits._replace(modelled=modelled[:, ::tips], error=size, tools=fits.tools[:, ::tips])
 
 
 def misfit(points: Points) -> float:
