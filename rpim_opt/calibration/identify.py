@@ -90,8 +90,8 @@ def calibrate(
         Loss, penalty and constraints, or the name of a ready one (``"robust"``); its functions are called anew.
     weight
         None or ``"learned"``: hyperparameters are estimated. A number, or a selection rule (or its name) over the
-        stated scales, which sees identification data only; it is asked anew until the steps become small, then the
-        weight stays. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
+        stated scales, which sees identification data only; it is asked again at the solution, and the weight stays
+        where it answers the same. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
     prior
         Of the deviations, beyond the scales of the parameters.
     model
@@ -111,7 +111,8 @@ def calibrate(
     progress
         Called after every iteration, which the logger ``rpim_opt`` reports at level INFO, too.
     solver, settings, verbose
-        Any installed solver of CVXPY, with its options (`Program.solve`).
+        Any installed solver of CVXPY, with its options (`Program.solve`), for the steps of the calibration; rules and
+        hyperparameters solve as without.
 
     Raises
     ------

@@ -93,7 +93,8 @@ class Options:
 class WeightChoice:
     """The weight of an iteration, and how it was chosen.
 
-    A rule is applied at every point (`updated`) until steps are short: then its weight is settled. At rest it is
+    A rule is applied (`updated`) at every point until steps are short where solutions have a formula, once where they
+    have none, and of robust losses only near the solution at weight 1: then its weight is settled. At rest it is
     applied once more (`confirmed`), and the weight is final if that is the same, else the loop goes on with the other.
 
     ``rule`` is None for a number; ``weights`` are all that it chose in turn, ``selection`` the last one.

@@ -452,13 +452,13 @@ class Program(Brief):
         except Unsolved as error:
             status = STATUS.get(str(error), str(error))
             return self._by_cvxpy(weight, damping, cp.CLARABEL, {}, False, status)
-        penalty, loss = self.structure.canonical, self.structure.loss
-        z = optimum.x[penalty.at]
+        canonical, loss = self.structure.canonical, self.structure.loss
+        z = optimum.x[canonical.at]
         # half: the projection by which `violation` judges the point is no more exact
-        if self.structure.constrained and not self.structure.joint and penalty.missed(optimum.x) > 0.5 * FEASIBLE:
+        if self.structure.constrained and not self.structure.joint and canonical.missed(optimum.x) > 0.5 * FEASIBLE:
             z = self.nearest(z)
         if self.structure.joint and loss is not None and optimum.rest is not None:  # own variables as they are there
-            values = loss.canonical.value(optimum.rest) + self.model.offset, penalty.value(optimum.x)
+            values = loss.canonical.value(optimum.rest) + self.model.offset, canonical.value(optimum.x)
             self._values[z.tobytes(), weight] = values
         return self._at(z, weight, partial(self._duals, optimum), optimum.iterations)
 

@@ -1,4 +1,4 @@
-"""Robust losses as weighted least squares (IRLS): over inlier configurations, or over all rows in blocks."""
+"""The squares that a robust fit amounts to, for rules, covariances and blocks; `solvers.separable` solves it."""
 
 from __future__ import annotations
 

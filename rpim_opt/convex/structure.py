@@ -5,7 +5,8 @@ returned before, the structure of that serves again. Besides these a loss is cal
 values or slopes are needed at numbers: for blocks of rows, for what a robust loss keeps, for a loss of a QR factor.
 
 CVXPY canonicalizes penalty and constraints once for a `Structure` (`canonical`), a loss once where Clarabel takes all
-of its rows (`Loss.canonical`), and some entries of a nonsmooth loss anew for every working set (`Loss.some`).
+of its rows (`Loss.canonical`), and some entries of a nonsmooth loss anew for every working set (`Loss.some`); besides,
+a quadratic of a user's is recognized by a canonical form, and the last resort (`Program.solve`) is canonicalized anew.
 Programs keep their structure, and `MOST_KEPT` are kept for the next ones, then all are forgotten. Warm starts and
 Clarabel's solvers live as long as the programs that `Program.on` makes of one another.
 """
