@@ -545,7 +545,7 @@ def _unit(values: Array, *steps: float) -> Array:
     """
     size = np.abs(values)
     decimals = decimals_of(values)
-    written = 0.0 if decimals is None else 0.5 * 10.0**-decimals
+    written = 0.5 * 10.0 ** -(MOST_DECIMALS if decimals is None else decimals)
     binary = 2.0 ** (np.floor(np.log2(np.maximum(size, ON_GRID))) - 10)
     digits = 10.0 ** (np.floor(np.log10(np.maximum(size, 1.0))) - 2)
     grids = [np.full(values.shape, step) for step in steps if step]
