@@ -791,7 +791,7 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
     near, extent = rms(fit.error[own]), points.take(np.flatnonzero(own)).extent
     if near >= min(BETTER * rms(fit.error), WRONG * extent):
         return
-    wrong = np.append(0, np.cumsum(~own))
+    wrong = np.cumsum(~own) - ~own  # before each row
     start = int(np.argmin(2 * wrong - np.arange(len(wrong))))  # fewest rows that are on the wrong side of it
     some, least, where = points.take(np.flatnonzero(~own)), 2 * FEWEST, ""  # scattered rows were chosen by their errors
     if wrong[start] < 2 * FEWEST and own[start:].mean() < 1 - MOSTLY:

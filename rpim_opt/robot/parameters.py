@@ -144,6 +144,12 @@ class Parameters(Tabled):
     own_frames: tuple[str, ...] = ()
     terms: tuple[str, ...] = ()
 
+    def __post_init__(self) -> None:
+        for key in ("dimensions", "nominal", "scale", "tolerance", "identified"):
+            count = len(getattr(self, key))
+            if count != len(self.names):
+                raise InputError(f"parameters, {key}", f"{count} entries", f"{len(self.names)}, one for each name")
+
     def _short(self) -> str:
         shown = ", ".join([*self.names[:SHOWN], "..."] if len(self) > SHOWN else self.names)
         return f"{shown}: {np.count_nonzero(self.identified)} of {len(self)} identified"
