@@ -61,6 +61,7 @@ SEVERAL = 0.85  # several joint zeros moved, if that leaves less than this part 
 LOOSE = 1e-3  # backlash of a joint [rad, m] that no gear in order has: a tenth of that is usual
 FLAT_TURN = 0.05
 """Part of their distance by which two places of a reflector differ in height and radius, if a joint turned it."""
+ANOTHER = 0.01  # joint movement [rad, m] after which no point is measured again to the last digit
 FILLED = 1e-3  # a point that is at least so far from the one before [m] is another one
 COPIES = 0.2  # part of the rows that may repeat others
 MOST_ROUNDS = 20  # of fitting one joint's values
@@ -412,7 +413,7 @@ def copied_rows(data: Dataset) -> Iterator[str]:
 
 
 def filled_rows(data: Dataset) -> Iterator[str]:
-    """Report rows that were not measured, but filled in: means of their neighbours, or joint values of the row before.
+    """Report rows that were filled in: means of their neighbours, joint values or the measured point of the row before.
 
     The data are in the order of the table.
     """
@@ -446,6 +447,13 @@ def filled_rows(data: Dataset) -> Iterator[str]:
                 cause = "are they of several reflectors? Name each row's reflector in a column `marker`."
             which = _rows(labels[1:][again].tolist(), "has", "have")
             yield f"{which} the joint values of the row before at another point: {cause}"
+        frozen = (moves == 0) & (np.abs(np.diff(q, axis=0)).max(axis=1) > ANOTHER) & (np.ptp(y[1:], axis=1) > 0)
+        if np.count_nonzero(frozen) >= FEW:
+            which = _rows(labels[1:][frozen].tolist(), "has", "have")
+            yield (
+                f"{which} the measured point of the row before at other joint values: the reading was not updated; "
+                "leave such rows out ([exclude])."
+            )
 
 
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:

@@ -444,6 +444,13 @@ def interpolated(y: np.ndarray, rows: np.ndarray) -> np.ndarray:
     return y
 
 
+def frozen(y: np.ndarray, rows: np.ndarray) -> np.ndarray:
+    """Return measured values (N, c) of which some rows are those of the row before the first of them."""
+    y = y.copy()
+    y[rows] = y[rows[0] - 1]
+    return y
+
+
 def repeated(q: np.ndarray, rows: np.ndarray) -> np.ndarray:
     q[rows] = q[rows - 1]
     return q
@@ -461,6 +468,11 @@ def repeated(q: np.ndarray, rows: np.ndarray) -> np.ndarray:
             lambda rows: joints(lambda q: repeated(q, rows)),
             [5, 17, 29],
             "rows P6, P18, P30 have the joint values of the",
+        ),
+        (
+            lambda rows: values(lambda y: frozen(y, rows)),
+            [20, 21, 22, 23],
+            "rows P21, P22, P23, P24 have the measured point of the row before at other joint values",
         ),
     ],
 )
