@@ -737,20 +737,11 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
     points = points_of(problem) or lengths_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
-    whole = rms(agreeing(points)[1].error)
-    parts: list[tuple[np.ndarray, Fit]] = []
-    rest = np.arange(len(points.row))
-    while whole >= FAR_MOVED * points.extent and len(rest) >= FEWEST:
-        own, fit = agreeing(points.take(rest))
-        part = rest[own]
-        if len(part) < FEWEST or rms(fit.error[own]) >= min(BETTER * whole, WRONG * points.take(part).extent):
-            break
-        parts.append((part, fit))
-        rest = rest[~own]
-        if rms(fit.error[own]) < EXACT:
-            labels = [problem.data.label[i] for i in points.row[part]]
-            yield f"{_rows(labels, 'agrees', 'agree')} with the nominal robot: {COMPUTED}"
-            return
+    parts, rest, exact = _stations(points)
+    if exact:
+        labels = [problem.data.label[i] for i in points.row[parts[-1][0]]]
+        yield f"{_rows(labels, 'agrees', 'agree')} with the nominal robot: {COMPUTED}"
+        return
     if len(parts) < 2 or len(rest) > len(points.row) / OUTLYING:
         return
     in_turn = all(len(part) > MOSTLY * (np.ptp(part) + 1) for part, _ in parts)
@@ -763,6 +754,23 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
         other, joint = _other_place(points, first, fit)
         if in_turn or joint != 1:  # no base moves to and fro about the first axis
             yield f"{where} another {other}."
+
+
+def _stations(points: Points) -> tuple[list[tuple[np.ndarray, Fit]], np.ndarray, bool]:
+    """Return groups of rows that agree among themselves, the rest, and whether the last group was computed."""
+    whole = rms(agreeing(points)[1].error)
+    parts: list[tuple[np.ndarray, Fit]] = []
+    rest = np.arange(len(points.row))
+    while whole >= FAR_MOVED * points.extent and len(rest) >= FEWEST:
+        own, fit = agreeing(points.take(rest))
+        part = rest[own]
+        if len(part) < FEWEST or rms(fit.error[own]) >= min(BETTER * whole, WRONG * points.take(part).extent):
+            break
+        parts.append((part, fit))
+        rest = rest[~own]
+        if rms(fit.error[own]) < EXACT:
+            return parts, rest, True
+    return parts, rest, False
 
 
 def _other_place(points: Points, first: Fit, second: Fit) -> tuple[str, int | None]:

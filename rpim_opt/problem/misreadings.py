@@ -459,15 +459,7 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
         return None
     chain, left = _mistakes(points, present)
     if present > WRONG and not points.seen and whole:
-        for further in ((_factors, _other_robots), (_orders,)):
-            if left < BETTER * present:
-                break
-            chain, left = _best(points, [each for readings in further for each in readings(points)])
-            if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
-                changed = chain[0].change(points)
-                second, size = _best(changed, _readings(changed))
-                if size < BETTER * present:
-                    chain, left = [*chain, *second], size
+        chain, left = _orders_and_robots(points, present, chain, left)
     fits = left < BETTER * present and (left <= LEFT or points.seen)
     fits = fits and _is_no_chance(points, len(chain), left / present)
     if mapping is not None and not (fits and left * points.extent < mapping.left):
@@ -478,6 +470,22 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
         return None
     behind = _mapping_behind(points) if present > WRONG and not points.lengths else None
     return behind or sibling(problem)
+
+
+def _orders_and_robots(
+    points: Points, present: float, chain: list[Misreading], left: float
+) -> tuple[list[Misreading], float]:
+    """Return the best of factors and other robots, then of orders of the joints, where a chain leaves too much."""
+    for further in ((_factors, _other_robots), (_orders,)):
+        if left < BETTER * present:
+            break
+        chain, left = _best(points, [each for readings in further for each in readings(points)])
+        if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
+            changed = chain[0].change(points)
+            second, size = _best(changed, _readings(changed))
+            if size < BETTER * present:
+                chain, left = [*chain, *second], size
+    return chain, left
 
 
 def _is_no_chance(points: Points, mistakes: int, left: float) -> bool:

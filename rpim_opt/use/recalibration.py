@@ -249,12 +249,7 @@ def update(
             released += cause.members
         start = updated.x
     if not after.likely:
-        refuse_misread(result, data)
-        furthest, missed = float(np.nanmax(result.nominal_errors())), rms(updated.errors(data))
-        if missed > STRANGE * furthest:
-            same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
-            found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
-            raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
+        _require_same_robot(result, updated, data)
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
@@ -262,13 +257,30 @@ def update(
         prior_inflation, released, left_out,
     )  # fmt: skip
     held_out = None if released else result.record.validation  # which was measured before a change
-    rows = {"new": updated.problem.data, "held-out": held_out}
-    errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
-    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
-    figures = {name: each for name, each in figures.items() if each["after"]["count"]}
+    figures = _errors(result, updated, held_out)
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere)
+
+
+def _require_same_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
+    """Refuse new measurements that are read otherwise than those of the result, or are of another robot."""
+    refuse_misread(result, data)
+    furthest, missed = float(np.nanmax(result.nominal_errors())), rms(updated.errors(data))
+    if missed > STRANGE * furthest:
+        same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
+        found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
+        raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
+
+
+def _errors(
+    result: Calibration, updated: Calibration, held_out: Dataset | None
+) -> dict[str, dict[str, dict[str, Any]]]:
+    """Return statistics of the errors before and after on new and on held-out rows, where they have lengths."""
+    rows = {"new": updated.problem.data, "held-out": held_out}
+    errors = {name: {"before": result.errors(of), "after": updated.errors(of)} for name, of in rows.items() if of}
+    figures = {name: {when: statistics(of) for when, of in each.items()} for name, each in errors.items()}
+    return {name: each for name, each in figures.items() if each["after"]["count"]}
 
 
 def _robots(result: Calibration) -> str:
