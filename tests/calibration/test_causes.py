@@ -283,7 +283,9 @@ def test_rows_behind_an_instrument_that_froze_are_not_read_otherwise() -> None:
     wrong = values(lambda y: np.where(frozen[:, None], y[30], y))(simulated_arm("fr3", count=80))
     causes = likely_causes(ro.calibrate(wrong))
     assert not any("from about row" in text for text in causes), causes
-    assert any("more have the measured point of the row before at other joint values" in text for text in causes), causes
+    assert any("more have the measured point of the row before at other joint values" in text for text in causes), (
+        causes
+    )
 
 
 def test_held_out_rows_are_elsewhere_only_if_the_others_are_not() -> None:
