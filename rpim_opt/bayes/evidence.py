@@ -239,7 +239,7 @@ class Point:
             diagonals, rows = np.zeros((p, q)), []
             for part, XC in zip(self.parts, self._by_noise[3], strict=True):
                 H = (XC.reshape(-1, p) @ X.T).reshape(*part.y.shape, -1)
-                rows.append((part.noise @ H).reshape(q, part.y.size, -1))
+                rows.append((part.noise @ H).reshape(q, part.y.size, len(X)))
                 diagonals += np.einsum("ankp,nkp->pa", part.noise @ XC, XC)
             M = np.concatenate(rows, axis=1)
             return np.einsum("aij,bji->ab", M, M), diagonals

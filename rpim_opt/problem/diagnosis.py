@@ -556,7 +556,7 @@ def _unit(values: Array, *steps: float) -> Array:
     written = 0.5 * 10.0 ** -(MOST_DECIMALS if decimals is None else decimals)
     binary = 2.0 ** (np.floor(np.log2(np.maximum(size, ON_GRID))) - 10)
     digits = 10.0 ** (np.floor(np.log10(np.maximum(size, 1.0))) - 2)
-    grids = [np.full(values.shape, step) for step in steps if step]
+    grids = [np.full(values.shape, step) for step in steps if 0 < step < np.inf]
     for unit, missing in ((binary, written), *((each, 0.0) for each in (*grids, digits, digits / 10))):
         off = np.abs(values - unit * (values / unit).round())
         if missing < np.median(unit) / 8 and (off <= ON_GRID * unit + missing).all():
