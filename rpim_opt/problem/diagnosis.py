@@ -809,7 +809,9 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
         return
     wrong = np.cumsum(~own) - ~own  # before each row
     start = int(np.argmin(2 * wrong - np.arange(len(wrong))))  # fewest rows that are on the wrong side of it
-    some, least, where = points.take(np.flatnonzero(~own)), 2 * FEWEST, ""  # scattered rows were chosen by their errors
+    out = np.flatnonzero(~own)
+    together = len(out) > MOSTLY * (np.ptp(out) + 1) if len(out) else False  # a joint that slipped is seen in residuals
+    some, least, where = points.take(out), 2 * FEWEST, ""  # scattered rows were chosen by their errors
     if wrong[start] < 2 * FEWEST and own[start:].mean() < 1 - MOSTLY:
         some, least = points.take(np.arange(start, len(own))), FEWEST
         where = f"from about row {problem.data.label[some.row[0]]} on"
@@ -820,10 +822,8 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
             labels = [problem.data.label[i] for i in some.row]
             yield f"{where or _rows(labels, 'fits otherwise:', 'fit otherwise:')} {better.sentence}"
             return
-    if not points.lengths and points.turns is None:
-        yield from _turned_joint(
-            problem, points.take(np.flatnonzero(~own)), fit, FAR * float(np.median(fit.error[own]))
-        )
+    if not together and not points.lengths and points.turns is None:
+        yield from _turned_joint(problem, points.take(out), fit, FAR * float(np.median(fit.error[own])))
 
 
 def _turned_joint(problem: CalibrationProblem, out: Points, fit: Fit, limit: float) -> Iterator[str]:
