@@ -245,8 +245,8 @@ class Point:
             return np.einsum("aij,bji->ab", M, M), diagonals
         M = np.zeros((q, p, p))
         for part in self.parts:
-            sizes, U = np.linalg.eigh(part.noise)
-            roots = np.sqrt(np.maximum(sizes, 0.0))[..., None] * U.transpose(0, 1, 3, 2)
+            values, U = np.linalg.eigh(part.noise)
+            roots = np.sqrt(np.maximum(values, 0.0))[..., None] * U.transpose(0, 1, 3, 2)
             for a, root in enumerate(roots):  # products of a matrix with itself take half the time
                 half = (root @ part.X).reshape(-1, p)
                 M[a] += half.T @ half
@@ -381,7 +381,7 @@ class Evidence:
             if not np.array_equal(logs, last.logs):
                 last = self.at(logs.copy(), last)
             if np.linalg.norm(last.gradient) <= accuracy:
-                raise StopIteration
+                raise StopIteration  # SciPy's own test waits for the next step that lowers the value
             return last
 
         for start in starts:

@@ -180,7 +180,8 @@ def select_model(estimator: Estimator, fit: Fit) -> tuple[Fit, tuple[Trial, ...]
 
 def complexity(extensions: Sequence[str]) -> int:
     """Return the complexity of a model: one for all of `CANDIDATES` that it has, one for every other extension."""
-    return len({each if each in FURTHER or each in CONDITIONS else CANDIDATES for each in extensions})
+    others = sum(extension in FURTHER or extension in CONDITIONS for extension in extensions)
+    return others + (len(extensions) > others)
 
 
 def _hyperparameters(evidence: Evidence, point: Point) -> dict[str, float]:

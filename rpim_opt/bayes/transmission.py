@@ -82,7 +82,8 @@ def admitted(
         model = rest.restricted(models.members(extensions))
         best = model.optima(model.starts()[:1])[0]
         penalty = EXTENSION_GAIN * complexity(extensions) + (MOMENTS_GAIN - EXTENSION_GAIN) * (MOMENTS in extensions)
-        penalty = penalty if kept.issubset(extensions) else np.inf
+        if not kept.issubset(extensions):
+            penalty = np.inf
         return Candidate(best.value + penalty, extensions, model, best)
 
     compared = sorted(models.compared(fitted), key=lambda each: each.criterion)

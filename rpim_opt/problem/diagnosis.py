@@ -658,14 +658,22 @@ def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
 
 
 def odd_column(problem: CalibrationProblem) -> Iterator[str]:
-    """Report a joint or coordinate whose values are wrong: with its own value in every row, the others fit.
-
-    Base, reflectors and these values are fitted in turn, those of a joint on a grid that gets narrower. Coordinates
-    without a sign are reported, too.
-    """
+    """Report a joint or coordinate whose values are wrong, else coordinates without a sign."""
     points = points_of(problem)
     if points is None or len(points.row) < 2 * FEWEST:
         return
+    found = list(_odd_values(problem, points))
+    unsigned = [axis for axis, k in zip("xyz", _unsigned(points.y), strict=True) if k]
+    if not found and unsigned:
+        yield f"no value of column {joined(unsigned)} is negative, and some are near zero: were signs lost?"
+    yield from found
+
+
+def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
+    """Report a joint or coordinate whose values are wrong: with its own value in every row, the others fit.
+
+    Base, reflectors and these values are fitted in turn, those of a joint on a grid that gets narrower.
+    """
     points = replace(points, turns=None)
     whole = misfit(points)
     turning = [i for i, kind in enumerate(points.robot.joint_types) if kind == "revolute"]
@@ -678,10 +686,6 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
     left = {column: misfit(each) for column, each in fitted.items()}
     column = min(left, key=left.__getitem__)
     if left[column] >= min(BETTER * whole, WRONG):  # free values take up much of any other mistake
-        low, high = points.y.min(axis=0), points.y.max(axis=0)
-        folded = [axis for axis, k in zip("xyz", (low >= 0) & (low < FOLDED * high), strict=True) if k]
-        if folded:
-            yield f"no value of column {joined(folded)} is negative, and some are near zero: were signs lost?"
         return
     best = fitted[column]
     apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
@@ -694,6 +698,12 @@ def odd_column(problem: CalibrationProblem) -> Iterator[str]:
         f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[column] * points.extent)} mm instead "
         f"of {three_digits(1e3 * whole * points.extent)} mm; check its column."
     )
+
+
+def _unsigned(values: Array) -> np.ndarray:
+    """Return which columns of values (N, k) have none below zero, and some near it."""
+    low, high = values.min(axis=0), values.max(axis=0)
+    return (low >= 0) & (low < FOLDED * high)
 
 
 def _values_that_fit(points: Points, joint: int, known: Fit | None = None) -> Array:
@@ -810,13 +820,18 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
     wrong = np.cumsum(~own) - ~own  # before each row
     start = int(np.argmin(2 * wrong - np.arange(len(wrong))))  # fewest rows that are on the wrong side of it
     out = np.flatnonzero(~own)
-    together = len(out) > MOSTLY * (np.ptp(out) + 1) if len(out) else False  # a joint that slipped is seen in residuals
+    together = len(out) > MOSTLY * (np.ptp(out) + 1)  # a joint that slipped is seen in residuals
     some, least, where = points.take(out), 2 * FEWEST, ""  # scattered rows were chosen by their errors
     if wrong[start] < 2 * FEWEST and own[start:].mean() < 1 - MOSTLY:
         some, least = points.take(np.arange(start, len(own))), FEWEST
         where = f"from about row {problem.data.label[some.row[0]]} on"
     several = 2 * len(np.unique(some.y, axis=0)) > len(some.row)  # any model fits one point many times
     if len(some.row) >= least and several and misfit(some) >= FAR * near / extent:
+        if not (where or together or points.lengths) and (_unsigned(points.q).any() or _unsigned(points.y).any()):
+            odd = list(_odd_values(problem, points))  # of which the rows of one sign fit otherwise, too
+            if odd:
+                yield from odd
+                return
         better = better_reading(problem.on(problem.data.take(some.row)), whole=False)
         if better is not None:
             labels = [problem.data.label[i] for i in some.row]

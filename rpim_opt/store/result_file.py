@@ -66,7 +66,7 @@ def save_result(result: Calibration, path: str | Path) -> None:
     """Write a calibration to one JSON file, or ``result.json`` in a folder, which `load_result` reads.
 
     The file is written completely or not at all. The calibration's record has title, validation data and input files.
-    The file states the verdict: where nobody asked for it before, likely causes of a bad fit are sought first, which
+    The file states the verdict: if it was not computed before, likely causes of a bad fit are sought first, which
     takes seconds. InputError for a `PartitionedProblem`, whose measurements the file cannot repeat.
     """
     if not result.problem.keeps_rows:

@@ -27,7 +27,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.closed_forms import register
+from rpim_opt.problem.registration.closed_forms import register, transformed
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
@@ -43,8 +43,8 @@ EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared w
 LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is said
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
-FIRST = np.diag([1.0, 1, 1, 1e-2, 1e-2, 1e-2])[None]  # weights [m/rad] with which the position comes first
-POSITION = np.diag([1.0, 1, 1, 0, 0, 0])[None]  # what is left of an error where orientations stay as they are
+FIRST = np.array([1, 1, 1, 1e-2, 1e-2, 1e-2])  # weights [m/rad] of an error with which the position comes first
+POSITION = np.array([1.0, 1, 1, 0, 0, 0])  # what is left of an error where orientations stay as they are
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which a pose without a start looks for near ones; how many it tries
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
@@ -256,8 +256,8 @@ def compensate(
     without ``q`` every pose is looked for from several configurations within the limits that come near. ``label`` names
     the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: where the
     standard uncertainty of w is larger (RMS of all rows), as where positions of one reflector hardly determine it, w
-    is instead the turn by which the correction changes the orientation. ``orientation=True`` corrects them all the
-    same, with ``False`` those of targets are ignored.
+    is instead the turn by which the correction changes the orientation, and |w|^2 counts 1e-4 m^2: position comes
+    first. ``orientation=True`` corrects them all the same, with ``False`` those of targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
     frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
@@ -341,11 +341,11 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}
     there = np.concatenate([part.reached[:, :3] for part in parts])
-    errors = np.concatenate([part.before[:, :3] for part in parts])
+    targets_at = there + np.concatenate([(part.before - part.missed)[:, :3] for part in parts])
     if len(there) >= MOVED:
         with suppress(InputError):
-            T = register(there, there + errors)
-            fields["after_motion"] = rms(np.linalg.norm(errors - (there @ T[:3, :3].T + T[:3, 3] - there), axis=1))
+            left = targets_at - transformed(register(there, targets_at), there)
+            fields["after_motion"] = rms(np.linalg.norm(left, axis=1))
     return fields, why
 
 
@@ -544,24 +544,23 @@ class _Cell(NamedTuple):
     def ended(self, begun: _Begun, largest: float, turning: bool) -> dict[str, Array]:
         """Return the fields of a `Compensation` for some targets; without ``turning`` orientations stay as they are."""
         targets, load, commands, target, missed, pose_before, before, J, beside = begun
-        W = attainable(J)
-        reached = self._reached(missed, W)
+        W = counts = attainable(J)
+        reached = self._reached(missed, counts)
         wanted, due = target, np.where(reached[:, None], before - missed, 0.0)
         if not turning:
-            wanted, due, W = np.hstack([target[:, :3], pose_before[:, 3:]]), times(POSITION, due), W @ FIRST
+            wanted, due, W = np.hstack([target[:, :3], pose_before[:, 3:]]), POSITION * due, counts * FIRST
         P = correction_weights(W @ J, times(W, due), largest)
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        cases = {"ok": self._reached(left, attainable(J)), "limited": at_limit, UNREACHABLE: ~reached}
+        cases = {"ok": self._reached(left, counts), "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields["position_before"], fields["orientation_before"] = self.norms(before)
-        fields["position_error"], fields["orientation_error"] = self.norms(
-            self.identified.at(corrected, load, target)[1]
-        )
+        error = left if turning else self.identified.at(corrected, load, target)[1]
+        fields["position_error"], fields["orientation_error"] = self.norms(error)
         fields["std"], fields["orientation_std"] = self.uncertainty(corrected, targets)
         return fields
 

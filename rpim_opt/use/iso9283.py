@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -193,7 +193,29 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     (2.0, 1.0)
     """
     columns = read_raw(Path(source)).columns if isinstance(source, str | Path) else read_columns(source)
-    stated = parse_units(units)
+    pose, attained, commanded = _approach_columns(columns, parse_units(units))
+    angles = next((group for group in ROTATIONS if set(group) <= set(attained)), ())
+
+    def beside(of: Mapping[str, tuple[str, float]], stems: tuple[str, ...]) -> Any:
+        """Return columns side by side (N, 3), or None where the table has none of them."""
+        if not set(stems) & set(of):
+            return None
+        missing = [stem for stem in stems if stem not in of]
+        if missing:
+            raise InputError("the header", f"no column for {listed(missing)}", f"all of {', '.join(stems)}, or none")
+        return np.column_stack([si * numbers(columns[name], name) for name, si in (of[stem] for stem in stems)])
+
+    return iso9283(
+        texts(columns[pose], pose), beside(attained, AXES), beside(commanded, AXES), beside(attained, angles),
+        beside(commanded, angles), angles or ROTATIONS[0],
+    )  # fmt: skip
+
+
+def _approach_columns(
+    columns: Iterable[str], stated: Mapping[str, str]
+) -> tuple[str, dict[str, tuple[str, float]], dict[str, tuple[str, float]]]:
+    """Return the column of poses, and name and unit [SI] of attained and of commanded coordinates and angles."""
+    columns = list(columns)
     poses: dict[str, str] = {}
     figures: dict[str, dict[str, tuple[str, float]]] = {"measured": {}, "wanted": {}}
     for name in columns:
@@ -214,19 +236,5 @@ def read_approaches(source: Any, units: str = "") -> Performance:
     attained, commanded = figures.values()
     pose = poses.get("configuration", poses.get("label"))
     if pose is None or not set(AXES) <= set(attained):
-        raise InputError("the header", listed(list(columns), 6), ACCEPTED)
-    angles = next((group for group in ROTATIONS if set(group) <= set(attained)), ())
-
-    def beside(of: Mapping[str, tuple[str, float]], stems: tuple[str, ...]) -> Any:
-        """Return columns side by side (N, 3), or None where the table has none of them."""
-        if not set(stems) & set(of):
-            return None
-        missing = [stem for stem in stems if stem not in of]
-        if missing:
-            raise InputError("the header", f"no column for {listed(missing)}", f"all of {', '.join(stems)}, or none")
-        return np.column_stack([si * numbers(columns[name], name) for name, si in (of[stem] for stem in stems)])
-
-    return iso9283(
-        texts(columns[pose], pose), beside(attained, AXES), beside(commanded, AXES), beside(attained, angles),
-        beside(commanded, angles), angles or ROTATIONS[0],
-    )  # fmt: skip
+        raise InputError("the header", listed(columns, 6), ACCEPTED)
+    return pose, attained, commanded

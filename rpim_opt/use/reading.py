@@ -74,20 +74,31 @@ def read_targets(
         columns |= dict.fromkeys(absent, [0.0] * len(next(iter(columns.values()))))
         noise = {"position_mm": 1, "orientation_mrad": 1} if oriented else {"position_mm": 1}
         data = read_data(columns, robot, noise, pose if oriented else position)
-        block, *others = data.blocks
-        if others:
-            raise InputError("column marker", "several reflectors", "targets of one")
-        if block.approach is not None:
-            accepted = "none: joints are in the middle of their backlash"
-            raise InputError("column approach1", "directions of approach", accepted)
+        block = _of_targets(data)
     torque = None if block.torque is None else block.torque[:, 0]
     targets = Targets(data.label, data.q if joints else None, block.y if positions else None, torque, block.payload)
+    return targets, _with_orientation(understanding)
+
+
+def _of_targets(data: Dataset) -> Block:
+    """Return the only block of targets; refuse several reflectors, and directions of approach."""
+    block, *others = data.blocks
+    if others:
+        raise InputError("column marker", "several reflectors", "targets of one")
+    if block.approach is not None:
+        accepted = "none: joints are in the middle of their backlash"
+        raise InputError("column approach1", "directions of approach", accepted)
+    return block
+
+
+def _with_orientation(understanding: Understanding) -> Understanding:
+    """Return what was understood with a note on how orientations were read, where there are any."""
     angles = ("rx", "ry", "rz", "qw,")
     turned = [each for table in understanding.tables for each in table.meant if each.name.startswith(angles)]
-    if turned:
-        meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
-        understanding = replace(understanding, notes=(*understanding.notes, f"Orientation of targets: {meant}."))
-    return targets, understanding
+    if not turned:
+        return understanding
+    meant = ", ".join(f"{each.column}: {each.meaning.removeprefix('measured ')}" for each in turned)
+    return replace(understanding, notes=(*understanding.notes, f"Orientation of targets: {meant}."))
 
 
 class Measured(NamedTuple):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -199,20 +199,7 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     lost = next((note for note in raw.notes if "is not a row of the table" in note), "")
     if lost:
         raise InputError("the table", lost.rstrip("."), "one row per joint")
-    columns: dict[str, list[str]] = {}
-    for name, cells in raw.columns.items():
-        texts = [str(cell) for cell in cells]
-        stem, unit = _stem(name.partition(" #")[0])
-        if stem in JOINT_NAMES or not any(texts) or all(map(JOINT_NAME.fullmatch, texts)):
-            continue
-        if stem in ANGLES and not unit and any("°" in text for text in texts):
-            unit = "deg"
-        if stem == "limits":
-            raise InputError("the header", f"both limits in a column, '{name}'", "columns lower [deg] and upper [deg]")
-        key = stem + (f"_{unit}" if unit else "")
-        if key in columns:
-            raise InputError("the header", ", ".join(raw.columns), "every column once")
-        columns[key] = texts
+    columns = _sheet_columns(raw.columns)
     conventions = {convention, *(cell.lower() for cell in columns.pop("convention", []))} - {""}
     if any(INDEX_BEFORE.search(name) for name in raw.columns):
         conventions.add("modified")
@@ -230,6 +217,25 @@ def read_sheet(path: Path, convention: str = "") -> RobotSetup:
     if robot.gravity.masses:
         raise InputError("the table", "masses of links in the frames of another convention", "--dh modified")
     return _from_standard(robot)
+
+
+def _sheet_columns(header: Mapping[str, Sequence[Any]]) -> dict[str, list[str]]:
+    """Return the columns of a sheet as texts, by the keys of ``robot.toml``; without those of joints' names."""
+    columns: dict[str, list[str]] = {}
+    for name, cells in header.items():
+        texts = [str(cell) for cell in cells]
+        stem, unit = _stem(name.partition(" #")[0])
+        if stem in JOINT_NAMES or not any(texts) or all(map(JOINT_NAME.fullmatch, texts)):
+            continue
+        if stem in ANGLES and not unit and any("°" in text for text in texts):
+            unit = "deg"
+        if stem == "limits":
+            raise InputError("the header", f"both limits in a column, '{name}'", "columns lower [deg] and upper [deg]")
+        key = stem + (f"_{unit}" if unit else "")
+        if key in columns:
+            raise InputError("the header", ", ".join(header), "every column once")
+        columns[key] = texts
+    return columns
 
 
 def _stem(name: str) -> tuple[str, str]:
