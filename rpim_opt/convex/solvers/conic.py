@@ -185,6 +185,19 @@ class Canonical:
         """Return the objective at x (N,)."""
         return float(0.5 * x @ (self.P @ x) + self.q @ x) + self.offset
 
+    def changes(self, near: Array, M: Array, size: float) -> Canonical:
+        """Return the form of changes y of a point (N,), x[at] = near[at] + size M y[at], M (n, n), others size y.
+
+        Its rows are divided by ``size``. The entries of A and P are at the same places whatever M is.
+        """
+        changed = copy(self)
+        changed.A, changed.b = _times(self.A, self.at, M), (self.b - self.A @ near) / size
+        changed.P = size**2 * _times(_times(self.P, self.at, M).T, self.at, M)
+        slope = size * (self.q + self.P @ near)
+        changed.q = slope.copy()
+        changed.q[self.at] = M.T @ slope[self.at]
+        return changed
+
     def missed(self, x: Array) -> float:
         """Return the violation of equations, inequalities and second-order cones at x (N,), as they were stated."""
         slack = np.divide(self.b - self.A @ x, self.row_scale, out=np.zeros(len(self.b)), where=self.row_scale > 0)
@@ -273,6 +286,12 @@ class Clarabel:
     def __init__(self, cones: list[Any], attempts: Sequence[Attempt] = ATTEMPTS):
         self.cones, self.attempts = cones, attempts
         self.renew()
+
+    def attempt(self, attempts: Sequence[Attempt]) -> None:
+        """Set what is tried in turn."""
+        if attempts != self.attempts:
+            self.attempts = attempts
+            self.renew()
 
     def renew(self) -> None:
         """Discard the solver: the next program has another sparsity pattern."""
@@ -377,6 +396,7 @@ class ReducedProgram:
         self.working = np.zeros(0, dtype=int)
         self.near = np.zeros(canonical.size)
         self.far = -1.0  # the weight of the last minimum, if that was far from where it was sought
+        self._changed: ReducedProgram | None = None  # the program of changes, set up once
 
     def solve(self, squares: ReducedSquares, weight: float, A: Array | None = None, b: Array | None = None) -> Point:
         """Return the minimum; A (k, n) and b (k,) are the rows of the loss. Unsolved where none is found."""
@@ -493,29 +513,28 @@ class ReducedProgram:
         s and V are the singular values and directions of all equations. With small weights some directions of z are
         10^5 scales long and others 10^-4, and costs are below a solver's tolerances.
         """
-        from scipy import sparse
-
         p, far = self.canonical, np.abs(near).max()
         z0, every = near[p.at], squares.R
         if A is not None:
             every = np.vstack([every, A])
         _, s, V = np.linalg.svd(np.linalg.qr(every, mode="r"))
         M = V.T / np.maximum(np.pad(s, (0, len(z0) - len(s))), 1 / far)
-        rows, columns, _ = _block(p.at, p.at)
-        others = np.setdiff1d(np.arange(p.size), p.at)
-        numbers = np.append(M.ravel(), np.full(len(others), far))
-        changes: Any = sparse.csc_array((numbers, (np.append(rows, others), np.append(columns, others))))
-        changed = copy(p)
-        changed.A, changed.b = sparse.csr_array(p.A @ changes / far), (p.b - p.A @ near) / far
-        changed.P, changed.q = sparse.csc_array(changes.T @ p.P @ changes), changes.T @ (p.q + p.P @ near)
-        program = ReducedProgram(changed, self.rows, self.loss, self.counts)
+        changed = p.changes(near, M / far, far)
+        program = self._changed
+        if program is None:
+            program = self._changed = ReducedProgram(changed, self.rows, self.loss, self.counts)
+        else:
+            program.canonical = changed
+            program.data.renumber(changed)
         attempts = ATTEMPTS[1:] if self._walks(weight) else ATTEMPTS  # the first one hardly ever reaches far
-        program.data.clarabel.attempts = [(*REFINED, *other) for other in attempts]
+        program.data.clarabel.attempt([(*REFINED, *other) for other in attempts])
         squares = ReducedSquares(squares.R @ M, squares.y - squares.R @ z0, M.T @ squares.g)
         if A is not None and b is not None:
             A, b = A @ M, b - A @ z0
         point, slack = program._about(np.zeros(p.size), squares, weight, A, b)
-        return replace(point, x=near + changes @ point.x, dual=point.dual / far), far * slack
+        x = far * point.x
+        x[p.at] = M @ point.x[p.at]
+        return replace(point, x=near + x, dual=point.dual / far), far * slack
 
     def _about(
         self, near: Array, squares: ReducedSquares, weight: float, A: Array | None, b: Array | None
@@ -526,7 +545,7 @@ class ReducedProgram:
         residual = squares.y - squares.R @ z0
         q = [weight * (p.q + p.P @ near), np.zeros(k)]
         q[0][p.at] += squares.g
-        bounds, dense = [residual, p.b - p.A @ near], [squares.R.ravel()]
+        bounds, dense = [residual, p.b - p.A @ near], [squares.R.ravel(), data.own]
         if self.loss is not None and A is not None and b is not None:
             q.append(self.loss.q)
             bounds.append(data.linked(A @ z0 - b))
@@ -556,9 +575,9 @@ class _ConicData:
         cones = [*([clarabel.ZeroConeT(k)] if k else []), *p.clarabel_cones]
         top, size = k + len(p.b), p.size + k
         squares = np.arange(k)
-        # entries as (rows, columns, numbers): R and A, which other programs have other numbers of, and the rest
-        dense = [_block(squares, p.at)]
-        entries = [(squares, p.size + squares, -np.ones(k)), _entries(p.A, k, 0)]
+        # entries as (rows, columns, numbers): those that other programs have other numbers of, and the rest
+        dense = [_block(squares, p.at), _entries(p.A, k, 0)]
+        entries = [(squares, p.size + squares, -np.ones(k))]
         curvature = [_entries(p.P, 0, 0, upper=True), (p.size + squares, p.size + squares, np.full(k, 2.0))]
         if loss is not None:
             cones += loss.clarabel_cones
@@ -589,10 +608,14 @@ class _ConicData:
         self.matrix: Any = None
         self.P, place = _assembled(curvature, (size, size))
         self._curvature = self.P.data.copy()
-        self._weighted = np.zeros(len(place), dtype=bool)
-        self._weighted[place[: len(curvature[0][0])]] = True
+        self.own, self._weighted = dense[1][2], place[: len(curvature[0][0])]
         # a loss's rows come as the user scaled them
         self.clarabel = Clarabel(cones, ATTEMPTS if loss is None else (EQUILIBRATED, *ATTEMPTS))
+
+    def renumber(self, p: Canonical) -> None:
+        """Take the numbers of another penalty and constraints with the same entries."""
+        self.own = _entries(p.A, 0, 0)[2]
+        self._curvature[self._weighted] = _entries(p.P, 0, 0, upper=True)[2]
 
     def linked(self, r: Array) -> Array:
         """Return the bounds of the loss's rows, for a residual r (m,) of the equations."""
@@ -601,7 +624,7 @@ class _ConicData:
         return bounds
 
     def filled(self, weight: float, numbers: Array) -> tuple[Any, Any]:
-        """Return P at a weight, and the matrix with the numbers of R (k, n) and of the loss's rows, row by row."""
+        """Return P at a weight, and the matrix with the numbers of R (k, n), `own`, and the loss's rows, row by row."""
         if self.matrix is None or numbers[~self._nonzero].any():  # zeros cost as much as other numbers
             self._nonzero |= numbers != 0
             rows, columns, ones = (np.concatenate(each)[self._nonzero] for each in zip(*self._dense, strict=True))
@@ -609,8 +632,24 @@ class _ConicData:
             self._numbers = place[: len(rows)]
             self.clarabel.renew()
         self.matrix.data[self._numbers] = numbers[self._nonzero]
-        self.P.data = np.where(self._weighted, weight, 1.0) * self._curvature
+        self.P.data = self._curvature.copy()
+        self.P.data[self._weighted] *= weight
         return self.P, self.matrix
+
+
+def _times(A: Any, at: np.ndarray, M: Array) -> Any:
+    """Return a sparse matrix with its columns ``at`` times M, and the zeros that this makes."""
+    from scipy import sparse
+
+    A = sparse.coo_array(A)
+    place = np.full(A.shape[1], -1)
+    place[at] = np.arange(len(at))
+    own = place[A.col] >= 0
+    rows, row = np.unique(A.row[own], return_inverse=True)
+    block: Any = sparse.csr_array((A.data[own], (row, place[A.col[own]])), (len(rows), len(at)))
+    there, columns, _ = _block(rows, at)
+    numbers = np.concatenate([(block @ M).ravel(), A.data[~own]])
+    return sparse.coo_array((numbers, (np.append(there, A.row[~own]), np.append(columns, A.col[~own]))), A.shape)
 
 
 Entries = tuple[np.ndarray, np.ndarray, Array]
