@@ -10,6 +10,7 @@ from functools import cached_property, partial
 from typing import Any
 
 import numpy as np
+from scipy.linalg import get_lapack_funcs
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
@@ -20,16 +21,18 @@ from rpim_opt.convex.expressions import OPTIMAL, cp, substituted
 from rpim_opt.convex.formulation import Formulation, formulation_of
 from rpim_opt.convex.quadratic import Quadratic, Ridge, ridge
 from rpim_opt.convex.robust_loss import Inliers, inliers_of
-from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, nearest
+from rpim_opt.convex.solvers.conic import FEASIBLE, Damping, Point, Unsolved, by_triangle, nearest
 from rpim_opt.convex.solvers.separable import Rows
 from rpim_opt.convex.solvers.solve import WarmStart, minimum
 from rpim_opt.convex.structure import Structure, structure
-from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
+from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel, reduced_rows
 
 ACTIVE = 1e-7
 """Part of the largest multiplier from which a constraint is active."""
 TOUCHING = 1e-9
 """Distance from a bound, in scales, at which a component counts as lying on it."""
+WELL_CONDITIONED = 1e-6
+"""Reciprocal condition number above which a triangular factor is solved with."""
 PROXIMAL = 1e-2, 1e-4, 1e-6
 """Sizes of the proximal term after the first."""
 STATUS = {
@@ -39,6 +42,8 @@ STATUS = {
     "AlmostDualInfeasible": "unbounded",
 }
 """CVXPY's words for Clarabel's."""
+
+TRCON: Any = get_lapack_funcs("trcon", dtype=float)
 
 
 def feasibility_tolerance(z: Array) -> float:
@@ -369,18 +374,26 @@ class Program(Brief):
             alone = self._part(self.structure.without_penalty, self.model).solve(damping=damping, accuracy=accuracy)
             estimate = replace(alone, penalty=self.value(alone.z, 0.0)[1])
         elif damping is None and self.closed_form:
-            form, z = self.penalty_form, self.ridge.minima(np.array([weight]))[0]
-            if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
-                # a penalty that hardly holds some directions costs the formula digits
-                A = np.vstack([self.squared.triangle[:, :-1], np.sqrt(weight) * form.matrix])
-                b = np.concatenate([self.squared.triangle[:, -1], np.sqrt(weight) * form.c])
-                z = z + np.linalg.lstsq(A, b - A @ z, rcond=RANK_TOLERANCE)[0]
-            estimate = self._at(z, weight)
+            estimate = self._at(self._closed(weight), weight)
         elif weight == 0 and damping is None and not self.model.svd[1].all():
             estimate = self._unidentified(accuracy)
         else:
             estimate = self._by_structure(weight, damping, accuracy)
         return replace(estimate, seconds=time.perf_counter() - begin)
+
+    def _closed(self, weight: float) -> Array:
+        """Return the minimum (n,) of squares and a quadratic penalty, by QR unless it is ill-conditioned."""
+        n, form, rows = self.structure.n, self.penalty_form, self.squared.triangle
+        if form is not None and weight > 0:
+            rows = np.vstack([rows, np.sqrt(weight) * np.column_stack([form.matrix, form.c])])
+        T = reduced_rows(rows)
+        if TRCON(T[:n, :n])[0] > WELL_CONDITIONED:
+            return by_triangle(T[:n, :n], T[:n, n])
+        z = self.ridge.minima(np.array([weight]))[0]
+        if form is not None and weight > 0 and not (form.diagonal and (form.L == 1).all()):
+            # a penalty that hardly holds some directions costs the formula digits
+            z = z + np.linalg.lstsq(rows[:, :n], rows[:, n] - rows[:, :n] @ z, rcond=RANK_TOLERANCE)[0]
+        return z
 
     @one_blas_thread
     def path(self, weights: Sequence[float] | Array) -> list[Estimate]:
