@@ -872,7 +872,7 @@ def test_the_document_of_a_calibration_has_the_tables_figures(monkeypatch, capsy
         assert f"{row['what']}" in text
         assert f"{row['mean_mm']:.{digits}f}" in text
     for p in document["parameters"]:
-        assert f"{p['deviation']:+.4f}" in text
+        assert f"{p['deviation']:+z.4f}" in text
     for remark in [*document["remarks"], *document["lack_of_fit"]["text"]]:
         assert remark in text
 
