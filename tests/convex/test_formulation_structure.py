@@ -255,7 +255,8 @@ def test_a_conflict_is_irreducible_and_said_by_name() -> None:
     assert found.constraints == ("low (1)", "high")
     assert contradiction(low)[0] is None
     assert name_of(high, 0) == "high"
-    assert name_of(lambda z, p: z[2] >= 0, 2) == "z[2] >= 0"  # what it returns
+    name = name_of(lambda z, p: z[2] >= 0, 2)
+    assert name == "z[2] >= 0"  # what it returns
     assert name_of(ro.in_ball(2.0, "a?"), 0) == "in_ball(2.0, 'a?')"
 
 
