@@ -118,13 +118,13 @@ ROBOTS = _completed(lambda: ro.robots())
 MODELS = _completed(lambda: ("auto", "geometry"))
 COMPONENTS = _completed(lambda: ("robot", "free", "level", "declared"))
 Problem = Annotated[str, Argument(help="A problem folder, or the name of a shipped one.", autocompletion=SHIPPED)]
-RULES = "learned (estimated prior scales), or one weight: reml, l_curve, gcv, k_fold, ..., a number."
+RULES = "learned (estimated prior scales), or one weight by a rule (reml, l_curve, gcv, k_fold, ...) or a number."
 READY = "least_squares, tikhonov, bounded, robust, sum_of_norms, minimax, lasso, group_lasso."
 PARTS = "Noise to estimate: robot (repeatability), level (factor on the stated noise), free (both), declared (none)."
 Variant = Annotated[Text, Option(help="A [variant.NAME] of the problem file.")]
 Result = Annotated[Path, Argument(help="result.json, or its folder.")]
 Units = Annotated[str, Option(help="Units of columns whose names carry none: deg,mm or rad,m.")]
-Kind = Annotated[Text, Option(help="Measurement type: position, pose, cable, ...; guessed, or that of the result.")]
+Kind = Annotated[Text, Option(help="Measurement type: position, pose, cable, ...; default: guessed, or the result's.")]
 Several = "several files are stacked, or joined as by rpim-opt new."
 NEAREST = "Join files by nearest time, with this largest difference [s]."
 ROTATION = "Meaning of rx, ry, rz: 'extrinsic xyz' (default), 'intrinsic zyx', vector."
@@ -135,7 +135,7 @@ Marker = Annotated[Text, Option(help="Name of the reflector, if there are severa
 UrdfBase = Annotated[Text, Option(help="Base link of the chain; default: the root of the URDF.")]
 UrdfTip = Annotated[Text, Option(help="Tip link of the chain, if there are several.")]
 Chain = Annotated[str, Option(help="Chain name: makes a problem with a URDF's joint origins, or adds a chain to one.")]
-Source = Annotated[Text, Option(help="Who measured what, when, with which instrument; the files by default.")]
+Source = Annotated[Text, Option(help="Who measured what, when, with which instrument; default: names of the files.")]
 UrKinematics = Annotated[File, Option(help="kinematics.yaml of ROS for a Universal Robot; corrected file to --out.")]
 CONF = "calibration.conf copied from a Universal Robot's controller; corrected file to --out."
 Convention = Annotated[str, Option(help="Convention of --mdh: modified (Craig), or standard (Paul, Hayati; .csv).")]
@@ -319,7 +319,7 @@ def calibrate(
     formulation: Annotated[Text, Option(help=READY, autocompletion=FORMULATIONS)] = None,
     noise: Annotated[Text, Option(help=PARTS, autocompletion=COMPONENTS)] = None,
     drop_outliers: Annotated[bool, Option("--drop-outliers", help="Calibrate again without flagged rows.")] = False,
-    use_validation: Annotated[Choice, Option(help="Refit with the validation rows; default: if held out.")] = None,
+    use_validation: Annotated[Choice, Option(help="Refit with validation rows too; default: if held out.")] = None,
     limit: Tolerance = None,
     box: Box = None,
     out: Folder = None,
@@ -358,7 +358,7 @@ def calibrate(
 def report(
     result: Result,
     out: Annotated[File, Option(help="HTML file; report.html beside the result by default.")] = None,
-    data: Annotated[list[Path] | None, Option(help=f"New measurements to validate on; {Several}")] = None,
+    data: Annotated[list[Path] | None, Option(help=f"New measurements for validation; {Several}")] = None,
     tables: Tables = TABLES,
     measurement: Kind = None,
     register: Register = False,
@@ -425,7 +425,7 @@ def accept(
 ) -> Answer:
     """Test the calibrated robot against a tolerance, by its expanded uncertainty over a region.
 
-    Exit code 0 if it is accepted, 1 if it is rejected, 4 if inconclusive: then it says what is missing.
+    Exit code 0 if it is accepted, 1 if it is rejected, 4 if inconclusive, with what is missing.
     """
     with _loaded(result) as (loaded, say):
         _require_data(register, data)
@@ -597,12 +597,12 @@ def simulate(
 def design(
     problem: Problem,
     count: Annotated[int, Option(help="How many configurations to choose.")] = 30,
-    criterion: Annotated[str, Option(help="V (predicted positions), D or A.")] = "V",
-    candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within limits.")] = 1000,
+    criterion: Annotated[str, Option(help="Criterion: V (variance of positions), D (determinant), A (trace).")] = "V",
+    candidates: Annotated[int, Option(min=1, max=1_000_000, help="Random candidates within joint limits.")] = 1000,
     table: Annotated[File, Option(help="Table of candidates to use instead: q1_deg, ...")] = None,
     point: Annotated[Text, Option(help="For touches: the point x,y,z [mm] in the robot's base frame.")] = None,
     seed: Annotated[int, Option(min=0, help="Seed of the random candidates.")] = 0,
-    augment: Annotated[bool, Option("--augment", help="Add to measured configurations, in their ranges.")] = False,
+    augment: Annotated[bool, Option("--augment", help="Add to the measured configurations, in their ranges.")] = False,
     out: Table = None,
 ) -> Answer:
     """Choose the next configurations to measure by optimal design."""
@@ -727,7 +727,7 @@ def _require_data(register: bool, data: list[Path] | None) -> None:
 def _calibrated(
     instance: "ro.store.Instance", selector: Text, formulation: Text, words: dict[str, Text], say: Callable[[str], None]
 ) -> "ro.calibration.Calibration":
-    """Calibrate as a problem's file says, or as the options say; name likely causes where there is no solution."""
+    """Calibrate with a problem file's settings, or those of options; name likely causes where there is no solution."""
     from rpim_opt.store.problem_file import named_weight
 
     changes: dict[str, Any] = {key: word for key, word in {**words, "formulation": formulation}.items() if word}
@@ -767,8 +767,8 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
     """Return a sentence on a figure [m] and its limit [mm], and whether it is kept; nothing where there is none."""
     if limit is None:
         return [], None
-    within = 1e3 * value <= limit
-    return [f"The largest {name} is {1e3 * value:.4f} mm, {'within' if within else 'above'} {limit:g} mm."], within
+    kept = 1e3 * value <= limit
+    return [f"Largest {name}: {1e3 * value:.4f} mm, {'within' if kept else 'above'} the limit of {limit:g} mm."], kept
 
 
 def main() -> None:

@@ -814,7 +814,7 @@ def test_what_no_file_can_hold_is_named(monkeypatch, capsys, tmp_path) -> None:
     problem, _ = simulated(("theta?", "ratio2"), configurations=20)
     ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), tmp_path / "result.json")
     assert run(monkeypatch, "export", str(tmp_path), "--mdh", str(tmp_path / "arm.csv")) == 0
-    assert "Files cannot hold ratio2: their geometry is from a fit of its own" in capsys.readouterr().out
+    assert "Files cannot hold ratio2: their geometry is from a separate fit" in capsys.readouterr().out
     assert "It includes what geometry alone misses" in (tmp_path / "arm.csv").read_text()
 
 

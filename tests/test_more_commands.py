@@ -153,7 +153,7 @@ def test_an_instrument_that_was_set_up_anew_is_registered_by_every_command_that_
     # after a motion they would no longer be recognized as rows that the calibration knows
     for command in (["monitor", old], ["validate", old], ["accept", "--limit", "0.5", "--data", old]):
         assert run(monkeypatch, command[0], result, *command[1:], "--register") == 2, command
-        assert "of 40 rows are identification rows, accepted: new rows alone" in capsys.readouterr().err
+        assert "of 40 rows are identification rows, accepted: new rows only" in capsys.readouterr().err
 
 
 def test_an_update_says_in_millimetres_what_it_changed(

@@ -86,7 +86,7 @@ def inside(folder: Path, name: str, where: str, file: object = None) -> Path:
 
 
 def read_toml(path: Path) -> dict[str, Any]:
-    """Return a TOML file's content; errors say line and column."""
+    """Return a TOML file's content; errors name line and column."""
     text = read_text(path, endings=[".toml"])
     if _DEEP.search(text):
         raise InputError("the TOML text", "a key of more than a hundred parts", "keys with fewer parts", path)
@@ -97,7 +97,7 @@ def read_toml(path: Path) -> dict[str, Any]:
 
 
 def read_json(path: Path) -> Any:
-    """Return a JSON file's content; errors say line and column."""
+    """Return a JSON file's content; errors name line and column."""
     text = read_text(path, LARGEST_DATA, [".json"])
     try:
         return parse_json(text)

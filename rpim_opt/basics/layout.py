@@ -31,7 +31,7 @@ SUMMARIES = frozenset({
 """What a row begins with that is no measurement, letters alone."""
 COMMENT = re.compile(r"(?:(?://|[#%!*])\s*)+")
 MISSING = re.compile(r"[-\u2013\u2014*?]*|n/?a|nan|none|null|#(?:n/a|value!|ref!|div/0!)|[+-]?1\.#\w+", re.IGNORECASE)
-"""How tables say that there is no value."""
+"""Cells that mark a missing value."""
 BLANK_NAME = re.compile(r"[^\s\[(]+(?:\s+\d+(?!\S))?(?:\s*[\[(][^\])]*[\])])?")
 """A name with its number and unit, in a header whose names and cells are separated by single blanks."""
 PART_OF_PI = re.compile(r"([+-]?)\s*(?:(\d+(?:\.\d*)?)\s*\*?\s*)?(?:π|pi)\s*(?:/\s*(\d+))?", re.IGNORECASE)
@@ -47,7 +47,7 @@ VALUE = re.compile(r"\b(?:value|meas\w*|actual|ist\b|mess\w*|wert|reading)", re.
 WITH_UNIT = re.compile(r"([+-]?[\d.,]+(?:[eE][+-]?\d+)?)\s*([^\d\s.,+-]\S*)")
 """A number with its unit in the cell."""
 UNITS_WORD = re.compile(r"\b(?:units?|einheit(?:en)?|unités?|unidades|unità)\b", re.IGNORECASE)
-"""What a line above the header says before the units that it states."""
+"""Words before the units in a line above the header."""
 JOINING = ("in", "and", "und", "et", "y", "e")
 """Words among units; ``in`` alone is inches."""
 
@@ -120,7 +120,7 @@ class RawTable:
     """A table as in its file, with numbers in Python's notation.
 
     ``columns`` are cells by what stands above them, ``Position X [mm]`` (a name that is there again has its place
-    behind it, ``X #7``), ``groups`` what of it groups columns; ``notes`` say how it was read, and what was left out, a
+    behind it, ``X #7``), ``groups`` what of it groups columns; ``notes`` tell how it was read, and what was left out, a
     sentence each; ``units`` are those that stand above the header, as `parse_units` has them.
     """
 
@@ -526,7 +526,7 @@ def _without_letters(cells: list[str], letters: Sequence[str]) -> list[str]:
 
 
 def _value_column(columns: Mapping[str, Sequence[str]]) -> str:
-    """Return the only column of numbers, or the only one of these that says so."""
+    """Return the only column of numbers, or the only one of these whose name states it."""
     numeric = [name for name, cells in columns.items() if _is_numeric(cells)]
     measured = [name for name in numeric if VALUE.search(name)] or numeric
     if len(measured) != 1:

@@ -56,7 +56,7 @@ LIST_OPENS = re.compile(r"[a-zA-Z]*[\[({][\s\d.+\-\[({]")
 ENCODINGS = "--encoding with the one that fits: cp932 (Japanese), gb18030 (Chinese), cp1251 (Russian), utf-16, ..."
 ZEROS = bytes(8)  # no text has so many zeros in a row, in whatever encoding
 ROW_OF_NUMBERS = 1 / 3
-"""Part of a row's cells that are numbers, from which on it tells what separates them."""
+"""Fraction of a row's cells that are numbers, from which on the row shows the separator."""
 BLANKS_CLEARLY = 1.5
 """Blanks separate cells where they part so many times more numbers than any sign does: a label may hold some."""
 FORMULA = re.compile(r"'*[=+\-@\t\r\uff1d\uff0b\uff0d\uff20]")

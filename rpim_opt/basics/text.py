@@ -129,7 +129,7 @@ class Tabled(Brief):
         rows = self._frame_rows()
         notes = list(self._notes())
         if len(rows) > MOST:
-            notes.insert(0, f"... and {len(rows) - MOST} rows more.")
+            notes.insert(0, f"... and {len(rows) - MOST} more rows.")
         head = [key for key in next(iter(rows), {}) if any(row[key] is not None for row in rows)]
         cells = [[_cell(row[key]) for key in head] for row in rows[:MOST]]
         return html_table(head, cells, notes, f"{type(self).__name__} {self._short()}")

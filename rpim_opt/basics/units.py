@@ -194,7 +194,7 @@ def parse_units(text: str) -> dict[str, str]:
             raise InputError("--units", f"'{part}'", choices(part, UNITS))
         key = stem or UNITS[name].dimension
         if key in units:
-            accepted = "one unit per dimension; another for joint values alone as q=rad"
+            accepted = "one unit per dimension; another for joint values only as q=rad"
             raise InputError("--units", f"{units[key]} and {part}", accepted)
         units[key] = name
     return units

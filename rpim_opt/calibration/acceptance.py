@@ -43,7 +43,7 @@ MEASURED = 1000  # measured configurations of a block at which the uncertainty i
 MOST = 3  # joints or rows that a reason names
 STATED = 1e9  # degrees of freedom of an uncertainty that is stated
 WORST, BESIDE = 16, 16  # the search for the largest bound goes on from so many, at so many beside each
-STEPS = (0.1, 0.05, 0.025, 0.0125)  # how far beside, in parts of the joint ranges
+STEPS = (0.1, 0.05, 0.025, 0.0125)  # how far beside, as fractions of the joint ranges
 LEAST = 1e-9  # width of the range of a joint that never moved [rad or m]
 ANYWHERE = Requirement(limit=1.0)  # the region of a result without requirement: joints within the measured ranges
 
@@ -227,7 +227,7 @@ class Acceptance:
 
     The verdict is ``"accepted"`` where at every configuration of the region the bound is within the limit, and held-out
     rows bear it out; ``"rejected"`` where they miss oftener than chance allows, or the robot's repeatability at its
-    least is above the limit; ``"inconclusive"`` where something is lacking. ``reasons`` say why, a sentence each; empty
+    least is above the limit; ``"inconclusive"`` where something is missing. ``reasons`` are sentences; empty
     where it is accepted.
 
     ``requirement`` has limit, confidence and region, ``workspace`` the expanded uncertainties at its configurations;
@@ -365,7 +365,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
 
 
 def _missing(result: Calibration, limit: float, found: Workspace, repeatability: float) -> str:
-    """Say what is missing for a bound within the limit [m]."""
+    """Return a sentence on what is missing for a bound within the limit [m]."""
     bound = found.largest
     if not np.isfinite(bound):
         return "Missing: measurements that identify the parameter combinations that neither data nor penalty determine."
@@ -390,10 +390,7 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
     measured = reaching(result, found.region, q, found.requirement.confidence)[1].max()
     apart = ""
     if measured < bound / 2:
-        apart = (
-            f", with joint values in other combinations than measured: at measured configurations it is at most "
-            f"{1e3 * measured:.3f} mm (another region: --box)"
-        )
+        apart = f", at measured configurations {1e3 * measured:.3f} mm (--box restricts the region)"
     return (
         f"Missing: more measurements. The bound is {1e3 * bound:.3f} mm{apart}; with all parameters known the robot's "
         f"repeatability would still contribute {1e3 * repeatability:.3f} mm. `rpim-opt design --augment` names the "
@@ -402,7 +399,7 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
 
 
 def _standing(result: Calibration) -> str:
-    """Say which joints of the robot were hardly moved; empty if all were."""
+    """Return a sentence on joints of the robot that hardly moved; empty if all did."""
     if len(result.ranges) > 1:
         return ""
     (measured,), (robot,) = result.ranges.values(), result.problem.arms.values()
@@ -444,7 +441,7 @@ def _of_instrument(data: Dataset, confidence: float) -> Array:
 def _held_out(
     result: Calibration, region: Region, requirement: Requirement, data: Dataset | None
 ) -> tuple[dict[str, Any] | None, list[str], list[str]]:
-    """Return what held-out rows say of a limit: a document [mm] or None, that they miss it, and what is lacking."""
+    """Return the test of a limit by held-out rows: a document [mm] or None, rows beyond it, and what is missing."""
     found = _rows_apart(result, data)
     if found is None:
         used = "" if data is None else f"; all {len(data)} rows of the table are identification rows"
@@ -512,7 +509,7 @@ def repeatability_bounds(result: Calibration, region: Region, q: Array, confiden
 
 
 def _unmodelled(result: Calibration, region: Region) -> list[str]:
-    """Say that the model does not fit, and that joints go in the region where nothing was measured."""
+    """Return sentences on a model that does not fit, and on joint ranges of the region that were not measured."""
     lines: list[str] = []
     fit = judged(result)
     if fit is not None and fit.alarming:

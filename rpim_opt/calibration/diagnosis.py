@@ -42,9 +42,9 @@ class ActiveBound(NamedTuple):
 class ShadowPrice(NamedTuple):
     """A constraint that is written as text, at a solution: its shadow price or its slack.
 
-    ``slack`` is how far it is from its limit, in ``unit``; ``multiplier`` by how much the misfit (loss + weight
-    penalty) would fall for every ``unit`` by which it is loosened, zero where it is not active; ``gain`` what loosening
-    it by ``step`` would bring, to first order. ``misfit`` is all there is.
+    ``slack`` is its distance from the limit, in ``unit``; ``multiplier`` the decrease of the objective (loss + weight
+    penalty) per ``unit`` of loosening, zero if it is inactive; ``gain`` the decrease for loosening it by ``step``, to
+    first order. ``misfit`` is the objective itself.
     """
 
     text: str
@@ -66,7 +66,7 @@ class ShadowPrice(NamedTuple):
             return f"'{self.text}' is inactive, with {self.slack:.3g} {self.unit} of slack."
         return (
             f"'{self.text}' is active: loosening it by {self.step:.3g} {self.unit} would lower the objective "
-            f"by {self.gain:.3g} of {self.misfit:.4g}."
+            f"by {self.gain:.3g}, from {self.misfit:.4g}."
         )
 
 

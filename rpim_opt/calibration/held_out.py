@@ -21,7 +21,7 @@ from rpim_opt.data.record import CONFIDENCE, HeldOut
 from rpim_opt.problem.diagnosis import common_rows
 from rpim_opt.problem.registration.closed_forms import register, transformed
 
-FEWEST = 5  # held-out rows below which they say too little
+FEWEST = 5  # held-out rows below which they are too few to judge
 GROSS = 6.0  # factor on the median distance from which on a row does not count for a registration
 RARE = 0.01  # probability that data like those of the calibration have any row that is named
 
@@ -82,7 +82,7 @@ def coverage_text(coverage: float, rows: int) -> str:
 def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
     """Return sentences on a common displacement of the measurements, by registration: as mistake or as remark.
 
-    It is said where rows are outside their prediction intervals, or too many coordinates are. A mistake is a motion
+    It is reported where rows are outside their prediction intervals, or too many coordinates are. A mistake is a motion
     that takes more than half of the RMS error, for its six degrees of freedom, of rows that are outside; a remark one
     whose part of the squared errors chance would give with probability 0.01 (Fisher's F). Both are empty otherwise.
     """
@@ -122,7 +122,7 @@ def registered(result: Calibration, data: Dataset) -> tuple[Dataset, str]:
     calibration's frame and would not be recognized after a motion; for fewer than five positions; points on a line.
     """
     if used := rows_used(result, data):
-        raise InputError("--register", f"{len(used)} of {len(data)} rows are identification rows", "new rows alone")
+        raise InputError("--register", f"{len(used)} of {len(data)} rows are identification rows", "new rows only")
     vectors = result.error_vectors(data)
     rows = np.flatnonzero(np.isfinite(vectors).all(axis=1))
     if len(rows) < FEWEST:

@@ -38,9 +38,9 @@ NOISE = {
     "level": ("instrument",),
     "declared": (),
 }
-"""Parts of the noise that are estimated, by the option's name."""
+"""Components of the noise that are estimated, by the option's name."""
 MODELS = {"geometry": ("position", "orientation", "instrument"), "auto": NOISE["free"]}
-"""Parts of the noise that a model tells apart: without its extensions joints would take gravity for noise."""
+"""Components of the noise by model: without extensions the deflection under gravity would count as joint noise."""
 LEVEL = 1e-9  # relative fall of the objective over five iterations below which it hardly changes
 DIVERGES = "poorly identifiable combinations diverge without a penalty; add one."
 DIVERGES_PENALIZED = (
@@ -76,9 +76,9 @@ def calibrate(
 
     Every iteration linearizes at the current deviations and solves for the *total* deviation; a curved step follows the
     curve of the residual (geodesic acceleration), and where the nonlinear objective falls by less than a quarter of
-    what the convex program promises, Levenberg-Marquardt damping shortens the next one. The loop ends when the undamped
-    program promises no decrease beyond its solver's accuracy, or its step is shorter than ``tolerance * (1 + ||z||)``.
-    The result has converged if a `Certificate` computed anew agrees: then it is a stationary point of the nonlinear
+    what the convex program predicts, Levenberg-Marquardt damping shortens the next one. The loop ends when the undamped
+    program predicts no decrease beyond its solver's accuracy, or its step is shorter than ``tolerance * (1 + ||z||)``.
+    The result has converged if an independent `Certificate` agrees: then it is a stationary point of the nonlinear
     problem.
 
     Parameters
@@ -87,11 +87,11 @@ def calibrate(
         The measurements, and the parameters to identify. ``ro.calibrate`` takes an instance of `load` as well, or the
         name or folder that it loads: what is not stated here is then as its file has it.
     formulation
-        Loss, penalty and constraints, or the name of a ready one (``"robust"``); its functions are called anew.
+        Loss, penalty and constraints, or the name of a ready one (``"robust"``); its functions are called again.
     weight
         None or ``"learned"``: hyperparameters are estimated. A number, or a selection rule (or its name) over the
-        stated scales, which sees identification data only; it is asked again at the solution, and the weight stays
-        where it answers the same. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
+        stated scales, which uses identification data only; it is applied again at the solution, and its weight is
+        final if it is the same. Weights of single groups of parameters are scales: ``Prior(scale={"a?_mm": 0.5})``.
     prior
         Of the deviations, beyond the scales of the parameters.
     model
@@ -103,11 +103,11 @@ def calibrate(
     start
         (n,) deviations [SI] to begin with; nominal by default. Then signs and zeros of joints are sought where the
         nominal robot does not explain the data (`global_start`), and frames that are stated metres or half a turn from
-        where the data put them count from there (`frames.relocated`). The answer does not depend on a given start, as
-        long as the loop converges.
+        their registration start there (`frames.relocated`). The result does not depend on a stated start, as long as
+        the loop converges.
     max_iterations, tolerance
-        When to stop: linearizations, and length of a step. A calibration that did not converge says so in ``converged``
-        and ``message``.
+        When to stop: linearizations, and length of a step. ``converged`` and ``message``
+        of the result report how the loop ended.
     progress
         Called after every iteration, which the logger ``rpim_opt`` reports at level INFO, too.
     solver, settings, verbose
@@ -253,7 +253,7 @@ def ending(ended: Ended, most: int) -> str:
 
 
 def _displaced_frames(stated: Source, registered: Source) -> list[str]:
-    """Say how far stated frames are from their registration; one at the origin was not stated."""
+    """Return a sentence on stated frames far from their registration; one at the origin was not stated."""
     p, q = stated.parameters, registered.parameters
     far = []
     for prefix in (name[:-1] for name in p.names if name.endswith("_x") and f"{name[:-1]}z" in p.names):

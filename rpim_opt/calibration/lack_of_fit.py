@@ -53,12 +53,12 @@ EXTENSIONS = {
     "gravity": Extension(("compliance?",), "gravity", "The arm deflects under gravity", ("compliance", "bend")),
     "first harmonic": Extension(
         ("ecc_cos?", "ecc_sin?"),
-        "eccentric encoders or gears (once a turn)",
-        "Encoders or gears of joints have errors once a turn",
+        "eccentric encoders or gears (once per revolution)",
+        "Encoders or gears of joints have once-per-revolution errors",
         ("ecc",),
     ),
     "second harmonic": Extension(
-        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints have errors twice a turn", ("ecc2",)
+        ("ecc2_cos?", "ecc2_sin?"), "second harmonics of joints", "Joints have twice-per-revolution errors", ("ecc2",)
     ),
     "moments": Extension(("bend*",), "gravity on masses whose centres differ from the assumed ones"),
     SESSIONS: Extension(

@@ -95,7 +95,7 @@ def influence(result: Outcome) -> Influence:
     ['c43', 'c14', 'c1']
     """
     if not result.program.linear_penalty:
-        raise result.no_covariance("k_fold leaves configurations out of any formulation")
+        raise result.no_covariance("k_fold accepts any formulation")
     free = result.problem.parameters.free
     model, first_label = _equations(result)
     numbers, which, equations = np.unique(model.group, return_inverse=True, return_counts=True)
@@ -113,9 +113,9 @@ def influence(result: Outcome) -> Influence:
     moving = np.array([name not in at_bound for name in free.names])
     gradient = A.T @ (A @ result.z - b) + L.T @ (L @ result.z - c)
     if np.linalg.norm(gradient[moving]) > BALANCED * np.linalg.norm(A.T @ b):
-        accepted = "a loss that is a reweighted sum of squares: squares, Huber's"
+        accepted = "a squared loss, or a robust one that is reweighted squares (Huber's)"
         if formulation.constraints and result.program.box is None:
-            accepted = f"{accepted}; and no active constraints but bounds"
+            accepted = f"{accepted}; and no active constraints other than bounds"
         raise InputError("influence", f"formulation '{formulation.name}'", accepted)
     T = np.zeros((len(free), len(A) + len(L)))  # H^-1 = T T'
     T[moving] = np.linalg.pinv(np.vstack([A, L])[:, moving], rcond=RANK_TOLERANCE)
@@ -195,7 +195,7 @@ def improvement(result: Outcome) -> Improvement | None:
         after^2  = tr(D (N + B) D') / W
         before^2 = (|D x|^2 - tr(D N D') + tr(D B D')) / W
 
-    N is that of leaving out every configuration in turn (the jackknife) where that is more than the noise says: then
+    N is that of leaving out every configuration in turn (the jackknife) where that exceeds what noise predicts: then
     the rows of a configuration err together, by the robot or by the camera, and more of them do not help.
 
     For a squared penalty or none, and one robot with joint limits, in one place or several (`together`).

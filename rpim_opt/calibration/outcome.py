@@ -302,7 +302,7 @@ class Outcome:
         """Return the error of every row for the nominal robot, (N,) [m]; arguments as for `errors`.
 
         Frames (base, reflectors, anchors, ...) that the calibration identifies are fitted to the identification data
-        first: before that they say nothing about the robot.
+        first: before that they do not describe the robot.
         """
         source, x = self._at(data, nominal=True)
         return source.errors(x, dimension)
@@ -398,7 +398,7 @@ class Outcome:
         return ""
 
     def no_covariance(self, instead: str) -> InputError:
-        """Return the error that says why there is no covariance, and what serves ``instead``."""
+        """Return the error that states why there is no covariance, and what serves ``instead``."""
         accepted = f"a squared penalty or none, and a loss with a gradient; {instead}"
         return InputError("uncertainty", self._undefined, accepted)
 
@@ -441,7 +441,7 @@ class Outcome:
     def covariance(self) -> Array:
         """Covariance of the deviations (n, n) [SI]: C = sigma^2 S (A'A + weight I)^-1 S + D D'.
 
-        `Uncertainty` says what is in it and what it holds for; D D' is zero with a weight of your own. It is
+        `Uncertainty` documents its contents and validity; D D' is zero with a weight of your own. It is
         conditional on active constraints; variances that neither data nor penalty decide are infinite.
         """
         return self.spread.covariance

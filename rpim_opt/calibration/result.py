@@ -30,7 +30,7 @@ class Calibration(Outcome):
     weight
         The weight of the penalty.
     selection
-        The selector's choice with its evidence; None for a given weight.
+        The selector's choice with its evidence; None for a number.
     converged
         Whether the loop ended at a solution that the certificate confirms.
     message
@@ -40,9 +40,9 @@ class Calibration(Outcome):
     program
         The convex program at the last linearization.
     certificate
-        Evidence that this is a solution, computed anew from the functions that define it.
+        Evidence that this is a solution, recomputed from the functions that define it.
     calibrate_again
-        `calibrate` with all its arguments but the problem; others may be given in their place.
+        `calibrate` with all its arguments but the problem; others may replace them.
     record
         Origin of the data, for files and reports.
     learned

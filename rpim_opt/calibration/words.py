@@ -25,14 +25,14 @@ from rpim_opt.robot.parameters import EXPANSION, is_joint_offset, of_session, ow
 MOST_ROWS, MOST_BOUNDS = 8, 5  # number of outliers and active bounds named individually
 LAST_DIGIT = 1e-4  # what tables of parameters show [mm, degree]
 WHERE = {"position": "in position along each axis", "orientation": "in orientation", "joint": "at the joints"}
-"""How the parts of the robot's repeatability are said."""
+"""Wording of the components of the robot's repeatability."""
 DEFLECTIONS = {
     "compliance": "deflection of joints under gravity",
     "ecc": "first harmonic of joints",
     "ecc2": "second harmonic of joints",
     "bend": "deflection of links under gravity",
 }
-"""Model extensions whose scales are said as deflections of `EXPECTED` where these are largest."""
+"""Model extensions whose scales are reported as deflections, at the configuration where these are largest."""
 UNUSUAL = 10.0  # scales of its group beyond which a deviation is said to be unusual: 2 in 1000 are under Student's t_3
 MOST = 5  # unusual parameters and outliers that are named one by one
 VAGUE = 0.5  # standard deviation of the logarithm of a hyperparameter from which on only its upper bound is said
@@ -153,7 +153,7 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
             "conditional on them: too small where these do not hold for the robot."
         )
     if not result.formulation.solvable:
-        lines.append("The formulation has functions that the result file cannot hold: it cannot be solved again.")
+        lines.append("The result file cannot store functions of a script: use that script to calibrate again.")
     if result.record.noise_assumed:
         lines.append(
             "The measurement noise is assumed, not stated; uncertainties and verdict depend on it. State the "
@@ -229,7 +229,7 @@ def _estimates(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, 
     if EXPANSION in learned.sizes:
         per_kelvin = 1e6 * learned.stated * learned.sizes[EXPANSION].value * z
         of = [own_name(name) == EXPANSION for name in names]
-        expansion = [f"{value:.3g} um per metre and kelvin" for value in per_kelvin[of]]
+        expansion = [f"{value:.3g} um/(m K)" for value in per_kelvin[of]]
     return {
         "Estimated prior scale": groups,
         "Estimated scale of model extensions": deflections,
@@ -242,7 +242,7 @@ def _estimates(learned: Learned, names: tuple[str, ...], z: Array) -> dict[str, 
 
 
 def _model_lines(learned: Learned) -> list[str]:
-    """Say which model extensions were selected, and by how much the evidence supports each."""
+    """Return a sentence on the selected model extensions and the evidence for each."""
     if not learned.trials:
         return []
     gains = {extension: learned.gain(extension) for trial in learned.trials for extension in trial.extensions}
@@ -257,14 +257,14 @@ def _model_lines(learned: Learned) -> list[str]:
 
 
 def _figure(size: Size, factor: float, unit: str) -> str:
-    """Say a hyperparameter with its 95 % confidence interval."""
+    """Return a hyperparameter with its 95 % confidence interval as text."""
     spread = np.exp(TWO_SIDED * min(size.spread, 7.0))
     value = factor * size.value
     return f"{value:.2g} {unit} (95 % CI {value / spread:.2g} to {value * spread:.2g})"
 
 
 def _figure_or_bound(size: Size, factor: float, unit: str) -> str:
-    """Say the same, or an upper bound with 95 % confidence where little more is known."""
+    """Return the same, or an upper bound with 95 % confidence where little more is known."""
     if size.spread <= VAGUE:
         return _figure(size, factor, unit)
     return f"at most {factor * size.value * np.exp(ONE_SIDED * size.spread):.2g} {unit} (95 % confidence)"
@@ -274,7 +274,7 @@ def camera_remarks(result: Outcome) -> list[str]:
     """Return remarks on views of a camera; empty if there are none."""
     if not camera_blocks(result.problem.sample().data):
         return []
-    from rpim_opt.calibration.leverage import improvement  # which no other measurement asks for
+    from rpim_opt.calibration.leverage import improvement  # which no other measurement needs
 
     before, after = (rms(errors(dimension="pixel")) for errors in (result.nominal_errors, result.errors))
     remarks = [

@@ -200,7 +200,7 @@ class Dataset(Tabled):
     def grouped_by_points(self) -> Dataset:
         """Return the measurements with one configuration number for all rows that share an unknown point.
 
-        Those are touches of a point or plane, of those that a drawing joins, and what was measured in the same
+        Those are touches of a point or plane, of those with a known relation, and what was measured in the same
         configuration: a fold of a cross-validation has all of them or none.
         """
         touches = (zip(block.row, block.touched, strict=True) for block in self.blocks if block.touched is not None)

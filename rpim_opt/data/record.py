@@ -22,7 +22,7 @@ CONFIDENCE = 0.95  # probability with which a limit is to be kept, where no othe
 class Requirement:
     """A tolerance on the position error, and the region where it applies.
 
-    The ``limit`` is that of the distance between the position that is reached and the one that the model says [m], kept
+    The ``limit`` bounds the distance between the position reached and the one that the model predicts [m], kept
     with probability ``confidence`` at every configuration of the region: the nominal reflector in a ``box``, sides
     (low, high) along x, y, z [m] in the robot's base frame, anywhere by default; ``joints`` within sides (low, high)
     [rad or m], by their number from 1, the others within what was measured. ``marker`` is the reflector; the only one,
@@ -117,16 +117,16 @@ class Earlier(NamedTuple):
 class Record:
     """Where a calibration's data come from, and what was held out.
 
-    ``title`` and ``source`` say what was calibrated and where every figure comes from. ``validation`` are measurements
+    ``title`` and ``source`` name what was calibrated and the origin of its data. ``validation`` are measurements
     that no step of the calibration saw, ``files`` the SHA-256 of the input files by name, ``excluded`` the rows that
     were left out, label to reason; ``simulated`` is whether the measurements are, ``noise_assumed`` whether their noise
-    is a guess. It was ``made`` then (UTC, ISO 8601), by packages of these ``versions``. ``details`` say who measured,
+    is a guess. It was ``made`` then (UTC, ISO 8601), by packages of these ``versions``. ``details`` state who measured,
     when, with which instrument, as somebody stated it.
 
     The ``requirement`` is what the robot is accepted by, if anything is; ``held_out`` are rows that were judged before
     they were used, None where validation data are still unused; ``earlier`` the calibrations that this one carries on
     (`use.update`), the last one last; ``digest`` that of the file that it was read from. Later tables are read as
-    ``reading`` says (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder,
+    ``reading`` states (`TableOptions.stated`); ``terms`` are those of a Python file in the problem's folder,
     ``mine:droop``.
 
     >>> import rpim_opt as ro

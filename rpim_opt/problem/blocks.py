@@ -44,7 +44,7 @@ def reduced(problem: CalibrationProblem, x: Array, reweigh: Reweigh | None = Non
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PartitionedProblem(RobotModel):
-    """A calibration problem whose measurements come in blocks, read anew at every iteration.
+    """A calibration problem whose measurements come in blocks, read again at every iteration.
 
     Every block is reduced to a QR factor (n+1, n+1), and these to one; so that memory depends on the largest block and
     not on their number, and blocks may be read by threads or by the workers of a cluster. What needs rows goes through
@@ -205,7 +205,7 @@ def _read(parameters: Parameters, dropped: frozenset[str], part: Numbered) -> Da
     known = {frame_of(name) for name in parameters.names if of_session(name)}
     strange = [name for name in data.sessions if session_prefix(name) not in known]
     if known and strange:
-        accepted = "sessions of the parameters; starting_parameters(..., sessions=...) takes the names of all parts"
+        accepted = "sessions with parameters: starting_parameters(..., sessions=...) takes the names of all blocks"
         raise InputError("session", f"'{strange[0]}' in block {number}", accepted)
     return data
 

@@ -143,7 +143,7 @@ class Touches:
 
     Touches at p_i have the equations c - p_i ~ 0 with an unknown point c, or n'(p_i - c) ~ 0 with a plane.
     Their best values follow from the touches (`Feature`), and what the equations say of the robot alone are contrasts,
-    which do not depend on them: c is a fixed effect, exactly. What a drawing knows of two of them is an equation of
+    which do not depend on them: c is a fixed effect, exactly. A known dimension between two of them is an equation of
     these best values: d - |c_2 - c_1| for points, d - |n_1'(c_2 - c_1)| for planes, 0 - asin n_1'n_2 for square ones,
     n_2 along two directions in the first for parallel ones.
 

@@ -51,7 +51,7 @@ class Design(Brief):
         what = f"{count}, {self.criterion}-optimal ({CRITERIA[self.criterion]})"
         if self.gap > 1:
             return f"{what}: too few for a useful optimality bound; choose more."
-        return f"{what}: no other set is more than {100 * self.gap:.2f} % better."
+        return f"{what}: no other choice is more than {100 * self.gap:.2f} % better."
 
 
 def random_candidates(robot: Robot, count: int, seed: int | np.random.Generator = 0, share: float = 1.0) -> Array:
@@ -113,7 +113,7 @@ def choose(
     The relaxation is solved by multiplicative steps (Silvey, Titterington and Torsney 1978), whose slopes bound what
     any set can reach. The largest weights are rounded and improved by exchanges (Fedorov 1972).
 
-    The first block of the problem's data says what is measured. ``candidates`` (M, dof) are joint values of the
+    The first block of the problem's data defines what is measured. ``candidates`` (M, dof) are joint values of the
     controller that could be measured, ``measured`` rows that are there already, which M then counts, too. InputError
     for another criterion, a count that the candidates do not allow, or measurements between two points.
 
@@ -286,7 +286,7 @@ class Observability(Brief):
 
     def __str__(self) -> str:
         indices = ", ".join(f"{name} {value:.3g}" for name, value in self.indices.items())
-        weak = f"; {self.weak} of them the prior determines more precisely than the data" if self.weak else ""
+        weak = f", {self.weak} of them more precisely from the prior than from the data" if self.weak else ""
         raw = f", {self.raw_condition:.3g} in mm and rad" if np.isfinite(self.raw_condition) else ""
         lines = [
             f"{self.rank} of {len(self.names)} parameter combinations are identifiable{weak}.",

@@ -28,8 +28,8 @@ class LinearModel(Brief):
     Sigma^-1/2 r + A z_k, so that z is the *total* deviation in units of the scales. ``group`` (m,) is the number of the
     configuration that an equation belongs to; ``parameters`` are the n identified ones.
 
-    ``constrained`` says whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would
-    meet them, so that how well they are met does not tell the noise. ``stands_for`` is how many equations A and b were
+    ``constrained`` is whether measured values are constraints (a plane, a sphere). A robot shrunk to nothing would
+    satisfy them, so that their residuals do not determine the noise. ``stands_for`` is how many equations A and b were
     reduced from by a rotation, None where they are the equations themselves, and ``offset`` what a loss that these
     equations stand for has besides |A z - b|^2. ``factor`` is what a loss multiplied the squares by, which are in units
     of the noise with 1.

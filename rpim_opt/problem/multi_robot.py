@@ -40,12 +40,12 @@ def together(
     The problems are in memory, of one robot each; called ``A``, ``B``, ..., or by name: ``left=problem``. ``shared``
     are patterns of the parameters that are one and the same in all problems that have them, ``["tool_*"]``; their
     nominal values are those of the first of these. Or patterns by the names of problems, each with its own: of two arms
-    of one cell and a camera elsewhere, the arms' ``base_*``. Joints of one URDF have parameters that can be shared
+    of one cell and a camera outside, the arms' ``base_*``. Joints of one URDF have parameters that can be shared
     where chains branch, too, with ``read_urdf(..., origins=True)``.
 
     InputError for fewer than two problems, a pattern that matches no parameter that several have, shared parameters
     that are stated differently, repeatability (it is stated of the whole, or learned), data in blocks, and touches of a
-    point that is elsewhere for another robot.
+    point that is at another place for another robot.
 
     >>> import rpim_opt as ro
     >>> problem = ro.load("position").problem
@@ -88,7 +88,7 @@ def together(
 def _common(
     parts: Mapping[str, CalibrationProblem], shared: Sequence[str] | Mapping[str, Sequence[str]]
 ) -> dict[str, set[str]]:
-    """Return what every problem shares: parameters that match a pattern and that several have, stated alike."""
+    """Return what every problem shares: parameters that match a pattern and that several have, stated equally."""
     patterns = shared if isinstance(shared, Mapping) else dict.fromkeys(parts, shared)
     for key, each in patterns.items():
         pick(parts, key, "together, shared")

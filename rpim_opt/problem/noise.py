@@ -12,7 +12,7 @@ from rpim_opt.basics.text import three_digits
 from rpim_opt.data.dataset import Dataset
 
 UNITS = {"length": ("mm", 1e-3), "angle": ("mrad", 1e-3), "pixel": ("px", 1.0)}
-"""Unit in which residuals and their deviations are said, and its size in SI."""
+"""Unit in which residuals and their standard deviations are reported, and its size in SI."""
 
 
 def in_unit(error: float | None, dimension: str) -> str:

@@ -46,7 +46,7 @@ from rpim_opt.robot.parameters import (
 )
 from rpim_opt.robot.terms import Curve, Model, transmission
 
-SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move all of a robot alike
+SHIFTED = ("base_x", "base_y", "base_z")  # parameters that move the whole robot
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -67,7 +67,7 @@ class RobotModel(Tabled):
         """Return the same problem with just the parameters identified that match one of the patterns.
 
         These are names with ``*``, ``?`` and ``[...]`` as in file names, or ``"auto"``: the geometry of all links,
-        Hayati's beta between nearly parallel axes, and the frames that the measurements can tell. InputError for a
+        Hayati's beta between nearly parallel axes, and the frames that the measurements identify. InputError for a
         pattern that matches no parameter.
         """
         p = self.parameters
@@ -143,7 +143,7 @@ class RobotModel(Tabled):
     def frozen(self) -> Self:
         """Return a copy that evaluates every measurement model once, now, and keeps the result.
 
-        A measurement of a script may read a variable, an attribute, a file: `residual` and its like ask it anew at
+        A measurement of a script may read a variable, an attribute, a file: `residual` and others evaluate it at
         every call. Within a calibration one answer has to serve from the first iteration to the last.
         """
         if self.frozen_functions is not None:
@@ -159,8 +159,8 @@ class CalibrationProblem(RobotModel):
     """Measurements, the nominal robot (several by name, see `together`), and the parameters that explain them.
 
     The unknowns x (n,) are the deviations [SI] of the identified parameters from nominal. Equations stand in the order
-    of the data's blocks. ``frozen_functions`` are those that `frozen` keeps, None where every call asks the measurement
-    models anew; ``repeatability`` is the robot's repeatability, None for the instrument's noise alone. InputError when
+    of the data's blocks. ``frozen_functions`` are those that `frozen` keeps, None where calls evaluate the measurement
+    models again; ``repeatability`` is the robot's repeatability, None for the instrument's noise alone. InputError when
     nothing is identified, or the data do not fit the robot or the parameters.
 
     >>> import numpy as np
@@ -303,7 +303,7 @@ class CalibrationProblem(RobotModel):
             absent = (p.nominal == 0) & ~p.identified
             robot = self.arms[block.robot]
             names = p.names
-            if block.robot:  # those of other robots keep their long names, which no formulation asks for
+            if block.robot:  # those of other robots keep their long names, which no formulation uses
                 visible = set(p.places_of(block.robot).tolist())
                 names = tuple(own_name(name) if i in visible else f".{name}" for i, name in enumerate(names))
             loads = loads_of(robot, needed(robot, p.of_robot(block.robot)), self.data, block)
@@ -390,7 +390,7 @@ class CalibrationProblem(RobotModel):
             if of:
                 errors[block.row] = np.sqrt(np.sum(residual[:, of] ** 2, axis=1))
         for index in self.touches.rows if self.touches else ():
-            if len(index) == 1:  # met whatever the robot
+            if len(index) == 1:  # satisfied by any robot
                 errors[self._equations.row[index[0]]] = np.nan
         return errors
 
@@ -571,7 +571,7 @@ class CalibrationProblem(RobotModel):
 class Identified(Parameters):
     """The n identified parameters of a linear model, with the problem that positions are predicted from.
 
-    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is asked for, also those
+    These are linear about the deviations ``at`` (n,) [SI], or about nominal; where a region is requested, also those
     that move farthest at the deviations ``farthest`` (n,) [SI] are looked at.
     """
 

@@ -94,7 +94,7 @@ def _derived(inputs: list[ca.SX], outputs: list[ca.SX]) -> Functions:
 
 
 class _Parameters:
-    """The parameters of a row by name: symbols are taken as asked for, since a row sees few of many."""
+    """The parameters of a row by name: symbols are made at first use, since a row depends on few of many."""
 
     def __init__(self, of: Structure) -> None:
         there = np.flatnonzero(~np.frombuffer(of.absent, dtype=bool))

@@ -72,7 +72,7 @@ def markers(problem: CalibrationProblem) -> list[str]:
 
 @lru_cache(maxsize=SOME)
 def _in_box(problem: CalibrationProblem, box: tuple[tuple[float, float], ...], marker: str | None) -> Array:
-    """Return configurations (N, dof) with the nominal reflector in a box, which is asked for at every iteration."""
+    """Return configurations (N, dof) with the nominal reflector in a box, which every iteration uses."""
     low, high = np.array(box).T
     inside = np.zeros((0, problem.robot.dof))
     for seed in range(ROUNDS):
@@ -233,7 +233,7 @@ def touched_place(problem: CalibrationProblem) -> Array:
     return min(centres, key=lambda centre: float(np.sum((centre - middle) ** 2)))
 
 
-TIMES = 100  # how often configurations are drawn to find some in which the board is in sight
+TIMES = 100  # how often configurations are drawn to find some in which the board is visible
 MARGIN = 0.04  # part of the image along its edges in which no point appears
 LARGE = 0.15  # least width of a board in the image, as part of the image's
 UPRIGHT = 0.5
@@ -253,7 +253,7 @@ def visible_configurations(
 
     They are drawn as by `random_candidates`. Frames and intrinsics are those of the problem's camera, at deviations
     ``x`` (n,) [SI], nominal by default; ``points`` are (P, 3) of the board [m], ``image`` is width and height [px].
-    InputError for a problem without a camera, and a board that is hardly ever in sight.
+    InputError for a problem without a camera, and a board that is hardly ever visible.
 
     >>> import numpy as np
     >>> import rpim_opt as ro

@@ -50,7 +50,7 @@ VANISHED = 1e-4  # penalties below this part of the median one are not drawn: a 
 def errors(result: Calibration, data: Dataset | None = None, ax: Axes = None) -> Axes:
     """Draw every row's error [mm] before and after calibration; flagged rows of the identification data are marked.
 
-    The rows are those of the identification data, and the axes new ones, unless others are given.
+    The rows are those of the identification data, and the axes new ones, unless others are stated.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("paper_arm")
@@ -179,7 +179,7 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     """Draw the L-curve: root of the penalty against root of the loss over the weight, with the selectors' choices.
 
     The program is solved at 200 weights where it has a closed form, else at 40; InputError without a penalty. The
-    weight of a result is marked, and the choices that are given by name.
+    weight of a result is marked, and the selectors' choices, by name.
 
     >>> import rpim_opt as ro
     >>> result = ro.calibrate(ro.load("position").problem, ro.tikhonov, weight=ro.reml)
@@ -216,7 +216,7 @@ def l_curve(of: Program | Calibration, selections: Mapping[str, Selection] | Non
     ax.set(ylabel="root of the penalty" if program.penalty_form is None else norms[1])
     logarithmic(ax, "x")
     logarithmic(ax, "y")
-    groups: list[tuple[Array, Array, list[str]]] = []  # a mark, where it is in parts of the axes, and its rules
+    groups: list[tuple[Array, Array, list[str]]] = []  # a mark, its place as fractions of the axes, and its rules
     for name in sorted(marked, key=lambda name: marked[name]):
         for point in at(marked[name]):
             place = (ax.transScale + ax.transLimits).transform(point)

@@ -313,7 +313,7 @@ def _parameters(content: Content) -> Iterator[Block]:
         allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
         rows.append([f"{name} [{unit}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)
-    files = "Exported files hold the geometry of a fit of its own, without model extensions: other numbers than these."
+    files = "Exported files hold the geometry of a separate fit without model extensions, with other values than these."
     yield "text", [note, *words.turned_frames(result), *([files] if _beyond_geometry(result) else [])]
     count = Counter(np.array(own.dimensions)[~own.of_frames].tolist())
     drawn = []
@@ -331,7 +331,7 @@ def _transmission(result: Calibration) -> Iterator[Block]:
     if not curves:
         return
     yield "heading", "Transmission errors of the joints"
-    yield "text", ["Controller's joint angle plus this error is the actual one; unknown outside the measured range."]
+    yield "text", ["Actual joint angle: the controller's plus this error, which is unknown outside the measured range."]
     yield "table", Table("Within the measured range", *words.curve_columns(result))
     factor = Uncertainty(result).coverage_factor if np.isfinite(curves[0].standard).all() else 0.0
     largest = max(float(np.max(np.abs(each.error) + factor * np.nan_to_num(each.standard))) for each in curves)
@@ -406,7 +406,7 @@ def _flagged(result: Calibration) -> Block:
             error = in_unit(row.error, row.dimension)
             rows.append([row.label, "", error, f"excluded outlier, {row.ratio:.0f} times the median error"])
     if not rows:
-        return "text", ["No row is flagged or excluded (one in a hundred good data sets has a flagged row)."]
+        return "text", ["No row is flagged or excluded (by chance, one in a hundred good data sets has a flagged row)."]
     head = ["row", "standardized residual", "error", "status"]
     return "table", Table("Largest first", head, rows, prose=True)
 

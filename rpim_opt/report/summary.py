@@ -167,13 +167,13 @@ def identifiability(result: Calibration) -> str:
     s = np.linalg.svd(model.triangle[:-1, :-1][:, parameters], compute_uv=False)
     rank, count = int(np.sum(s > RANK_TOLERANCE * s[0])), int(parameters.sum())
     apart = "" if parameters.all() else ", without the transmission errors of the joints"
-    others = " Parameter standard deviations include the unidentifiable ones; predictions of what was measured do not."
+    others = " The others enlarge standard deviations of parameters, not those of predicted measurements."
     others = others if rank < count else ""
     return f"{rank} of {count} parameter combinations are identifiable from {model.equations} equations{apart}.{others}"
 
 
 def warnings(result: Calibration, checked: bool = False) -> list[str]:
-    """Return the warnings, the most serious first; ``checked`` says that new measurements stand beside the result."""
+    """Return the warnings, the most serious first; ``checked`` where new measurements validate the result."""
     lines = [line for line in words.remarks(result, result.verdict) if line != result.message]
     excluded = result.record.excluded
     if excluded:

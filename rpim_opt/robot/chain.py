@@ -129,7 +129,7 @@ def require_same_arm(
 ) -> list[str]:
     """Refuse a robot whose joints or nominal parameters differ from a file's MDH table (n, 5).
 
-    The file's joints are those of the table: what its joint map says of the controller's values stays beside the file.
+    The file's joints are those of the table: its joint map, from the controller's values, is not in the file.
     Return that (`joint_values`).
     """
     if robot.joint_types != joint_types:
@@ -163,7 +163,7 @@ def joint_values(robot: Robot, joint_map: Array, file: Path) -> list[str]:
         places.append(f"joint {i + 1} is at {' '.join(terms)}")
     if not places:
         return []
-    return [f"{file.name}: with the calibration's joint values q its {joined(places)}; it does not hold this mapping."]
+    return [f"{file.name}: with the calibration's joint values q its {joined(places)}; the file lacks this mapping."]
 
 
 def without_beta(robot: Robot) -> Robot:
@@ -220,7 +220,7 @@ def _to_axis(axis: Array) -> Array:
 
 
 def _step(M: Array, near: Array, parallel: float) -> tuple[float, float, float, float, float]:
-    """Return theta, d, beta, alpha, a that reach the z axis of M, as `describe` says, near those of two rows (2, 5)."""
+    """Return theta, d, beta, alpha, a that reach the z axis of M, as in `describe`, near those of two rows (2, 5)."""
     theta0, d0, alpha0 = near[0, 2], near[0, 3], near[1, 0]
     v = M[:3, 2]
     p = M[:3, 3]

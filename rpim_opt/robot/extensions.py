@@ -19,10 +19,10 @@ from rpim_opt.robot.terms import BEND_SCALE, JOINT_TERMS, Configuration, Symbol,
 GUESS = ((5.0, None), (10.0, 4))
 """Masses [kg] at the origin of a frame, None for the last: what an arm is taken for that states none."""
 AXES = "xyz"
-EXPECTED = 1e-4  # expected size of an extension's deflection [rad] at the configuration where it is largest
+EXPECTED = 1e-4  # prior scale of an extension's deflection [rad] at the configuration where it is largest
 DRAWS = 300
 SAME = 1e-2
-"""Columns that differ by less, relatively, say the same: far from rounding, and from tilts of some milliradians."""
+"""Columns that differ by less, relatively, are redundant: far from rounding, and from tilts of some milliradians."""
 
 
 @dataclass(eq=False, kw_only=True)
@@ -155,7 +155,7 @@ def bend_names(robot: Robot) -> tuple[str, ...]:
     """Return the non-redundant parameters ``bend{i}_{k}{a}`` of a robot.
 
     Over random joint values, those whose slope (`moment_slopes`) is neither constant nor, but for a factor and a
-    constant, that of an earlier one of the same joint. With constants they say all that masses of links can do to
+    constant, that of an earlier one of the same joint. With constants they represent all that masses of links can do to
     an arm of revolute joints.
     """
     n = len(robot.mdh)

@@ -32,7 +32,7 @@ class Gravity:
     ``direction`` is where it points in the robot's base frame (frame 0 of the table), made a unit vector. ``masses``
     are those of the links that joints 1 to dof move [kg], ``centres`` where they are in the links' own frames [m], the
     frames after these joints. Without: a guess, 5 kg at the last frame's origin and 10 kg at frame 4's, which is good
-    enough to tell how torques go with the configuration: compliance takes up their size. ``payload`` is what the flange
+    enough for how torques depend on the configuration: compliance takes up their size. ``payload`` is what the flange
     carries besides [kg], ``payload_centre`` where, in the flange frame [m]. InputError for no direction, masses that
     are negative, numbers that are not finite or do not fit together.
 
@@ -118,11 +118,11 @@ class Robot(Brief):
 
     where q are the joint values of the model, ``joint_map @ (joint values of the controller)``.
 
-    ``mdh`` is (n, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad]; ``joint_types`` say ``"revolute"`` or
+    ``mdh`` is (n, 5), columns alpha [rad], a [m], theta [rad], d [m], beta [rad]; ``joint_types`` are ``"revolute"`` or
     ``"prismatic"`` of every joint, all revolute by default. ``joint_map`` (n, dof) holds signs and couplings between
     the controller's joint values and the model's, the identity by default (a FANUC counts joint 3 from the horizontal);
     mimic joints have a row and no column: dof is less than n then. ``limits`` (dof, 2) are lower and upper joint values
-    of the controller [rad or m], infinite where unknown; ``source`` says where the table comes from. ``model`` are
+    of the controller [rad or m], infinite where unknown; ``source`` is the origin of the table. ``model`` are
     terms of a user's own, by which it moves besides; `forward_kinematics` is of the table alone. InputError for shapes
     that do not fit, numbers that are not finite, a singular joint map, limits that are not in order, masses that are
     not one per joint.

@@ -30,7 +30,7 @@ DEFAULT_SCALE = {
     ("base", "length"): 100e-3, ("base", "angle"): 100e-3,
     ("camera", "pixel"): 10.0, ("camera", "ratio"): 1e-3, ("camera", ""): 0.05,
 }  # fmt: skip
-"""Expected size of deviations by (group, dimension), in SI, where a problem states none; terms state their own."""
+"""Default prior scales of deviations by (group, dimension) [SI]; terms state their own."""
 STEEL = 12e-6  # by how much steel grows [1/K]; aluminium by 23e-6
 SHOWN = 4  # names in one line
 KNOWN = 2**14  # names whose meaning is cached: those of a hundred robots
@@ -116,7 +116,7 @@ class Parameters(Tabled):
     reflectors ``tool_A_x, ...``) and those of the measurement; ``dimensions`` ``length``, ``angle``, ``ratio`` or
     ``compliance``. ``nominal`` (P,) are the values from which deviations count, ``scale`` (P,) their prior standard
     deviations, ``tolerance`` (P,) the largest deviations that a bounded calibration allows, or infinite [SI];
-    ``identified`` (P,) says which a calibration may change. ``own_frames`` are prefixes of measurements' frames,
+    ``identified`` (P,) marks those that a calibration changes. ``own_frames`` are prefixes of measurements' frames,
     ``plane_``, ``terms`` names of the parameters of a user's own terms (`Model`).
 
     >>> import rpim_opt as ro
@@ -288,7 +288,7 @@ class Parameters(Tabled):
         return dict(zip(self.names, self.values_at(x).tolist(), strict=True))
 
     def scaled(self, table: Mapping[str, float], file: object = None) -> Parameters:
-        """Return the same table with other scales, given as in a problem file's ``[scale]``.
+        """Return the same table with other scales, stated as in a problem file's ``[scale]``.
 
         Keys are ``length_mm``, ``angle_mrad``, ``tool_mm``, ``base_mrad``, ... for a group, ``joint_offset_mrad`` for
         every theta, or a pattern or a parameter's name with a unit, ``a?_mm``, ``d5_mm``. A name goes before a pattern,

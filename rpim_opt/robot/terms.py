@@ -144,7 +144,7 @@ class Term:
     frame behind the link, the robot's or the flange's, is displaced along and about its own axes. Small terms of a link
     add up. A term whose parameters are all zero must not move anything; it is not evaluated then.
 
-    ``scales`` are the parameters by name, with their unit and expected size: ``{"play_mrad": 0.1}``. Every joint or
+    ``scales`` are the parameters by name, with their unit and prior scale: ``{"play_mrad": 0.1}``. Every joint or
     link has its own, ``play2``; ``{}`` in a name stands for the number. ``nominal`` are their nominal values, with the
     same keys, zero by default. ``joints`` are numbers (from 1) or types (``"revolute"``, ``"prismatic"``) of the joints
     or links that have it, by default the revolute joints, and all links. ``columns`` are further columns of the data

@@ -49,7 +49,7 @@ class Instance(Tabled):
     """A calibration problem of a folder, with validation data and settings.
 
     ``problem`` has robot, parameters and identification data; ``formulation``, ``weight`` (None where hyperparameters
-    are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result says of
+    are estimated), ``prior``, ``model`` and ``noise`` are as for `calibrate`. ``record`` is what a saved result has of
     the data, with the validation data; ``published`` are mean errors [mm] that the source prints for the same table, by
     role (identification, validation) and method; ``reference`` figures that a run must reproduce, by name, (value,
     tolerance); ``held_out`` is whether the validation data were drawn from the same table: once they have validated,

@@ -91,7 +91,7 @@ def new_problem(
     name of a ready robot, or a file, ``data`` are text, Excel or Parquet files. ``measurement`` is what was measured,
     by default poses where the tables have orientations, else positions; ``options`` are what is stated of the tables.
     ``urdf_base`` and ``urdf_tip`` are links between which a URDF's robot is, ``dh`` the convention of a DH table,
-    ``"modified"`` or ``"standard"``, where it does not say it (`read_sheet`).
+    ``"modified"`` or ``"standard"``, where it states none (`read_sheet`).
 
     ``validation`` is a table or several, or ``hold_out`` the part of the configurations that is drawn at random with
     ``seed``. ``chain`` is the NAME of ``[chain.NAME]``, a problem on the origins of a URDF's joints; a chain that goes
@@ -176,7 +176,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, rows: 
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         there = f"{frame}, {placed(arm.tool)} in the flange frame"
     yield (
-        f"{understanding.kind.words.thing_at} starts at {there}: state its place in [tool] if it is known. [tool], "
+        f"{understanding.kind.words.thing_at} starts at {there}: state its position in [tool] if it is known. [tool], "
         "`known` and --tool refer to the flange frame after the last joint."
     )
     if placed(arm.base) != placed(np.zeros(6)):

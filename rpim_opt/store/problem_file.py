@@ -125,7 +125,7 @@ def _place(table: Mapping[str, Any], robot: Robot, data: Dataset, where: str) ->
     """Return joint values (N, dof) [rad or m], or the sides of a box [m]."""
     if "rows" in table:
         if len(table) > 1:
-            raise InputError(where, "rows and other keys", "rows alone")
+            raise InputError(where, "rows and other keys", "rows only")
         return _rows(data, table["rows"], where)
     joints = _joints(robot)
     known = dict.fromkeys(BOX, ("length",)) | joints
@@ -274,7 +274,7 @@ class ProblemTable(Table):
     identification: str | None = None  # Table of the identification data.
     validation: str | None = None  # Table of the validation data.
     held_out: bool = False  # Validation data are rows of the same table: once they have validated, all rows are used.
-    noise_assumed: bool = False  # The measurement noise is a guess, which results and reports say.
+    noise_assumed: bool = False  # The measurement noise is a guess, which results and reports state.
     raw: dict[str, str] = Field({})  # Files from which `new` made the tables: name = SHA-256.
     observation: list[Observation] = Field([])  # Several measurement types, a table each.
     target: str | dict[str, Any] | None = None  # Board of a camera: a table, or columns, rows and spacing.
@@ -345,7 +345,7 @@ def read_problem(
     path = inside(folder, "problem.toml", "the problem", folder)
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     content = read_toml(path)
-    table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is asked for
+    table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is requested
     if variant is not None:
         content = _overlay(content, pick(table.variant, variant, "variant", path))
         table, placed = _checked(content, kinds, path)
@@ -449,7 +449,7 @@ def stated_prior(
 ) -> Prior:
     """Return the prior of a problem file, checked against the problem's parameters.
 
-    What ``scale`` says of joint offsets alone, or of a parameter by its name, is taken at its word: somebody has
+    A ``scale`` of joint offsets alone, or of a parameter by its name, is taken at its word: somebody has
     thought of it, as of a certificate's standard uncertainty of a reflector's place.
     """
     for key in ("inflate", "without"):

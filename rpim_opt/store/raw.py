@@ -30,13 +30,13 @@ from rpim_opt.robot.chain import RobotSetup
 
 CLEARLY = 3.0  # The right reading of orientations, or mounting of a camera, leaves so many times less than another.
 USUAL = "extrinsic xyz"
-SINCE_1970 = 1e8  # times [s] that are larger; others may begin anew in every file
+SINCE_1970 = 1e8  # times [s] that are larger; others may begin at zero in every file
 READINGS = {
     "quaternion": ORDERS,
     "rotation": (USUAL, "vector", *(f"intrinsic {''.join(order)}" for order in permutations("xyz") if order[0] != "z"),
                  "intrinsic zxy"),
 }  # fmt: skip
-"""What an option may say, and a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
+"""Values of the option, which a check against the robot tries; extrinsic turns are intrinsic ones in reverse order."""
 Files = Sequence[tuple[Path | None, RawTable]]
 
 

@@ -77,8 +77,8 @@ def save_result(result: Calibration, path: str | Path) -> None:
 def load_result(path: str | Path, measurements: Sequence[Measurement] = (), model: Models | None = None) -> Calibration:
     """Return the calibration that a file holds.
 
-    A digest tells whether anything was changed since it was written: by error, that is, and not by somebody who also
-    writes a new digest. The errors of all rows are computed anew and compared with those that the file states.
+    A digest shows whether anything was changed since it was written: by error, that is, and not by somebody who also
+    writes a new digest. The errors of all rows are recomputed and compared with those that the file states.
     A formulation with functions of a script's own is there by its name: it cannot be solved again, everything else
     works.
 
@@ -280,7 +280,7 @@ def _rows(result: Calibration) -> dict[str, list[RowErrors]]:
 
 
 def _terms(model: Model, robot: Robot) -> list[OwnTerm]:
-    """Return what a file says of a user's own terms on a robot: all but their functions."""
+    """Return what a file holds of a user's own terms on a robot: all but their functions."""
     own = [term for term in model.terms if not term.ready]
     names = [[name for i in term.places(robot.joint_types) for name in term.names(i)] for term in own]
     return [OwnTerm(term.at, named, dict(term.columns)) for term, named in zip(own, names, strict=True)]
@@ -475,7 +475,7 @@ def _listed(array: np.ndarray) -> Any:
 
 
 def _array(values: Any, kind: Any) -> np.ndarray:
-    """Return lists as an array: of floats where the class says so, otherwise of integers, truth values or texts."""
+    """Return lists as an array: of floats where the class has them, otherwise of integers, truth values or texts."""
     if kind is not np.ndarray:
         return np.array(values, dtype=float)  # reads "nan" and "inf", too
     array = np.array(values)

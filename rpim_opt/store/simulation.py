@@ -161,7 +161,7 @@ def write_simulation(name: str | Path, seed: int | None = None, out: Path | None
 
 @dataclass(frozen=True, eq=False)
 class _Table:
-    """One table of the true deviations ``x`` (n,) [SI]; it is noisy where it identifies, and draws alike where not."""
+    """One table of the true deviations ``x`` (n,) [SI]; it is noisy where it identifies, with the same draws if not."""
 
     stated: ProblemFile
     plan: Simulation

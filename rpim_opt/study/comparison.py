@@ -80,7 +80,7 @@ def compare(
     (n,) [SI], a calibration, or a function from joint values (N, dof) to positions (N, 3) [m]. ``options`` are further
     ones of every calibration: ``{"model": "auto"}``.
 
-    ``splits`` say which configurations are held out: ``"folder"``, the validation data of the problem; a part of its
+    ``splits`` are the configurations held out: ``"folder"``, the validation data of the problem; a part of its
     data (``0.25``); in how many folds (``5``), one replicate a fold. ``counts`` are of how many of the others to
     identify from, by default all. ``noise`` are factors, 1 or more, on the noise of the data to fit: the missing part
     is added, and declared. ``seeds`` are how many, or which: of generated problems, splits, draws and noise.
@@ -91,9 +91,9 @@ def compare(
 
     ``workers`` are processes on this machine, -1 for all processors; or of a cluster, where ``joblib.parallel_config``
     names one. Finished replicates are written to the file ``journal``, with which a call with the same code (of the
-    Python files that are loaded) and arguments goes on: more seeds, splits, counts and factors may be asked. It refuses
-    other code and arguments, and those that cannot be pickled. ``resume`` is False to begin it anew; None refuses to
-    drop what it has. ``progress`` is whether a bar is shown, or is told how many replicates of how many are done.
+    Python files that are loaded) and arguments goes on: more seeds, splits, counts and factors may be added. It refuses
+    other code and arguments, and those that cannot be pickled. ``resume`` is False to start again; None refuses to
+    drop what it has. ``progress`` is whether a bar is shown, or a function of the finished and the total number.
 
     InputError before anything is computed: for unknown names, words and numbers, and a journal of something else.
 
@@ -178,9 +178,9 @@ class Comparison:
     """Replicates of methods on problems, one row each.
 
     ``rows`` are plain tables: ``problem``, ``method``, ``formulation``, ``selector``, ``split``, ``fold``, ``count``
-    and ``noise_factor`` (as asked), ``seed``; ``status`` (``ok``, ``not delivered``, ``impossible``, ``failed``) with
+    and ``noise_factor`` (as stated), ``seed``; ``status`` (``ok``, ``not delivered``, ``impossible``, ``failed``) with
     its ``reason``; ``configurations`` and ``parameters`` that were fitted, the ``weight``, and the ``metrics``.
-    ``drawn`` are problems that every seed draws anew, ``asked`` the grid in words, ``made`` script, package, versions
+    ``drawn`` are problems that depend on the seed, ``asked`` the grid as text, ``made`` script, package, versions
     and time.
 
     >>> import rpim_opt as ro
@@ -322,7 +322,7 @@ class Summary:
     """Methods ranked by the geometric mean of their metric.
 
     Less of the ``metric`` is better; others are compared with the ``reference``. ``standings`` are one a method that
-    has figures; ``notes`` say of what the intervals speak, and what is not delivered or has no results.
+    has figures; ``notes`` state what the intervals refer to, and what is not delivered or has no results.
 
     >>> import rpim_opt as ro
     >>> found = ro.compare("position", ["tikhonov", "lasso"], ["reml", 1.0], splits=5)
@@ -419,7 +419,7 @@ def interval(ratios: Mapping[Pair, float], drawn: AbstractSet[str]) -> tuple[flo
     """Return the geometric mean of paired ratios, given as logarithms, and the ends of its 95 % interval.
 
     Replicates of one problem have the problem in common. The mean is over problems, of each one's mean; and with five
-    problems or more it is they that are drawn anew (cluster bootstrap), so that the interval speaks of other problems
+    problems or more it is they that are resampled (cluster bootstrap), so that the interval refers to other problems
     like these. With fewer, what is independent within each is: the arms of a generator, the seeds or else the folds of
     a measured one; then it speaks of other such arms, seeds or folds. Percentiles are those of Hesterberg (2015, The
     American Statistician 69), wider for few.
@@ -475,7 +475,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
     without: dict[tuple[str, str, str], list[str]] = {}
     for row in rows:
         if row["status"] == UNDELIVERED:  # each for reasons with figures of its own
-            row = {**row, "reason": "their figures count; the column reason says why."}
+            row = {**row, "reason": "their figures are included; the column `reason` states why."}
         if row["status"] != OK:
             without.setdefault((row["method"], row["status"], row["reason"]), []).append(row["problem"])
     for (method, status, reason), missing in without.items():
@@ -490,7 +490,7 @@ def _notes(rows: Rows, standings: Sequence[Standing], drawn: AbstractSet[str], r
 def distributions(values: Mapping[str, Sequence[float]], label: str) -> Any:
     """Return a logarithmic dot plot with one line per name, from top to bottom, and marked medians.
 
-    ``values`` are positive figures by name; ``label`` says what they are, with their unit.
+    ``values`` are positive figures by name; ``label`` names them, with their unit.
 
     >>> import rpim_opt as ro
     >>> figure = ro.study.distributions({"reml": [0.1, 0.2, 0.4], "l_curve": [0.2, 0.3, 0.9]}, "mean error [mm]")

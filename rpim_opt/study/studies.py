@@ -127,7 +127,7 @@ def load_study(path: Path, needed: tuple[str, ...] = NEEDED) -> ModuleType:
 def files_of(path: Path, study: ModuleType) -> dict[str, str]:
     """Return digests of the files that a study depends on, by their names in its folder.
 
-    That is whatever lies in its folder but hidden files and results of studies. Where the study says ``DEPENDS =
+    That is whatever lies in its folder but hidden files and results of studies. Where the study defines ``DEPENDS =
     ["data/*.csv"]``, it is that and Python files.
     """
     folder = path.parent
@@ -182,7 +182,7 @@ def run_study(
     computes them. A finished replicate is written down at once. The ``name`` is a file ``mine.py``, a folder with
     ``study.py``, or a study of the checkout without its ending; ``quick`` is the small version; ``workers``,
     ``resume`` and ``progress`` are as `run_cases` has them. ``redraw`` computes nothing: the report is
-    written anew from the replicates of the last run. Results go to ``out``, by default ``results/NAME`` or
+    rewritten from the replicates of the last run. Results go to ``out``, by default ``results/NAME`` or
     ``results/NAME-quick`` beside the study.
     """
     path = find_study(name)

@@ -40,19 +40,19 @@ SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
 REACHED = 1e-7  # A target counts as reached when no more than this is left [m, rad]
 EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared with errors and the limit
-LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is said
+LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is reported
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 FIRST = np.array([1, 1, 1, 1e-2, 1e-2, 1e-2])  # weights [m/rad] of an error with which the position comes first
-POSITION = np.array([1.0, 1, 1, 0, 0, 0])  # what is left of an error where orientations stay as they are
+POSITION = np.array([1.0, 1, 1, 0, 0, 0])  # remaining error where orientations are not corrected
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
-BANK, TRIALS = 2000, 12  # configurations among which a pose without a start looks for near ones; how many it tries
+BANK, TRIALS = 2000, 12  # configurations among which starts of a pose without one are sought; how many it tries
 NULL_SPACE_WEIGHT = 1e-10  # weight of a correction that moves nothing, relative to the largest squared singular value
 STEP_TOLERANCE = 1e-10
 DECREASE_TOLERANCE = 1e-6
 """A row has converged when its step is shorter [rad or m], or lowers the objective by a smaller part."""
 MAX_ITERATIONS = 50
-MOVED = 6  # targets from which on one motion of all of them says something
+MOVED = 6  # targets from which on one motion of all of them is significant
 WEIGHED = "a calibration with compliances identified from torques of gravity, or a term that depends on the payload"
 
 
@@ -99,7 +99,7 @@ class Compensation:
     after_motion: float = np.nan
 
     def _moved(self) -> str:
-        """Say what a common motion of all targets leaves of the uncorrected errors, where it is most of them."""
+        """Return what a common motion of all targets leaves of the uncorrected errors, where it is most of them."""
         if not self.after_motion < rms(self.position_before) / 2:
             return ""
         return f" (a common motion of all targets, or another base, leaves {1e3 * self.after_motion:.4f} mm RMS)"
@@ -121,8 +121,8 @@ class Compensation:
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
-            f"Uncorrected errors refer to the identified base, where targets hold{self._moved()}; nominal errors of a "
-            "report to refitted base and tool.",
+            "Uncorrected errors refer to the identified base, in whose frame targets are "
+            f"stated{self._moved()}; nominal errors in a report refer to a refitted base and tool.",
         ]
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():
@@ -235,7 +235,7 @@ def compensate(
 ) -> Compensation:
     """Correct joint commands so that the calibrated robot reaches the poses of the nominal one.
 
-    A target is the pose of the tool in the robot's base: that of the nominal robot at a command q, or one given.
+    A target is the pose of the tool in the robot's base: that of the nominal robot at a command q, or a stated one.
     The corrected command q + D minimizes, within the joint limits and with no joint moved by more than ``largest``,
 
         |p|^2 + |w|^2 + D' P D
@@ -335,8 +335,8 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
         turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
         if turn < of_turn < np.inf:
             why = (
-                f" Orientation stays as uncorrected commands have it: its correction, {turn:.2f} mrad, is smaller than "
-                f"its standard uncertainty, {of_turn:.2f} mrad (RMS; --orientation makes it all the same)."
+                f" Orientation is not corrected: its correction, {turn:.2f} mrad, would be smaller than its standard "
+                f"uncertainty, {of_turn:.2f} mrad (RMS); --orientation corrects it anyway."
             )
     ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}
@@ -350,7 +350,7 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
 
 
 def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
-    """Say why a stated tool is known less than the reflector, where it is known least; empty where it is not."""
+    """Return why a stated tool is less certain than the reflector, at its least certain row; empty where it is not."""
     row = int(np.argmax(found.std))
     there = Targets._make(None if each is None else each[row : row + 1] for each in targets)
     known, of_tool = reflector.uncertainty(found.q[row : row + 1], there)[0][0], found.std[row]
@@ -364,7 +364,7 @@ def _less_known(found: Compensation, targets: Targets, reflector: _Cell) -> str:
             "flange (`known` in [prior]), or do not identify these parameters."
         )
     of_tool, known = (f"{1e3 * EXPANDED * each:.3f} mm" for each in (of_tool, known))
-    return f" In row {found.label[row]} the U of the tool is {of_tool}, the reflector's {known}. {advice}"
+    return f" In row {found.label[row]}, U is {of_tool} at the tool and {known} at the reflector. {advice}"
 
 
 def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: str, robot: str) -> tuple[Array, Array]:
@@ -374,7 +374,7 @@ def tool_uncertainty(result: Calibration, q: Array, tool: Array | None, marker: 
 
 
 def _checked(robot: Robot, stated: Targets, orientation: bool) -> Targets:
-    """Return the targets as arrays, labelled, or say what does not fit."""
+    """Return the targets as labelled arrays; InputError for what does not fit."""
     rows = stated.q if stated.poses is None else stated.poses
     if rows is None:
         raise InputError("targets", "neither joint values nor poses", "q, poses, or both")

@@ -58,7 +58,7 @@ class Exported(NamedTuple):
 
 
 Writer = tuple[Path, Callable[[Path], Sequence[str] | None]]
-"""A file, and what writes to the path that it is given and says what the user has to know of it."""
+"""A file, and the function that writes to a path and returns notes for the user."""
 
 
 def identified(result: Calibration, marker: str | None = None, robot: str = "") -> RobotSetup:
@@ -139,7 +139,7 @@ def export_files(
 
     A robot that is neither accepted nor rejected, or less certain than the nominal one is accurate, is written with the
     note that this is inconclusive. Raises NotDelivered for a calibration that is not delivered, or rejected by the
-    requirement of its record, unless ``despite_verdict``, which every file says then; InputError where there is nothing
+    requirement of its record, unless ``despite_verdict``, noted in every file; InputError where there is nothing
     to write, or a file cannot hold what was identified.
     """
     whole = result
@@ -250,7 +250,7 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
         except (InputError, ValueError) as error:  # of functions of a user's own
             where = f"formulation '{result.formulation.name}'"
             found = f"no fit without {listed(lost, 6)}, which files cannot hold: {str(error).rstrip('.')}"
-            raise InputError(where, found, "functions that need none of it") from error
+            raise InputError(where, found, "functions that do not use them") from error
         if isinstance(stated, CalibrationProblem) and alone.learned is not None and alone.learned.left_out:
             again = calibrate(alone.problem.on(stated.data), alone.formulation, weight=alone.weight)
             alone = replace(again, learned=replace(alone.learned, left_out=()))
@@ -263,14 +263,14 @@ def geometry_alone(result: Calibration) -> tuple[Calibration, list[str]]:
     where = "validation" if data is not None else "identification"
     whole, left = (float(1e3 * np.sqrt(np.nanmean(each.errors(data) ** 2))) for each in (result, alone))
     sentence = (
-        f"Files cannot hold {listed(lost, 6)}: their geometry is from a fit of its own to the same measurements, with "
+        f"Files cannot hold {listed(lost, 6)}: their geometry is from a separate fit to the same measurements, with "
         f"{left:.3f} mm RMS on the {where} rows ({whole:.3f} mm with the whole model)."
     )
     return alone, [sentence]
 
 
 def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
-    """Write a DH table, with what it says of itself in which convention."""
+    """Write a DH table, with a note on its convention."""
     write_robot(rounded(arm.robot), target, dh)
     convention = CONVENTIONS[dh.lower()]
     alpha, a = arm.robot.mdh[0, :2]
@@ -279,11 +279,11 @@ def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
         base = frame_numbers(numeric_frame(base) @ numeric_link(alpha, a))
         inside = f" Its base contains alpha1 = {1e3 * alpha:.4g} mrad and a1 = {1e3 * a:.4g} mm, which place axis 1."
     ends = f"base {placed(base)} in the instrument's frame, reflector {placed(arm.tool)} in the flange frame"
-    return [f"{target.name}: {CONVENTION[convention]}.{inside}", f"{target.name} is without base and tool: {ends}."]
+    return [f"{target.name}: {CONVENTION[convention]}.{inside}", f"{target.name} lacks base and tool: {ends}."]
 
 
 def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
-    """Write four rows a period of the finest harmonic in the measured ranges; say what they are, and how large."""
+    """Write four rows a period of the finest harmonic in the measured ranges; return what they are, and their sizes."""
     curves = transmission_errors(result)
     if not curves:
         accepted = "transmission errors of joints, which model 'auto' adds where the data support them"
@@ -295,8 +295,8 @@ def _write_joint_corrections(result: Calibration, target: Path) -> list[str]:
     errors = [f"{curve} {1e3 * curve.rms:.3f}" for curve in curves]
     write_text(target, "\n".join(lines) + "\n")
     return [
-        f"Transmission errors (RMS, mrad): {joined(errors)}. Angles are as the controller counts them, within the "
-        "measured ranges; std_mrad is the standard uncertainty (k = 1). A joint stands at angle_deg plus the "
+        f"Transmission errors (RMS, mrad): {joined(errors)}. Angles are those of the controller, within the "
+        "measured ranges; std_mrad is the standard uncertainty (k = 1). The actual angle is angle_deg plus the "
         "correction: subtract it from a command. The corrections belong to the geometry of the whole model "
         "(`compensate` uses both), not to that of other exported files."
     ]
@@ -312,7 +312,7 @@ def _write_urdf(
     tip: str | None = None,
     tip_measured: bool = False,
 ) -> list[str]:
-    """Write the identified origins, and base and tool if they belong to the file; say where root and reflector are.
+    """Write the identified origins, and base and tool if they belong to the file; return where root and reflector are.
 
     An identified base near the file's root is the same frame, known better, and is written.
     """
@@ -359,7 +359,7 @@ def _write_urdf(
 
 
 def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: str | None, robot: str) -> list[str]:
-    """Say how well the pose of the tip link is known, at ``tool`` in the flange frame or at the reflector."""
+    """Return a sentence on the uncertainty of the tip link, at ``tool`` in the flange frame or at the reflector."""
     problem = result.problem.sample().alone(robot)
     blocks = [block for block in problem.data.blocks if block.q.shape[2] == problem.robot.dof]
     q = np.concatenate([block.q[:, 0] for block in blocks])
@@ -370,7 +370,7 @@ def _tip_uncertainty(result: Calibration, tip: str, tool: Array | None, marker: 
     if not np.isfinite([position, turn]).all():
         return ["URDF: the pose of its tip link is undetermined: check position and orientation by other means."]
     seen = len(reflectors(problem.parameters.names)) > 1 or any(block.measurement.turning for block in blocks)
-    rests = "" if seen else ". Positions of one reflector do not determine all of its pose; the rest is the prior's"
+    rests = "" if seen else ". Positions of one reflector determine only part of its pose, the prior the rest"
     measured = ""
     if tool is not None:
         measured = f"the reflector {2e3 * tool_uncertainty(result, q, None, name, robot)[0].max():.2g} mm, "

@@ -78,7 +78,7 @@ class Performance(Tabled):
         return f"at {counted(len(self.poses), 'pose')}, RP {1e3 * self.repeatability:.4g} mm"
 
     def _notes(self) -> list[str]:
-        """Say in what the table is not what the standard requires, and what is not known."""
+        """Return how the table differs from what the standard requires, and what is not known."""
         lines: list[str] = []
         cycles = sorted({each["cycles"] for each in self.poses})
         if cycles[0] < CYCLES or len(self.poses) < POSES:

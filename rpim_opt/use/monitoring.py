@@ -154,10 +154,10 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
 
     A check is judged by the prediction interval of a new reading, given the calibration and all checks before it; the
     innovations are summed up (Page's CUSUM); and every parameter and frame is tried as one that moved, at once before
-    some check or steadily. A robot that does not drift is said to with probability 0.01 in all.
+    some check or steadily. A robot that does not drift raises a false alarm with probability 0.01 in all.
 
     The result has a squared penalty or none. ``data`` are check readings in the instrument's frame of the calibration,
-    in the order of ``when`` (N,) [s] if that is stated; ``times`` are N texts that say so.
+    in the order of ``when`` (N,) [s] if that is stated; ``times`` are their N texts.
     InputError for times that are not one a check, and a result that has no covariance (lasso).
 
     >>> import rpim_opt as ro
@@ -199,7 +199,7 @@ def monitor(result: Calibration, data: Dataset, when: Array | None = None, times
 def _innovations(result: Calibration, problem: CalibrationProblem, level: float) -> tuple[Array, Array]:
     """Return innovations of N checks in standard deviations (N,), and as standard normal deviates (N,).
 
-    The error of the calibration bends all predictions alike. A Kalman filter takes that away as checks show it, so that
+    The calibration's error is common to all predictions. A Kalman filter takes that away as checks show it, so that
     the innovations of a robot that does not drift are independent::
 
         e = r - J m,    S = J C J' + V,    K = C J' S^-1,    m + K e,    C - K J C
@@ -266,7 +266,7 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     """Return the change that explains checks best; None where chance does, over all changes that were tried."""
     model = problem.linearize(recalibration.previous_deviations(result, problem))
     form = recalibration.penalty_of(recalibration.posterior_as_prior(result, problem), model.A.shape[1])
-    # rows of one configuration were read together: the first of them says when
+    # rows of one configuration were read together: the first of them has the time
     numbers, first = np.unique(problem.data.configuration, return_index=True)
     when = first[np.searchsorted(numbers, model.group)]
     misfit = recalibration.Misfit(result, model, form)

@@ -180,7 +180,7 @@ def _typical_noise(blocks: Sequence[Block], kind: Measurement) -> dict[str, floa
 def _understood(
     result: Calibration, source: Any, kind: Measurement, stated: TableOptions, targets: bool = False
 ) -> Understanding:
-    """Return what tables say, read as the calibration's own were; where that does not fit, as they say themselves."""
+    """Return the content of tables, read as the calibration's own were; where that does not fit, by their headers."""
     sources = source if isinstance(source, list | tuple) else [source]
     reading = dict(result.record.reading)
     if not all(Path(str(each)).suffix.lower() in EXCEL for each in sources):

@@ -99,12 +99,12 @@ class Moved(NamedTuple):
 class Update:
     """A recalibration with the previous result as prior.
 
-    ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` say how the ``readings``
+    ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` are how the ``readings``
     (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
     readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
     evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
     ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
-    previous one, where nothing was released. ``registered`` says that the instrument or the base moved so far that the
+    previous one, where nothing was released. ``registered`` is whether the instrument or the base moved so far that the
     base was registered again; else empty.
     """
 
@@ -195,13 +195,13 @@ def update(
 ) -> Update:
     """Recalibrate a robot: the posterior of its previous calibration is the prior of this one.
 
-    First it is asked whether the robot is still the same. While a change of one parameter, of one frame, or one wrong
+    First the robot is tested for changes. While a change of one parameter, of one frame, or one wrong
     reading lets chi-squared fall by more than chance would in one robot of a hundred (over all that may have changed),
     the most probable change is released: its parameters get a prior about where they were, wider than any crash, and
     all others keep the posterior.
 
     The result has a squared penalty or none. ``data`` are new measurements of the same robot, in the same instrument's
-    frame unless ``reset`` says otherwise: patterns of parameters of which the earlier result says nothing,
+    frame unless ``reset`` names them: patterns of parameters that the earlier result does not describe,
     ``("base_*",)`` where the instrument moved, which is done by itself where it moved far. ``prior_inflation`` is a
     factor on the earlier standard deviations, where everything may have drifted a little; ``source`` says where the
     data come from; ``progress`` is called with each step in words. InputError for a result without covariance (lasso),
@@ -226,7 +226,7 @@ def update(
     elsewhere = "" if released else _base_elsewhere(result, problem, prior_inflation)
     if elsewhere:
         released = tuple(name for name in free.names if name.startswith(BASE))
-    # a frame that was reset may be anywhere: then it is registered anew
+    # a frame that was reset may be anywhere: then it is registered again
     start = None if released else previous_deviations(result, problem)
     changes: list[Cause] = []
     first: tuple[tuple[Cause, ...], Fit] | None = None  # before anything is released

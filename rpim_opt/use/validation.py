@@ -27,10 +27,10 @@ class Validation(HeldOut):
     """Errors of a calibration on N new measurements, as `HeldOut` has them, and what else they show.
 
     ``data`` are the measurements, ``vectors`` (N, 3) measured minus predicted position [m], NaN where no position was
-    measured. ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` says how far
+    measured. ``outside`` are rows beyond the joint ranges that the calibration measured, ``touched`` is how far
     touches are from their points and planes, the worst first [mm], ``remarks`` what a reader of the errors has to know,
     ``mistake`` names another reading of the measurements that fits far better, if there is one, and ``no_intervals``
-    says why there are none.
+    states why there are none.
     """
 
     data: Dataset

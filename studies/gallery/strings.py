@@ -1,6 +1,8 @@
 """Every text of the package that a user may see: file, line, text, with the expressions of an f-string in braces.
 
-``python3 dev.py strings`` prints the list, with the glossary at hand to be read from first to last.
+These are strings, and the first lines of docstrings of modules and of what is public, with its name: the help of
+commands and the reference show them. ``python3 dev.py strings`` prints the list, with the glossary at hand to be read
+from first to last.
 """
 
 from __future__ import annotations
@@ -31,8 +33,18 @@ def texts(source: str) -> Iterator[tuple[int, str]]:
             text = "".join(parts)
         elif isinstance(node, ast.Constant) and isinstance(node.value, str) and id(node) not in skipped:
             text = node.value
-        if PROSE.search(text):
+        if PROSE.search(text) and "->" not in text:  # an einsum
             yield node.lineno, " ".join(text.split())
+
+
+def first_lines(source: str) -> Iterator[tuple[int, str]]:
+    """Yield line, name and first line of the docstring of a module and of its public functions and classes."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+            name = getattr(node, "name", "")
+            first = (ast.get_docstring(node) or "").partition("\n")[0]
+            if first and not name.startswith("_"):
+                yield getattr(node, "lineno", 1), f"{name}: {first}".removeprefix(": ")
 
 
 def _piece(part: ast.expr) -> str:
@@ -43,5 +55,6 @@ def _piece(part: ast.expr) -> str:
 
 if __name__ == "__main__":
     for path in sorted((ROOT / "rpim_opt").rglob("*.py")):
-        for line, text in sorted(set(texts(path.read_text(encoding="utf-8")))):
+        source = path.read_text(encoding="utf-8")
+        for line, text in sorted({*texts(source), *first_lines(source)}):
             print(f"{path.relative_to(ROOT)}:{line}: {text}")

@@ -314,7 +314,7 @@ def test_parts_know_the_sessions_of_all_parts_and_say_where_they_do_not(problem:
     assert found.x == pytest.approx(together.x, abs=1e-5)
 
     first = start().scaled(SCALES).identify([*identified, "session_*"])
-    with pytest.raises(ro.InputError, match=r"session: found 'day 3' in block 2, accepted: sessions of the parameters"):
+    with pytest.raises(ro.InputError, match=r"session: found 'day 3' in block 2, accepted: sessions with parameters"):
         ro.calibrate(PartitionedProblem(problem.robot, first, parts[0](), parts))
     with pytest.raises(ro.InputError, match=r"'day 3' in block 2"):  # weights of one's own do not learn from all rows
         ro.calibrate(PartitionedProblem(problem.robot, first, parts[0](), parts), ro.tikhonov, 1.0)

@@ -77,7 +77,7 @@ def test_ripple_is_found_and_predicts_other_rows(rippled):
     assert "It holds for the whole model, as `compensate` uses it" in page
     assert "transmission2_c1" not in page
     assert "Joint 2: 0." in page
-    assert "Exported files hold the geometry of a fit of its own" in page
+    assert "Exported files hold the geometry of a separate fit" in page
     assert "parameter combinations are identifiable from 360 equations, without the transmission errors" in page
 
 
@@ -193,7 +193,7 @@ def test_corrections_are_a_table(rippled, tmp_path):
     assert "whole model: Inconclusive: limit 0.001 mm" in doubtful.notes[0]
     assert "Missing: " in doubtful.notes[0]
     assert doubtful.notes[0] in list(csv.reader((tmp_path / "arm.csv").read_text().splitlines()))[1][-1]
-    assert "fit of its own to the same measurements" in (tmp_path / "arm.csv").read_text()
+    assert "separate fit to the same measurements" in (tmp_path / "arm.csv").read_text()
     plain = ro.calibrate(result.stated, weight=1.0)
     with pytest.raises(ro.InputError, match="no transmission error"):
         ro.use.export_files(plain, corrections=tmp_path / "none.csv")

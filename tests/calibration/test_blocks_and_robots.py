@@ -111,5 +111,5 @@ def test_influence_of_a_loss_by_equation_is_that_of_the_squares_it_ends_with() -
     weight = np.minimum(1.0, 2.0 / r).reshape(24, 3).mean(axis=1)
     assert found.weight == pytest.approx(weight, rel=1e-6)
     assert found.weight.argmin() == 7
-    with pytest.raises(ro.InputError, match="a loss that is a reweighted sum"):
+    with pytest.raises(ro.InputError, match="a squared loss, or a robust one"):
         influence(replace(robust, formulation=replace(stated, loss=lambda r: cp.norm2(r) + cp.max(r))))

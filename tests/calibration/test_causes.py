@@ -360,7 +360,7 @@ def test_a_joint_that_the_table_counts_the_other_way_is_said_below_the_headline(
     """And in report and acceptance test, until robot.toml says it, too."""
     made(monkeypatch, tmp_path, flipped(1)(simulated_arm("ur5e")))
     cell, out, robot = str(tmp_path / "cell"), str(tmp_path / "out"), tmp_path / "cell" / "robot.toml"
-    said = "Table and robot file count joint values differently: joint 2 reversed (sign = -1). "
+    said = "Signs or zeros of joints differ between table and robot file: joint 2 reversed (sign = -1). "
     assert run(monkeypatch, "calibrate", cell, "--out", out) == 0
     lines = capsys.readouterr().out.splitlines()
     headline = next(i for i, line in enumerate(lines) if "the mean position error falls" in line)
@@ -376,7 +376,7 @@ def test_a_joint_that_the_table_counts_the_other_way_is_said_below_the_headline(
     assert capsys.readouterr().out.count(said) == 1
     robot.write_text(robot.read_text().replace("alpha_deg = 90\n", "alpha_deg = 90\nsign = -1\n", 1))
     assert run(monkeypatch, "calibrate", cell) == 0
-    assert "count joint values differently" not in capsys.readouterr().out
+    assert "differ between table and robot file" not in capsys.readouterr().out
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -124,7 +124,7 @@ def _parted(labels: tuple[str, ...], whole: ro.CalibrationProblem) -> list[tuple
     return [(1 if label in first else 2, label) for label in labels]
 
 
-@pytest.mark.parametrize(("stated", "accepted"), [(ro.lasso, "squared penalty"), (ro.minimax, "reweighted sum")])
+@pytest.mark.parametrize(("stated", "accepted"), [(ro.lasso, "squared penalty"), (ro.minimax, "reweighted squares")])
 def test_what_has_no_such_influence_is_refused(stated: ro.Formulation, accepted: str) -> None:
     result = ro.calibrate(ro.load("position").problem, stated, weight=1.0)
     with pytest.raises(ro.InputError, match=accepted):

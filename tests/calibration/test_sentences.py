@@ -78,7 +78,7 @@ LEFT: dict[str, tuple[LackOfFit, str, str]] = {
     "few spare": (LackOfFit(3, 9, 3.2, "length", 1e-4), "3 degrees of freedom are too few", "measurement noise"),
     "effects": (
         left(1e-4, instrument=1e-4, present={"gravity": 30.0, "first harmonic": 9.0}),
-        "gravity (likelihood-ratio statistic 30). Encoders or gears of joints have errors once a turn "
+        "gravity (likelihood-ratio statistic 30). Encoders or gears of joints have once-per-revolution errors "
         "(likelihood-ratio statistic 9).",
         "would explain",
     ),

@@ -75,7 +75,7 @@ def test_the_evidence_takes_it_and_finds_the_coefficient(automatic: ro.Calibrati
     sd = np.sqrt(automatic.covariance[i, i])
     assert sd < 2e-6
     assert abs(automatic.x[i] - ALUMINIUM) < 4 * sd
-    assert f"Thermal expansion: {1e6 * automatic.x[i]:.3g} um per metre and kelvin." in str(automatic)
+    assert f"Thermal expansion: {1e6 * automatic.x[i]:.3g} um/(m K)." in str(automatic)
 
 
 def test_the_robot_is_found_as_if_it_had_not_warmed_up(

@@ -78,7 +78,7 @@ def test_some_rows_and_bounds_are_named_and_the_others_counted() -> None:
         "Active bound: a2 at +0.5 mm. Loosening its tolerance by 0.05 mm would lower "
         "the RMS of the standardized residuals by 0.05."
     )
-    loosened = "'a2 by 0.5 mm' is active: loosening it by 0.1 mm would lower the objective by 0.2 of 9."
+    loosened = "'a2 by 0.5 mm' is active: loosening it by 0.1 mm would lower the objective by 0.2, from 9."
     assert eleven.count(loosened) == 11
     assert not any("Outliers bias" in line for line in eleven)
     assert any("Outliers bias" in line for line in flagged(1, True))
@@ -102,7 +102,7 @@ def test_what_a_file_could_not_hold_is_said() -> None:
         formulation=replace(ro.tikhonov, solvable=False),
         message="Done.",
     )
-    assert "cannot be solved again" in words.remarks(stand_in, Verdict())[0]
+    assert "cannot store functions of a script" in words.remarks(stand_in, Verdict())[0]
 
 
 def test_errors_before_and_after_are_in_millimetres() -> None:

@@ -26,7 +26,7 @@ def test_a_design_is_near_the_best_and_better_than_chance(criterion: str) -> Non
     assert found.weights.sum() == pytest.approx(40)
     assert (found.bound >= found.value) == (criterion == "D")
     assert f"{criterion}-optimal" in str(found)
-    assert "no other set is more than" in str(found)
+    assert "no other choice is more than" in str(found)
 
 
 @pytest.mark.slow

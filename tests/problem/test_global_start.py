@@ -113,7 +113,9 @@ def test_another_description_of_the_same_robot_is_named() -> None:
     assert result.mapping is not None
     assert "zero of joint 4 +180.0 deg (" in result.message
     both = "zero of joint 4 +180.0 deg, or joint 5 reversed (sign = -1)"
-    said = f"Table and robot file count joint values differently: {both} (these explain the data equally well, "
+    said = (
+        f"Signs or zeros of joints differ between table and robot file: {both} (these explain the data equally well, "
+    )
     assert result.caution.startswith(said)
     assert both in inspect(problem.on(replace(problem.data, blocks=(turned,)))).warnings[-1]
 
@@ -230,5 +232,5 @@ def test_a_length_of_the_wrong_sign_is_no_matter_of_the_joints_alone(name: str) 
     nominal[problem.parameters.names.index(name)] *= -1
     parameters = replace(problem.parameters, nominal=nominal)
     result = ro.calibrate(ro.CalibrationProblem(replace(problem.robot, mdh=mdh), parameters, problem.data))
-    assert result.caution.endswith("of the wrong sign in the robot file looks like zeros of 180 deg: check them first.")
+    assert result.caution.endswith("in the file acts like zeros of 180 deg: check it first.")
     assert not ro.calibrate(problem).caution

@@ -68,7 +68,7 @@ def test_long_tables_are_cut_in_notebooks_and_whole_in_frames() -> None:
     parameters = INSTANCE.problem.parameters
     assert len(parameters) > 60
     assert parameters._repr_html_().count("<tr>") == 61
-    assert "and 54 rows more" in parameters._repr_html_()
+    assert "and 54 more rows" in parameters._repr_html_()
     assert len(parameters.to_frame()) == len(parameters) == 114
 
 

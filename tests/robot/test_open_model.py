@@ -341,7 +341,7 @@ def test_files_hold_the_geometry_of_a_calibration_without_a_users_term(
     own = measured(own, noise=SIGMA, own2=3e-4, own4=-2e-4, a2=5e-4)
     found = ro.calibrate(own, weight=weight)
     written = ro.use.export_files(found, mdh=tmp_path / "arm.toml")
-    assert "Files cannot hold own2, own3, own4: their geometry is from a fit of its own" in " ".join(written.notes)
+    assert "Files cannot hold own2, own3, own4: their geometry is from a separate fit" in " ".join(written.notes)
     assert "It includes what geometry alone misses, at most 0." in " ".join(written.notes)
     rigid = ro.calibrate(blank().on(own.data), weight=weight)
     assert np.abs(ro.read_robot(tmp_path / "arm.toml").mdh - rigid.robot.mdh).max() < 1e-9

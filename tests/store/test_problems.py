@@ -249,7 +249,7 @@ def test_a_reversed_joint_of_an_arm_that_moved_little_is_that_and_no_large_zero(
     mapping = result.mapping
     assert mapping is not None
     assert mapping.explanations == "joint 3 reversed (sign = -1)"
-    told = [each for each in mapping.ambiguities if "as the controller counts, to decide" in each]
+    told = [each for each in mapping.ambiguities if "measure at pendant values" in each]
     assert len(told) == 2 < len(mapping.alternatives)
     assert all(str(result.message).count(each) == 0 and each in result.verdict.reasons for each in told)
     low, high = problem.robot.limits.T

@@ -586,7 +586,7 @@ def test_a_limit_holds_for_what_is_left_and_its_uncertainty() -> None:
     reflector = 2e3 * ro.use.compensate(result, known_to.q[[row]]).std[0]
     for text in (said, str(known_to)):  # with and without a limit
         (known,) = re.findall(
-            rf"In row {row + 1} the U of the tool is {2e3 * known_to.std[row]:.3f} mm, the reflector's (.*) mm", text
+            rf"In row {row + 1}, U is {2e3 * known_to.std[row]:.3f} mm at the tool and (.*) mm at the reflector", text
         )
         assert float(known) == pytest.approx(reflector, abs=2e-3)
         assert "No number of reflectors separates d6 and theta6 from the tool: state what is known" in text

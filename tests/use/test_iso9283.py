@@ -95,8 +95,8 @@ def test_a_table_as_it_is_exported(monkeypatch, capsys, tmp_path) -> None:
     assert out.read_text().startswith("pose,cycles,AP_p_mm")
     assert run(monkeypatch, "iso9283", file, "--limit", "0.3", "--repeatability", "0.5") == 1
     text = capsys.readouterr().out
-    assert "The largest AP_p is 0.2000 mm, within 0.3 mm." in text
-    assert "The largest RP_l is 0.5464 mm, above 0.5 mm." in text
+    assert "Largest AP_p: 0.2000 mm, within the limit of 0.3 mm." in text
+    assert "Largest RP_l: 0.5464 mm, above the limit of 0.5 mm." in text
     assert "ISO 9283:1998, 7.2.1 (AP) and 7.2.2 (RP)." in text
 
 

@@ -27,7 +27,7 @@ INTRINSICS = {
 }  # fmt: skip
 """Focal lengths and centre, and distortion in the order of OpenCV."""
 STRETCH = {"stretch_x": "ratio", "stretch_y": "ratio"}
-"""By how much a printed board is larger than its file says, along its axes."""
+"""Relative stretch of a printed board against its file, along its axes."""
 TARGET = {"target_x": "length", "target_y": "length", "target_z": "length"}
 """Columns: where a row's point is on its board."""
 Board = Mapping[str, Sequence[float] | Array]

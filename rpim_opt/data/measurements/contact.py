@@ -53,7 +53,7 @@ revisit = replace(
 """A touch of an unmeasured point: r_i = c - p_i, with c the mean of the positions of all touches of it."""
 
 known_distance = replace(distance, name="known_distance")
-"""The distance that a drawing states between two touched points or parallel planes: r = y - |c2 - c1|."""
+"""The known distance between two touched points or parallel planes: r = y - |c2 - c1|."""
 
 known_square = Measurement(
     "known_square", lambda T1, T2: 0 * T1[0, 0], {"angle": "angle"}, noise={"angle": "angle"}, points=2
@@ -72,7 +72,7 @@ known_parallel = Measurement(
 
 TYPES = (revisit,)
 KNOWN = (known_distance, known_square, known_parallel)
-"""What a drawing knows of things that were touched: no measurements, though they have equations."""
+"""Known dimensions of touched objects: no measurements, though they have equations."""
 UNNAMED = (revisit_plane, *KNOWN)  # ready types that no problem file names as its measurement
 
 
@@ -124,7 +124,7 @@ class KnownAngle:
         return known_parallel if self.parallel else known_square
 
 
-Known = KnownDistance | KnownAngle  # what a drawing or a certificate states of two touched things
+Known = KnownDistance | KnownAngle  # known dimensions, from a drawing or a certificate
 
 
 def _require_sound(known: Known) -> None:

@@ -47,7 +47,7 @@ class Measurement(Brief):
     as ``x`` of a table ``[anchor]``. ``frames`` are the prefixes of those that are frames, six each: the model gets one
     transform instead. It also gets what it ``sees``, by keyword: ``"q"`` for the joint values of the model, (dof, 1),
     of two points (dof, 2), ``"torque"`` for the measured joint torques in the same shape, and columns of the data by
-    name; ``extra`` has those columns, name to dimension, and ``accepted`` what a message says where one is missing.
+    name; ``extra`` has those columns, name to dimension, and ``accepted`` the text of the message where one is missing.
 
     ``columns`` of a data table hold the measured values y, name to dimension: ``{"x": "length"}`` stands for a column
     ``x_mm`` or ``x_m``; dimension ``""`` for one without unit; empty for a constraint, whose measured value is zero.
@@ -64,7 +64,7 @@ class Measurement(Brief):
     measured [m], for residuals that are no lengths: errors in millimetres are the residual times it. None for lengths
     and angles.
 
-    A ``touching`` row says no more than which point was touched, a ``planar`` one which plane: its equations are
+    A ``touching`` row states only which point was touched, a ``planar`` one which plane: its equations are
     differences to the other rows of the point, in the robot's own base frame. ``names`` are columns of names that a
     table of it may have besides, ``("point",)``, of which a touch has one; ``variants`` the type that it is where a
     table has a column of that name; ``parts`` types of tables that state less and can validate it: positions of poses.

@@ -34,6 +34,6 @@ plane = Measurement(
     frames=("plane",),
     start=plane_start,
 )
-"""A point on a plane, given as a frame whose x and y axes span it: r = -n'(p - o) with its z axis n and origin o."""
+"""A point on a plane, stated as a frame whose x and y axes span it: r = -n'(p - o) with its z axis n and origin o."""
 
 TYPES = (plane,)

@@ -51,7 +51,7 @@ class Key(NamedTuple):
 
 
 class Match(NamedTuple):
-    """Which rows of joints and of measured values belong together, their names, notes, and the columns that say so."""
+    """Which rows of joints and of measured values belong together, their names, notes, and the columns that match."""
 
     left: Sequence[int]
     right: Sequence[int]
@@ -183,7 +183,7 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
         found = f"'{key}', whose values no column of the other file has"
     for side in (joints, values):
         found += "".join(f"; {name} of {side.file}: {listed(keys, 3)}" for name, keys in _naming(side).items())
-    raise InputError("--key", found, f"columns that name rows alike, {OTHER_KEYS}")
+    raise InputError("--key", found, f"--key with a column of common values, {OTHER_KEYS}")
 
 
 def _only(items: Sequence[Any]) -> Any:
@@ -192,7 +192,7 @@ def _only(items: Sequence[Any]) -> Any:
 
 
 def _labels(joints: Understood, values: Understood, others_tell: bool) -> Key | None:
-    """Return the labels of rows with joints that measured ones have, too, unless they count rows and others tell."""
+    """Return the labels that rows with joints and measured ones share, unless they are row numbers and others match."""
     labels = _normal(joints.columns.get("label", ()))
     if others_tell and counts_rows(labels):
         return None

@@ -83,7 +83,7 @@ KINDS = {
                           "istwert", "messwert", "gemessen", "mesuré", "mesurée", "misurato", "misurata", "medido",
                           "medida", "gemeten", "实测"}),
 }  # fmt: skip
-"""Words of a name that say whether it was measured, wanted or computed from others."""
+"""Words of a name for values that are measured, commanded or computed from others."""
 TURNS = (
     (("a", "b", "c"), ("rz", "ry", "rx"), "KUKA: A, B, C turn about z, y, x", ""),
     (("w", "p", "r"), ("rx", "ry", "rz"), "FANUC: W, P, R turn about x, y, z", ""),

@@ -280,7 +280,7 @@ def declared_noise(noise: Mapping[str, Any], kind: Measurement) -> dict[str, Any
 def covariances(
     columns: Numbers, declared: Mapping[str, Any], kind: Measurement, y: Array, label: Sequence[str]
 ) -> Array:
-    """Return the covariances of the residual's components [SI], (N, k, k) or (1, k, k) where all rows are alike.
+    """Return the covariances of the residual's components [SI], (N, k, k) or (1, k, k) if the same for all.
 
     A standard deviation that a row states of itself replaces the declared one and the tracker's part of it.
     """

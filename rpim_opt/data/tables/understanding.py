@@ -201,7 +201,7 @@ def counts_rows(keys: Sequence[str]) -> bool:
 
 
 def _choose_label(read: Readings, table: Columns, key: str) -> None:
-    """Of several labels keep the stated key, or the one that tells rows apart and does more than count them."""
+    """Of several labels keep the stated key, or the one that distinguishes rows and is no row number."""
     cells = {name: [str(cell).strip() for cell in table[name]] for name, each in read.items() if each.stem == "label"}
     chosen = [name for name in cells if name.lower() == key.lower()]
     if not chosen:
@@ -227,7 +227,7 @@ def _read(name: str, group: str, known: Sequence[str], names: Sequence[str], joi
     if stem.lower() in names:  # elsewhere such a column holds labels
         return Reading(stem.lower(), unit, "touched point")
     reading = recognize(stem, joints)
-    if group and not reading.why:  # the words of a group that tell nothing
+    if group and not reading.why:  # the words of a group without meaning
         rests = [rest for _, rest in endings(stem)]
         inner = [Reading(rest, "", "by its name") if rest in known else recognize(rest, joints) for rest in rests]
         inside = next((each for each in inner if each.why), reading)
@@ -271,7 +271,7 @@ def _count_from_one(read: Readings, dof: int) -> None:
 
 
 def _without_prefix(read: Readings, wanted: set[str], joints: Sequence[str], stated: str) -> Readings:
-    """Return the meanings of names without a common prefix; a controller's coordinates beside others are asked for."""
+    """Return the meanings of names without a common prefix; refuse several prefixes if none is stated."""
     known = [name for name, each in read.items() if each.stem in wanted]
     direct = dict.fromkeys(known, Reading("", "", "another column is the instrument's"))
     bare = any(len(split(name)[0]) == 1 or INSTRUMENT.search(name) for name in known)
@@ -416,7 +416,7 @@ def meaning(stem: str) -> str:
 
 
 def _unit(name: str, read: Reading, dimensions: Sequence[str], units: Mapping[str, tuple[str, str]]) -> tuple[str, str]:
-    """Return a column's unit and why: its own, the given one, that of its dialect."""
+    """Return a column's unit and why: its own, the stated one, that of its dialect."""
     if read.unit:
         return read.unit, "in the header"
     # a sigma may be of lengths or of angles: no unit of one dimension is meant

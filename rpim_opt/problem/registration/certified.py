@@ -195,7 +195,7 @@ def rotation_constraints(count: int) -> Array:
     """Return C (c, n, n) with x'C x = 0 for x = (1, vec R_1, ..., vec R_count), rows first, and no other quadratic.
 
     Of every rotation the twenty independent ones: R R' = 1 and R'R = 1, of which one diagonal entry follows from the
-    others, and each row the cross product of the next two, which says that R is right-handed.
+    others, and each row the cross product of the next two, so that R is right-handed.
     """
     C = np.zeros((20 * count, 1 + 9 * count, 1 + 9 * count))
     number = 0

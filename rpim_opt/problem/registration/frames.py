@@ -256,7 +256,7 @@ def starting_parameters(
     places = tools
     if base is None:
         base, located, _ = locate(robot, posed(data, own), tools)
-        # a board or a camera that is turned otherwise is not in sight
+        # a board or a camera that is turned otherwise is not visible
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
     values, fixtures = _own_values(robot, data, base, places, own)
@@ -290,7 +290,7 @@ def _own_values(
 def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: Collection[str]) -> Parameters:
     """Return parameters with fixtures at the least squares of the nominal robot, reflectors fitted beside them.
 
-    A start that takes reflectors for known is off by more than these are, a long cable's anchor by metres. Gross
+    A start that takes reflectors for known has larger errors than these, a long cable's anchor by metres. Gross
     outliers are left out; where the data do not determine a fit, fixtures stay where they are.
     """
     fitted = np.isin(parameters.names, list(fixtures))
@@ -386,7 +386,7 @@ def fitted_frames(problem: Source) -> tuple[Source, Array]:
 
     over the identified parameters of base, reflectors, anchors and the like, in units of their scales, of the nominal
     robot. Returned are the problem of the frames (all other parameters nominal; frames that were stated far off are
-    counted from where the data put them) and the deviations (f,) [SI]; one without frames comes back as it is.
+    counted from their registration) and the deviations (f,) [SI]; one without frames comes back as it is.
 
     >>> import rpim_opt as ro
     >>> instance = ro.load("position")
@@ -410,7 +410,7 @@ def ridge_deviations(alone: Source, steps: int = 200) -> Array:
     """
     source = in_parts(alone.frozen())
     scale = alone.parameters.free.scale
-    at: list[Array] = []  # where it was linearized last, and the factor: slopes are asked for where residuals were
+    at: list[Array] = []  # where it was linearized last, and the factor: slopes are evaluated where residuals were
 
     def triangle(z: Array) -> Array:
         if not at or not np.array_equal(at[0], z):

@@ -3,7 +3,7 @@
 Batched multi-start Levenberg-Marquardt (`fit_arms`) over joint zeros and reflectors, the base (of lengths the anchor)
 eliminated at every step: random zeros, all signs in turn, a few steps for all and more for the best, until enough
 starts end in one optimum. There is no certificate: a better optimum that one start reaches with probability h is missed
-with (1 - h)^starts. Lengths do not tell an arm from its mirror image.
+with (1 - h)^starts. Lengths do not distinguish an arm from its mirror image.
 """
 
 from __future__ import annotations
@@ -48,17 +48,17 @@ SHORT, LONG = 14, 45  # steps of all starts of a round, and of the best quarter
 ROUNDS, HITS = 4, 5  # rounds at most, and starts that have to end in the best optimum
 FEW = 40  # rows of a search; the best candidates are fitted to more
 LEAST_NOISE = 5e-5  # floor of the error of a point [m]: what is nearer is rounding
-ODDS = 30.0  # difference of chi-squared up to which data do not tell two mappings apart
-GROSS = 6.0  # rows farther off than so many medians of the best fit's errors do not tell mappings apart
+ODDS = 30.0  # difference of chi-squared up to which data do not distinguish two mappings
+GROSS = 6.0  # rows farther off than so many medians of the best fit's errors do not distinguish mappings
 FEWEST_FREE = 4  # degrees of freedom below which any mapping would fit
 MOST_JOINTS = 8  # joints beyond which signs are too many to be tried
-SAME_TOOL = 0.05  # distances of a reflector from its stated place [m] whose multiples tell two descriptions apart
+SAME_TOOL = 0.05  # distances of a reflector from its stated place [m] whose multiples distinguish two descriptions
 MIRRORED = 1.3  # a left-handed frame fits as well if it leaves up to so many times what a mapping leaves
 COMPARED = 200  # configurations at which mappings are compared
 WRITE = "write sign, and add the zeros to theta_deg, of these joints in robot.toml"  # the remedy
 AS_STATED = "joints as stated"
-TOLD = 2  # other mappings of equal fit that are told, the best ones
-RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is told
+TOLD = 2  # other mappings of equal fit that are named, the best ones
+RARE_BASIN = 0.005  # probability of reaching a basin with one start whose probability of being missed is reported
 
 
 @dataclass(frozen=True, eq=False)
@@ -89,7 +89,7 @@ class JointMapping:
     nominal: float  # RMS error of the best three quarters of the points with joints as stated [m]
     left: float  # and with the mapping
     starts: int  # random starts of the search
-    alternatives: tuple[Alternative, ...] = ()  # that the data cannot tell from it though they predict otherwise
+    alternatives: tuple[Alternative, ...] = ()  # of equal fit, with other predictions
     mirrored: bool = False  # whether a left-handed measured frame and joints as stated fit as well
     behind: str = ""  # joints that fit as well in a left-handed frame, as stated or one of them reversed
     same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
@@ -102,21 +102,19 @@ class JointMapping:
 
     @property
     def caution(self) -> str:
-        """Return that table and robot file count joint values differently, and what to check and to write."""
+        """Return what table and robot file disagree about (signs, zeros), and what to check and to write."""
         equally = ""
         if self.same:
             far = ", or ".join(f"{three_digits(1e3 * each.moved)} mm" for each in (self, *self.same))
             equally = f" (these explain the data equally well, with a reflector {far} from its stated place)"
         text = (
-            f"Table and robot file count joint values differently: {self.explanations}{equally}. The result holds for "
-            f"joint values as the table counts them. Check the pendant: if the controller counts so, {WRITE}; if it "
-            "counts as the robot file does, correct the table's columns and calibrate again before using this robot."
+            f"Signs or zeros of joints differ between table and robot file: {self.explanations}{equally}. The result "
+            f"holds for the table's joint values. Check the pendant: if it displays the table's values, {WRITE}; if it "
+            "displays the robot file's, correct the table's columns and calibrate again before using this robot."
         )
         half_turns = np.isclose(np.abs(self.zero), np.pi) & (np.array(self.joint_types) == "revolute")
         if half_turns.any():
-            text += (
-                " A length (a, d) of the wrong sign in the robot file looks like zeros of 180 deg: check them first."
-            )
+            text += " A length (a, d) of the wrong sign in the file acts like zeros of 180 deg: check it first."
         return text
 
     @property
@@ -132,7 +130,7 @@ class JointMapping:
 
     @property
     def ambiguities(self) -> tuple[str, ...]:
-        """Return sentences on alternatives of equal fit; no mirror image of an arm whose joints count as stated."""
+        """Return sentences on alternatives of equal fit; no mirror image of an arm whose signs are as stated."""
         as_nominal = bool((self.sign > 0).all())
         return self._said([other for other in self.alternatives if not (other.mirror and as_nominal)])
 
@@ -155,11 +153,11 @@ class JointMapping:
             values = ", ".join(_value(kind, v) for kind, v in zip(self.joint_types, other.deciding, strict=True))
             sentences.append(
                 f"{what} fits as well, and differs by {three_digits(1e3 * other.apart)} mm at other "
-                f"configurations: measure at ({values}), as the controller counts, to decide."
+                f"configurations: measure at pendant values ({values}) to decide."
             )
         more = len(alternatives) - TOLD
         if more > 0:
-            sentences.append(f"{more} more fit as well: joints moved too little, or data are wrong.")
+            sentences.append(f"{more} more mappings fit as well: joints moved too little, or data are wrong.")
         return tuple(sentences)
 
 
@@ -330,7 +328,7 @@ def _plainer(
 ) -> tuple[Array, Fit]:
     """Return signs (B, dof) and fits of mappings without zeros, or with quarter turns, that explain points as well.
 
-    That is as well as the first of the given ones, with deviations of the size of the problem's prior, by residuals and
+    That is as well as the first of the others, with deviations of the size of the problem's prior, by residuals and
     penalty together: zeros of any size take up errors of the geometry, where joints moved little.
     """
     n = points.robot.dof
@@ -357,7 +355,7 @@ def _plainer(
 
 
 class _SameRobot(NamedTuple):
-    """Mappings that predict the same elsewhere, the best first: their prediction, and the plainest of them."""
+    """Mappings with equal predictions, the best first: their prediction, and the plainest of them."""
 
     members: list[int]
     prediction: Array

@@ -254,7 +254,7 @@ def agreeing(points: Points) -> tuple[np.ndarray, Fit]:
 
 
 def _fits_of_all(points: Points, sets: np.ndarray) -> Fit:
-    """Return the fits to each set (B, K) of rows, with what they say of all rows; errors of poses with their tips."""
+    """Return the fits to each set (B, K) of rows, with their residuals of all rows; errors of poses with their tips."""
     fits = fit_arms(Candidates.of([points.take(each) for each in sets]), STEPS)
     every = Candidates.of([points])
     turn, p, _, _ = _flange(every.robot, every.q)

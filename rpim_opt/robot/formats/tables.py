@@ -37,7 +37,7 @@ CONVENTIONS = {"modified": "modified", "craig": "modified", "proximal": "modifie
 INDEX_BEFORE = re.compile(r"[_\s(\[{]*i\s*[-\u2212]\s*1[)\]}]*", re.IGNORECASE)
 """Of alpha and a of the link before: the table is modified."""
 INDEX = re.compile(r"[_\s(\[{]+i[)\]}]*(?=\s|$)")
-"""Of the joint itself, ``d(i)``, ``theta_i``: that tells no convention."""
+"""Of the joint itself, ``d(i)``, ``theta_i``: common to all conventions."""
 SHEET = {"\u03b1": "alpha", "θ": "theta", "β": "beta", "twist": "alpha", "theta offset": "theta", "offset": "theta",
          "r": "a", "min": "lower", "minimum": "lower", "max": "upper", "maximum": "upper"}  # fmt: skip
 """Other names of columns."""
@@ -165,7 +165,7 @@ def read_robot(path: str | Path) -> Robot:
     TOML and JSON have the keys of ``robot.toml`` (the guide "Your own robot"). CSV has one row per joint and the keys
     of a ``[[joint]]`` as columns, ``alpha_deg,a_mm,theta_deg,d_mm,beta_deg``, and if wanted ``type``, ``sign``,
     ``lower_deg,upper_deg`` (``_mm`` for prismatic joints), ``mass_kg,centre_x_mm,centre_y_mm,centre_z_mm``; a column
-    ``convention`` says ``modified`` or ``standard``. InputError names file, key or column.
+    ``convention`` states ``modified`` or ``standard``. InputError names file, key or column.
 
     >>> import rpim_opt as ro
     >>> ro.robot.write_robot(ro.load("paper_arm").problem.robot, "robot.toml")

@@ -348,7 +348,7 @@ class _Joint:
         lower, upper = (float(self._numbers("limit", which, "0", 1)[0]) for which in ("lower", "upper"))
         if lower > upper:
             raise self.error("limit", f"{lower:g} to {upper:g}", "lower < upper")
-        far = max(abs(lower), abs(upper)) > LARGEST  # 1e16 is how some files say that there is none
+        far = max(abs(lower), abs(upper)) > LARGEST  # some files write 1e16 for no limit
         unlimited = far or lower == upper or self.element.get("type") == "continuous"
         return (-math.inf, math.inf) if unlimited else (lower, upper)
 

@@ -54,7 +54,7 @@ def _rows(found: Any) -> Rows:
         else:
             found = inner[0] if len(inner) == 1 else [found]
     if not isinstance(found, list) or not all(isinstance(row, dict) for row in found):
-        raise InputError("the text", "an array of other things", "an array of objects, one per row")
+        raise InputError("the text", "an array of other values", "an array of objects, one per row")
     named = [
         {f"{name} [{units[name]}]" if name in units else name: cell for name, cell in row.items()} for row in found
     ]

@@ -49,7 +49,7 @@ def _listed(name: str, cells: str, headers: Sequence[str] = ()) -> Target:
 
 
 def _paired(name: str, fields: str) -> Target:
-    """Return a target whose values are stated by name, in degrees and millimetres unless it says otherwise."""
+    """Return a target whose values are stated by name, in degrees and millimetres unless it states other units."""
     values = {}
     for part, value, unit in PAIR.findall(fields):
         header = part.upper() if part[1:] else f"commanded {part.upper()}"

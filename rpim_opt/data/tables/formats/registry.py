@@ -15,7 +15,7 @@ from rpim_opt.basics.layout import RawTable, TableOptions, read_table
 from rpim_opt.basics.tables import EXCEL, TEXTS, decoded
 
 Rows = Sequence[Mapping[str, Any]]
-"""Cells by the names of their columns, which say units as headers do: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
+"""Cells by the names of their columns, with units as in headers: ``{"label": "P1", "J1 [deg]": "10.5"}``."""
 
 NO_TABLES = (".xml", ".pdf", ".xls", ".ods", ".doc", ".docx", ".zip", ".bag", ".mcap", ".db3", ".h5", ".npy", ".pkl",
              ".html", ".htm", ".py", ".ipynb")  # fmt: skip
