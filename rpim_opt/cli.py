@@ -334,7 +334,7 @@ def calibrate(
 
         say("reading the problem")
         instance = ro.load(problem, variant)
-        requirement = console.required(limit, box, instance.record.requirement)
+        requirement = console.requirement_of(limit, box, instance.record.requirement)
         instance = replace(instance, record=replace(instance.record, requirement=requirement))
         result = _calibrated(instance, selector, formulation, {"model": model, "noise": noise}, say)
         without = [flag.label for flag in result.flagged if drop_outliers and flag.label not in result.clustered]
@@ -432,7 +432,7 @@ def accept(
         options = loaded, data, measurement, tables.options, register
         read = ro.use.read_measurements(*options) if data else None
         say("searching for the maximum uncertainty")
-        requirement = console.required(limit, box, loaded.record.requirement)
+        requirement = console.requirement_of(limit, box, loaded.record.requirement)
         acceptance = ro.calibration.accept(loaded, requirement, read and read.data)
     return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], read=read)
 
@@ -567,7 +567,7 @@ def compensate(
     above the limit (without a limit: error above twice its standard uncertainty).
     """
     console.require_positive("--limit", limit)
-    mass, centre = console.carried(payload)
+    mass, centre = console.payload_of(payload)
     with _loaded(result) as (loaded, say):
         read, understood = ro.use.read_targets(loaded, targets, tables.options)
         say("compensating")
@@ -774,7 +774,7 @@ def _against(limit: float | None, name: str, value: float) -> tuple[list[str], b
 def main() -> None:
     """Run the command line; an error that a user can correct is one sentence, not a traceback."""
     atexit.register(gc.freeze)  # what ends with the process is not searched for garbage once more
-    with console.arriving():
+    with console.output_errors():
         try:
             code = app(standalone_mode=False)
             if code == INTERRUPTED:  # typer's own answer to Ctrl-C in some versions, without a word

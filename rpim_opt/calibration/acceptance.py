@@ -17,11 +17,11 @@ from rpim_opt.basics.units import display
 from rpim_opt.calibration.diagnosis import SLACK
 from rpim_opt.calibration.held_out import (
     FEWEST,
-    compared,
     coverage_text,
-    displaced,
+    displacement,
     excluded_by_fit,
     headline_errors,
+    held_out_errors,
     of_positions,
     required_coverage,
     rows_used,
@@ -82,7 +82,7 @@ class Region:
             inside[block.row] = np.all(points, axis=0)
         return inside
 
-    def drawn(self) -> Array:
+    def samples(self) -> Array:
         """Return configurations (N, dof) that represent the region; InputError if none reaches the box."""
         return within(self.problem, self.box, self.marker)
 
@@ -131,7 +131,7 @@ class Workspace:
         return float(self.expanded[-1])
 
     @property
-    def typical(self) -> float:
+    def median(self) -> float:
         """Median expanded uncertainty of the sampled configurations [m]."""
         return float(np.median(self.expanded[:-1]))
 
@@ -141,7 +141,7 @@ class Workspace:
         return (
             f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
             f"{1e3 * self.largest:.3f} mm (largest of {self.count} configurations, refined by a search), median "
-            f"{1e3 * self.typical:.3f} mm"
+            f"{1e3 * self.median:.3f} mm"
         )
 
 
@@ -149,19 +149,19 @@ def workspace(result: Outcome, requirement: Requirement, region: Region, drawn: 
     """Return the expanded uncertainty at configurations (N, dof) of a region, and at the maximum found by a search."""
     rng = np.random.default_rng(0)
     span = np.ptp(region.limits, axis=1)
-    q, bound = drawn, reaching(result, region, drawn, requirement.confidence)[1]
+    q, bound = drawn, reached_positions(result, region, drawn, requirement.confidence)[1]
     for step in STEPS:
         beside = q[np.argsort(-bound)[:WORST]].repeat(BESIDE, axis=0)
         beside = np.clip(beside + step * span * rng.normal(size=beside.shape), *region.limits.T)
         beside = beside[region.inside(beside)]
         if len(beside):
             q = np.concatenate([q, beside])
-            bound = np.concatenate([bound, reaching(result, region, beside, requirement.confidence)[1]])
+            bound = np.concatenate([bound, reached_positions(result, region, beside, requirement.confidence)[1]])
     q = np.vstack([drawn, q[np.argmax(bound)]])
-    return Workspace(requirement, region, q, *reaching(result, region, q, requirement.confidence))
+    return Workspace(requirement, region, q, *reached_positions(result, region, q, requirement.confidence))
 
 
-def reaching(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
+def reached_positions(result: Outcome, region: Region, q: Array, confidence: float) -> tuple[Array, Array]:
     """Return predicted positions (N, 3) [m] at configurations (N, dof), and their expanded uncertainties (N,)."""
     prediction = result.predict(q, region.marker, of="reached")
     return prediction.position, distance_quantile(prediction.covariance, result.freedom, confidence)
@@ -194,7 +194,7 @@ def measured_workspace(result: Calibration) -> Workspace | None:
     requirement = result.record.requirement or ANYWHERE
     try:
         region = region_of(result, requirement)
-        sampled = workspace(result, requirement, region, region.drawn())
+        sampled = workspace(result, requirement, region, region.samples())
     except InputError:
         return None
     return sampled if np.isfinite(sampled.expanded).all() else None
@@ -204,7 +204,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     """Return a warning if U exceeds the error of the nominal robot; otherwise an empty text."""
     name, errors, _ = headline_errors(result)
     nominal = rms(errors)
-    if found is None or not (of_positions(result) and result.verdict.delivered and found.typical > nominal):
+    if found is None or not (of_positions(result) and result.verdict.delivered and found.median > nominal):
         return ""
     advice = (
         "Measure more configurations (`rpim-opt design --augment`), with larger wrist rotations, or state what is "
@@ -213,7 +213,7 @@ def inconclusive(result: Calibration, found: Workspace | None) -> str:
     if any(map(of_session, result.problem.parameters.free.names)):
         advice = _missing(result, nominal, found, 0.0)
     return (
-        f"Inconclusive: the median U over the region, {1e3 * found.typical:.3f} mm, is above the error of the "
+        f"Inconclusive: the median U over the region, {1e3 * found.median:.3f} mm, is above the error of the "
         f"nominal robot, {1e3 * nominal:.3f} mm RMS on the {name} rows. {advice}"
     )
 
@@ -284,7 +284,7 @@ class Acceptance:
         """Return the same as a document [mm]."""
         r, workspace = self.requirement, self.workspace
         box = r.box and {axis: [1e3 * low, 1e3 * high] for axis, (low, high) in zip("xyz", r.box, strict=True)}
-        lengths = {"bound": self.bound, "typical": workspace and workspace.typical, "repeatability": self.repeatability}
+        lengths = {"bound": self.bound, "median": workspace and workspace.median, "repeatability": self.repeatability}
         return {
             "verdict": self.verdict,
             "limit_mm": 1e3 * r.limit,
@@ -331,7 +331,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     limit = requirement.limit
     region = region_of(result, requirement)
     requirement = replace(requirement, marker=region.marker)  # the first, if none of several is stated
-    drawn = region.drawn()
+    drawn = region.samples()
     held_out, missed, unheld = _held_out(result, region, requirement, data)
     lacking = [*_unmodelled(result, region), *unheld]
     if result.contradiction:
@@ -387,7 +387,7 @@ def _missing(result: Calibration, limit: float, found: Workspace, repeatability:
             '(known = ["anchor_x = 900 +- 0.05 mm", ...]).'
         )
     q = np.concatenate([b.q[:MEASURED, 0] for part in result.problem.rows() for b in part.data.blocks])
-    measured = reaching(result, found.region, q, found.requirement.confidence)[1].max()
+    measured = reached_positions(result, found.region, q, found.requirement.confidence)[1].max()
     apart = ""
     if measured < bound / 2:
         apart = f", at measured configurations {1e3 * measured:.3f} mm (--box restricts the region)"
@@ -417,8 +417,8 @@ def _rows_apart(result: Calibration, data: Dataset | None) -> tuple[Dataset, Hel
         used = rows_used(result, apart)
         if not used.keys() >= set(apart.label):
             apart = apart.without(used) if used else apart
-            held = compared(result, apart)
-            return apart, held, [], "".join(displaced(result, apart, held))
+            held = held_out_errors(result, apart)
+            return apart, held, [], "".join(displacement(result, apart, held))
         if held is not None and not set(held.label).issuperset(used.values()):
             return None
     if held is None:

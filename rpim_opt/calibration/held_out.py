@@ -31,7 +31,7 @@ def rows_used(result: Calibration, data: Dataset) -> dict[str, str]:
     return dict(common_rows(result.problem.sample().data, data))
 
 
-def compared(result: Calibration, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
+def held_out_errors(result: Calibration, data: Dataset, counted: np.ndarray | None = None) -> HeldOut:
     """Return the errors of a calibration on measurements that it did not use, beside their prediction intervals.
 
     The coverage is that of the rows that are ``counted`` (N,), by default all.
@@ -79,7 +79,7 @@ def coverage_text(coverage: float, rows: int) -> str:
     return f"{share} (at least {100 * required_coverage(rows):.0f} % are required for this number of rows)"
 
 
-def displaced(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
+def displacement(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
     """Return sentences on a common displacement of the measurements, by registration: as mistake or as remark.
 
     It is reported where rows are outside their prediction intervals, or too many coordinates are. A mistake is a motion
@@ -178,7 +178,7 @@ def refit_all(result: Calibration, validation: Dataset | None = None) -> Calibra
     whole = Dataset.together([original.data, apart], ["identification", "validation"])
     refitted = result.calibrate_again(original.on(whole))
     labels = whole.label[len(original.data) :]
-    held = replace(compared(result, apart, np.isin(labels, refitted.problem.labels)), label=labels)
+    held = replace(held_out_errors(result, apart, np.isin(labels, refitted.problem.labels)), label=labels)
     record = replace(result.record, validation=None, held_out=held)
     if refitted.learned is not None and result.learned is not None:  # rows that were excluded stay so, and are named
         left_out = (*result.learned.left_out, *refitted.learned.left_out)

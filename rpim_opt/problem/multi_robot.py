@@ -121,7 +121,7 @@ def _common(
     return common
 
 
-def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
+def identifying_sessions(problem: CalibrationProblem) -> CalibrationProblem:
     """Return the problem with the sessions of its data identified, as the known ones are.
 
     Their parameters stand behind all others, with the scales of a session that is known; the problem itself where no
@@ -152,7 +152,7 @@ def knowing_sessions(problem: CalibrationProblem) -> CalibrationProblem:
 
 def unknown_sessions(problem: CalibrationProblem) -> list[Array]:
     """Return T S^2 T' (N, k, k) [SI] of every block: sessions that are not identified, zero for those that are."""
-    whole = knowing_sessions(problem)
+    whole = identifying_sessions(problem)
     if whole is problem or problem.touches is not None:
         return [np.zeros((1, 1, 1)) for _ in problem.data.blocks]
     p = whole.parameters

@@ -32,7 +32,7 @@ from rpim_opt.problem.row_functions import (
     require_same_torques,
     row_functions,
 )
-from rpim_opt.robot.chain import NEAR_PARALLEL, ORIGIN, carried_by
+from rpim_opt.robot.chain import NEAR_PARALLEL, ORIGIN, row_origins
 from rpim_opt.robot.kinematics import call_rows
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import (
@@ -614,7 +614,7 @@ def near_parallel(robot: Robot) -> tuple[str, ...]:
     tilt, and a rotation about y after joint i takes the tilt instead (Hayati 1983). None where the origins of a URDF's
     joints are identified.
     """
-    if carried_by(robot.model.terms):
+    if row_origins(robot.model.terms):
         return ()
     return tuple(
         f"beta{i}"
@@ -645,7 +645,7 @@ def identifiable(patterns: Iterable[str], robot: Robot, parameters: Parameters, 
         for name in block.measurement.parameters
         if not (block.measurement.by_camera and name.startswith("board_"))  # a board is as large as its file says
     }
-    geometry = re.compile(f"{ORIGIN}.*" if carried_by(robot.model.terms) else r"(alpha|a|d|theta)\d+")
+    geometry = re.compile(f"{ORIGIN}.*" if row_origins(robot.model.terms) else r"(alpha|a|d|theta)\d+")
     tools = re.compile(r"tool_.*" if any(kind.turning for kind in kinds) else r"tool_(.*_)?[xyz]")
     names = [name for name in parameters.names if geometry.fullmatch(name)]
     names += near_parallel(robot)

@@ -39,7 +39,7 @@ def fail(text: str, code: int) -> None:
 
 
 @contextmanager
-def arriving() -> Iterator[None]:
+def output_errors() -> Iterator[None]:
     """Exit quietly if the output pipe is closed, and with a sentence for other errors of the operating system."""
     try:
         yield
@@ -123,7 +123,7 @@ def touched_point(text: str | None) -> list[float] | None:
     return [1e-3 * v for v in _numbers("--point", text, (3,), "x,y,z [mm] in the robot's base frame")]
 
 
-def carried(text: str | None) -> tuple[float | None, list[float] | None]:
+def payload_of(text: str | None) -> tuple[float | None, list[float] | None]:
     """Return mass [kg] and centre of mass [m], or None, of ``--payload``."""
     if text is None:
         return None, None
@@ -132,7 +132,7 @@ def carried(text: str | None) -> tuple[float | None, list[float] | None]:
     return mass, [1e-3 * v for v in centre] or None
 
 
-def required(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
+def requirement_of(limit: float | None, box: str | None, stated: Requirement | None) -> Requirement | None:
     """Return the requirement of ``--limit`` [mm] and ``--box``, which override those of the problem or result."""
     from rpim_opt.data.record import Requirement
 

@@ -20,7 +20,7 @@ from rpim_opt.basics.text import percent
 from rpim_opt.basics.units import joint_columns
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import compared, coverage_text, headline_errors, rows_used
+from rpim_opt.calibration.held_out import coverage_text, headline_errors, held_out_errors, rows_used
 from rpim_opt.calibration.lack_of_fit import judged
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.uncertainty import Uncertainty, position_budget, transmission_errors
@@ -195,7 +195,7 @@ def _accuracy(content: Content) -> Iterator[Block]:
     if content.accepted is None:  # otherwise its section says it
         held = record.held_out
         if held is None and record.validation is not None:
-            held = compared(result, record.validation)
+            held = held_out_errors(result, record.validation)
         if held is not None and held.coverage is not None:
             notes.append(f"Held-out rows: {coverage_text(held.coverage, len(held.label))}.")
     yield "text", notes

@@ -290,14 +290,14 @@ class Origin(NamedTuple):
     up: bool  # whether the chain goes up through the joint
 
 
-class Carried(NamedTuple):
+class RowOrigins(NamedTuple):
     """The origins after a row (from 1) of a robot's table, in order."""
 
     row: int
     origins: tuple[Origin, ...]
 
 
-def displaced(carried: Carried) -> Term:
+def origins_term(carried: RowOrigins) -> Term:
     """Return the term of the origins after a row of the table, which displace the following frames in order.
 
     With F the parent link's frame behind the row, a joint that is passed down displaces by F D F^-1, one that is passed
@@ -311,7 +311,7 @@ def displaced(carried: Carried) -> Term:
     return Term(partial(_moves, carried), scales, at="link", joints=(carried.row,), made_of=carried)
 
 
-def _moves(carried: Carried, _link: Joint, *sizes: Symbol) -> Symbol:
+def _moves(carried: RowOrigins, _link: Joint, *sizes: Symbol) -> Symbol:
     """Return the product of the displacements as six numbers."""
     T = ca.SX.eye(4)
     for k, (_, F, up) in enumerate(carried.origins):
@@ -328,6 +328,6 @@ def _inverse(T: ca.SX) -> ca.SX:
     return ca.vertcat(ca.horzcat(turned, -turned @ T[:3, 3]), ca.horzcat(0, 0, 0, 1))
 
 
-def carried_by(terms: Sequence[Term]) -> tuple[Carried, ...]:
+def row_origins(terms: Sequence[Term]) -> tuple[RowOrigins, ...]:
     """Return the origins among a robot's terms."""
-    return tuple(term.made_of for term in terms if isinstance(term.made_of, Carried))
+    return tuple(term.made_of for term in terms if isinstance(term.made_of, RowOrigins))

@@ -150,7 +150,7 @@ class Term:
     or links that have it, by default the revolute joints, and all links. ``columns`` are further columns of the data
     that it sees, name to dimension: ``{"temperature": "temperature"}`` stands for a column ``temperature_K``,
     ``{"hours": ""}`` for one without unit. ``made_of`` is of this package's terms that follow from numbers alone, which
-    a file holds: a `Curve` or `chain.Carried`. InputError for names, units, scales, places and dimensions that cannot
+    a file holds: `Curve`, `chain.RowOrigins`. InputError for names, units, scales, places and dimensions that cannot
     be.
 
     >>> import casadi as ca

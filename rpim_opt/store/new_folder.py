@@ -26,9 +26,9 @@ from rpim_opt.data.tables.reading import read_data
 from rpim_opt.problem.diagnosis import rows_without_values
 from rpim_opt.problem.multi_robot import NAME
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
-from rpim_opt.problem.registration.camera import camera_blocks, posed
+from rpim_opt.problem.registration.camera import camera_blocks, with_poses
 from rpim_opt.problem.registration.frames import locate, starting_cameras, starting_parameters
-from rpim_opt.robot.chain import MOUNT, ORIGIN, Carried, RobotSetup, carried_by, placed, same_place
+from rpim_opt.robot.chain import MOUNT, ORIGIN, RobotSetup, RowOrigins, placed, row_origins, same_place
 from rpim_opt.robot.formats.tables import exact, toml, write_robot
 from rpim_opt.robot.formats.urdf import branching_tip
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics, numeric_frame
@@ -176,7 +176,7 @@ def _remarks(arm: RobotSetup, source: Path, understanding: Understanding, rows: 
         frame = "the last frame of the DH table" if source.suffix.lower() == ".csv" else "the tip link"
         there = f"{frame}, {placed(arm.tool)} in the flange frame"
     yield (
-        f"{understanding.kind.words.thing_at} starts at {there}: state its position in [tool] if it is known. [tool], "
+        f"{understanding.kind.words.at_flange} starts at {there}: state its position in [tool] if it is known. [tool], "
         "`known` and --tool refer to the flange frame after the last joint."
     )
     if placed(arm.base) != placed(np.zeros(6)):
@@ -309,7 +309,7 @@ def _camera(arm: RobotSetup, columns: Columns) -> tuple[Measurement, str]:
     misfit = {}  # RMS [m] of the views' poses where base and tool fit best
     for name, kind in CAMERAS.items():
         data = read_data(columns, arm.robot, {"pixel_px": 1.0}, kind)
-        poses = posed(data, starting_cameras(data, {}))
+        poses = with_poses(data, starting_cameras(data, {}))
         base, tools, _ = locate(arm.robot, poses, {block.markers[0]: np.zeros(6) for block in poses.blocks})
         placed_so = model_parameters(arm.robot, base, tools).identify(["base_*"])
         errors = CalibrationProblem(arm.robot, placed_so, poses).errors(np.zeros(len(placed_so.free)))
@@ -338,7 +338,7 @@ def _problem_text(
     parameters = starting_parameters(robot, rows, base, tools)
     names = list(identifiable("auto", robot, parameters, rows))
     if context["chain"] and markers == [""]:
-        names = _at_links(names, carried_by(robot.model.terms), base is not None)
+        names = _at_links(names, row_origins(robot.model.terms), base is not None)
     lenses = starting_cameras(rows, {})
     cameras = {
         fixture: {name: lenses[of_fixture(f"camera_{name}", fixture)] for name in list(INTRINSICS)[:4]}
@@ -376,7 +376,7 @@ def _problem_text(
     return text, how
 
 
-def _at_links(names: Sequence[str], carried: Sequence[Carried], at_base: bool) -> list[str]:
+def _at_links(names: Sequence[str], carried: Sequence[RowOrigins], at_base: bool) -> list[str]:
     """Return parameters of a chain, with those of fixed joints at its ends, if any, in place of base and tool."""
     mounts = {
         origin.up: origin.prefix for part in carried for origin in part.origins if origin.prefix.startswith(MOUNT)
@@ -391,7 +391,7 @@ def _at_links(names: Sequence[str], carried: Sequence[Carried], at_base: bool) -
 
 def _base(arm: RobotSetup, rows: Dataset, tools: Mapping[str, Array], kind: Measurement) -> tuple[Array | None, str]:
     """Return the base to state, None for registration, and why."""
-    rows = posed(rows, starting_cameras(rows, {}))
+    rows = with_poses(rows, starting_cameras(rows, {}))
     if not any(block.measurement.registers for block in rows.blocks):
         return arm.base, "The base is that of the robot's file: these measurements do not depend on it."
     located, _, verdict = locate(arm.robot, rows, tools)

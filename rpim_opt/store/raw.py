@@ -222,10 +222,10 @@ def in_time_order(found: Understanding) -> Understanding:
 def _with_meaning(tables: Sequence[Understood], columns: Sequence[str], **new: str) -> tuple[Understood, ...]:
     """Return tables in which columns, in lower case, that have no other meaning have a new one."""
 
-    def told(each: Meant) -> Meant:
+    def updated(each: Meant) -> Meant:
         return each._replace(**new) if each.column.lower() in columns and each.meaning == "not used" else each
 
-    return tuple(replace(table, meant=tuple(map(told, table.meant))) for table in tables)
+    return tuple(replace(table, meant=tuple(map(updated, table.meant))) for table in tables)
 
 
 def _checked(first: Understanding, files: Files, arm: RobotSetup, doubt: str) -> Understanding:

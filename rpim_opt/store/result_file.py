@@ -39,7 +39,7 @@ from rpim_opt.data.record import Record
 from rpim_opt.problem.noise import Repeatability
 from rpim_opt.problem.problem import CalibrationProblem, around
 from rpim_opt.problem.registration.global_start import JointMapping
-from rpim_opt.robot.chain import Carried, carried_by, displaced
+from rpim_opt.robot.chain import RowOrigins, origins_term, row_origins
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters
 from rpim_opt.robot.terms import Curve, Model, Term, transmission
@@ -197,7 +197,7 @@ class Stored:
     robots: dict[str, Robot]  # Nominal robots.
     terms: dict[str, list[OwnTerm]]  # Terms of a script's own, without their functions.
     transmission: tuple[Curve, ...]  # Transmission errors of the joints.
-    origins: dict[str, tuple[Carried, ...]]  # Origins of a URDF's joints that displace the robots' rows.
+    origins: dict[str, tuple[RowOrigins, ...]]  # Origins of a URDF's joints that displace the robots' rows.
     model: Parameters  # All parameters: nominal, prior scale, tolerance, identified.
     data: dict[str, Dataset]  # Identification and validation data.
     repeatability: Repeatability | None  # Repeatability of the robot.
@@ -226,7 +226,7 @@ def content(result: Calibration) -> dict[str, Any]:
         robots=arms,
         terms={name: _terms(robot.model, robot) for name, robot in arms.items()},
         transmission=tuple(curve for robot in arms.values() for curve in robot.model.curves),
-        origins={name: carried_by(robot.model.terms) for name, robot in arms.items()},
+        origins={name: row_origins(robot.model.terms) for name, robot in arms.items()},
         rows=_rows(result),
         model=result.problem.parameters,
         data=sets(result),
@@ -389,7 +389,7 @@ def _robot(name: str, file: Stored, models: Models) -> Robot:
         accepted = f"model=ro.Model(terms=[...]) with the calibration's terms: {'; '.join(map(str, terms)) or 'none'}"
         raise InputError("key terms", "; ".join(map(str, own_terms)) or "no term", accepted)
     curves = [transmission(curve) for curve in file.transmission if curve.joint <= len(robot.mdh) and not name]
-    origins = [displaced(carried) for carried in file.origins.get(name, ())]
+    origins = [origins_term(carried) for carried in file.origins.get(name, ())]
     return replace(robot, model=Model((*origins, *model.terms, *curves)))
 
 

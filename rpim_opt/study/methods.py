@@ -16,7 +16,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, pick
 from rpim_opt.basics.units import number
 from rpim_opt.calibration import baselines
-from rpim_opt.calibration.held_out import compared
+from rpim_opt.calibration.held_out import held_out_errors
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import judge
 from rpim_opt.convex.formulation import FORMULATIONS, formulation_of, tikhonov
@@ -324,7 +324,7 @@ class Fitted:
 def _coverage(fitted: Fitted) -> float | None:
     if fitted.result is None:
         return None
-    share = compared(fitted.result, fitted.held_out).coverage
+    share = held_out_errors(fitted.result, fitted.held_out).coverage
     return None if share is None else 100 * share
 
 

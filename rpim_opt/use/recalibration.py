@@ -16,7 +16,7 @@ from rpim_opt.basics.text import counted, joined, table, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
-from rpim_opt.calibration.held_out import compared, displaced, registered
+from rpim_opt.calibration.held_out import displacement, held_out_errors, registered
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import refuse_misread
@@ -28,7 +28,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.record import Earlier, HeldOut, Record
 from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.linear import RANK_TOLERANCE, LinearModel
-from rpim_opt.problem.multi_robot import knowing_sessions
+from rpim_opt.problem.multi_robot import identifying_sessions
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.robot.chain import placed, same_place
 from rpim_opt.robot.kinematics import FRAME
@@ -308,7 +308,7 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
     """Say where the base is and was, if readings that are displaced together put it out of its place; empty else."""
     # evidence is linear in the deviations: of a base that turned far, it is none
     base = [name for name in problem.parameters.free.names if name.startswith(BASE)]
-    if not base or not displaced(result, problem.data, compared(result, problem.data))[0]:
+    if not base or not displacement(result, problem.data, held_out_errors(result, problem.data))[0]:
         return ""
     registered = _recalibrated(result, problem, base, inflation, None)
     values = [each.problem.parameters.by_name(each.x) for each in (result, registered)]
@@ -322,11 +322,11 @@ def _base_elsewhere(result: Calibration, problem: CalibrationProblem, inflation:
 
 
 def moved_or_changed(result: Calibration, data: Dataset, held: HeldOut) -> tuple[str, str]:
-    """Return the sentences of `displaced`, or the change of the robot that leaves clearly less of chi-squared.
+    """Return the sentences of `displacement`, or the change of the robot that leaves clearly less of chi-squared.
 
     That is less by `AS_GOOD`, of new measurements and prior together, than after registration and with another base.
     """
-    moved = displaced(result, data, held)
+    moved = displacement(result, data, held)
     placed_by = {BASE + axis for axis in FRAME} <= set(result.problem.parameters.free.names)
     if not any(moved) or not placed_by or result.known_covariance is None or not result.problem.keeps_rows:
         return moved
@@ -398,7 +398,7 @@ def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
     problem = result.problem
     if not isinstance(problem, CalibrationProblem):
         raise InputError("the result", "a calibration of data in blocks", "one of measurements in memory")
-    return knowing_sessions(problem.on(data))
+    return identifying_sessions(problem.on(data))
 
 
 def previous_deviations(result: Calibration, problem: CalibrationProblem) -> Array:

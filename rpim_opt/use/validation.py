@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.tables import columns_csv, records
 from rpim_opt.basics.text import listed, table
 from rpim_opt.calibration.diagnosis import Outside
-from rpim_opt.calibration.held_out import compared, coverage_text, registered
+from rpim_opt.calibration.held_out import coverage_text, held_out_errors, registered
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.calibration.verdict import implausible, misread, worse_sentence, worse_than_nominal
 from rpim_opt.calibration.words import HEADER, contact_remarks, known_points, touch_errors, touch_rows
@@ -146,7 +146,7 @@ def validate(result: Calibration, data: Dataset, register: bool = False) -> Vali
         data, motion = registered(result, data)
         remarks.append(f"Registered again: the measurements were {motion}.")
     problem = result.problem.sample()
-    held = compared(result, data)
+    held = held_out_errors(result, data)
     touched = touch_errors(data, held.nominal, held.error)
     remarks += shared_rows(problem.data, data)
     moved, hint = moved_or_changed(result, data, held)

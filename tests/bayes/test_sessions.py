@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.basics.arrays import Array
 from rpim_opt.calibration.acceptance import inconclusive, measured_workspace
-from rpim_opt.calibration.held_out import compared
+from rpim_opt.calibration.held_out import held_out_errors
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
 from rpim_opt.problem.blocks import PartitionedProblem
 from rpim_opt.problem.multi_robot import unknown_sessions
@@ -338,4 +338,4 @@ def test_intervals_of_readings_are_wide_where_few_sessions_told_how_they_differ(
         moved = reading.position + scale * (y - reading.position)
         away = fresh.on(replace(data, blocks=(replace(data.blocks[0], y=moved),))).data
         inside = np.abs(moved - reading.position) <= reading.expanded
-        assert compared(automatic, away).coverage == pytest.approx(inside.mean(), abs=1e-12)
+        assert held_out_errors(automatic, away).coverage == pytest.approx(inside.mean(), abs=1e-12)

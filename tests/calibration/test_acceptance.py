@@ -13,7 +13,7 @@ from scipy.stats import chi
 
 import rpim_opt as ro
 from rpim_opt.basics.files import read_json
-from rpim_opt.calibration.acceptance import distance_quantile, reaching, region_of
+from rpim_opt.calibration.acceptance import distance_quantile, reached_positions, region_of
 from rpim_opt.problem.workspace import in_base
 from rpim_opt.report.summary import headline
 from tests.simulate import simulated
@@ -67,10 +67,10 @@ def test_the_bound_holds_at_true_positions_as_often_as_it_says() -> None:
         problem, truth = simulated(noise=5e-5, seed=seed)
         found = ro.calibrate(problem)
         region = region_of(found, Requirement(1e-3))
-        q = region.drawn()[:400]
+        q = region.samples()[:400]
         there = problem.on(ro.Dataset.of(q, np.zeros((len(q), 3)), 1.0))
         miss = np.linalg.norm(there.modelled(truth)[0] - found.forward(q)[:, :3, 3], axis=1)
-        kept.append(np.mean(miss <= reaching(found, region, q, 0.95)[1]))
+        kept.append(np.mean(miss <= reached_positions(found, region, q, 0.95)[1]))
     # the simulated robot repeats exactly, and some repeatability is always allowed for
     assert np.mean(kept) > 0.95
     assert min(kept) > 0.8
@@ -83,7 +83,7 @@ def test_a_region_is_where_it_says_and_its_largest_bound_is_searched_for(result)
     box = ((0.3, 0.8), (-0.5, 0.5), (0.2, 0.9))
     required = Requirement(1e-4, box=box, joints=((1, (-0.5, 0.5)),))
     region = region_of(result, required)
-    q = region.drawn()
+    q = region.samples()
     at = in_base(region.problem, q)
     assert len(q) == 2048
     assert (at >= np.array(box)[:, 0]).all()
@@ -92,11 +92,11 @@ def test_a_region_is_where_it_says_and_its_largest_bound_is_searched_for(result)
     measured = result.problem.data.q
     assert (q[:, 1:] >= measured[:, 1:].min(axis=0)).all()
     found = accept(result, required)
-    bound = reaching(result, region, q, 0.95)[1]
+    bound = reached_positions(result, region, q, 0.95)[1]
     assert found.bound >= bound.max()
     assert region.inside(found.workspace.q[-1:])[0]
     assert not region.inside(q[:1] + 2 * np.pi * np.eye(6)[:1]).any()  # the same place by other angles
-    assert found.workspace.typical == pytest.approx(np.median(bound))
+    assert found.workspace.median == pytest.approx(np.median(bound))
 
 
 def test_what_no_region_can_be_is_refused(result) -> None:
@@ -144,7 +144,7 @@ def test_joints_that_were_moved_together_do_not_bound_other_combinations() -> No
     moved_together = ro.calibrate(problem.on(ro.Dataset.of(q, y, 5e-5)), ro.tikhonov, 1.0)
     found = ro.calibration.accept(moved_together, ro.data.Requirement(1e-4))
     assert found.verdict == "inconclusive"
-    measured = reaching(moved_together, region_of(moved_together, found.requirement), q, 0.95)[1].max()
+    measured = reached_positions(moved_together, region_of(moved_together, found.requirement), q, 0.95)[1].max()
     assert f", at measured configurations {1e3 * measured:.3f} mm (--box restricts the region)" in str(found)
     assert found.bound is not None
     assert found.bound > 2 * measured
@@ -174,7 +174,7 @@ def test_held_out_rows_may_be_elsewhere(result) -> None:
 
 
 def test_a_region_in_which_nothing_was_measured_is_not_accepted(result) -> None:
-    drawn = region_of(result, Requirement(1e-3)).drawn()
+    drawn = region_of(result, Requirement(1e-3)).samples()
     there, measured = (in_base(result.problem, q) for q in (drawn, result.problem.data.q))
     far = there[np.argmax(np.linalg.norm(there[:, None] - measured, axis=2).min(axis=1))]
     box = tuple((float(at) - 0.03, float(at) + 0.03) for at in far)

@@ -37,11 +37,11 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
         "Missing: rows.",
         "Region: joints within the measured ranges.",
     ]
-    assert [bare.content()[f"{name}_mm"] for name in ("bound", "typical", "repeatability", "box")] == [None] * 4
+    assert [bare.content()[f"{name}_mm"] for name in ("bound", "median", "repeatability", "box")] == [None] * 4
     free = Acceptance(LIMIT, "inconclusive", (), expanded(500, np.inf, 5e-5), 2e-5)
     assert "The position reached" not in str(free)
     assert free.content()["bound_mm"] is None
-    assert free.content()["typical_mm"] == pytest.approx(0.05)
+    assert free.content()["median_mm"] == pytest.approx(0.05)
     whole = Acceptance(
         LIMIT, "accepted", (), expanded(500, 9e-5, 5e-5), 2e-5, {"rows": 4, "sentence": "Held out: 4 rows."}
     )

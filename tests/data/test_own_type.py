@@ -29,7 +29,7 @@ height = Measurement(
     model=lambda T: T[2, 3],
     columns={"height": "length"},
     noise={"height": "length"},
-    words=Words(thing="a stylus", noise_of="a dial gauge", columns={"height": "height that the gauge reads"}),
+    words=Words(target="a stylus", noise_of="a dial gauge", columns={"height": "height that the gauge reads"}),
 )
 TYPES = (height,)
 '''

@@ -14,7 +14,7 @@ from rpim_opt.data.measurements.camera import INTRINSICS, TARGET
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.problem import workspace as sight
 from rpim_opt.problem.misreadings import better_reading
-from rpim_opt.problem.registration.camera import normalized, posed, starting_camera
+from rpim_opt.problem.registration.camera import normalized, starting_camera, with_poses
 
 BOARD = ro.data.grid_board(4, 3, 0.05)
 POINTS = np.array(list(BOARD.values()))
@@ -145,7 +145,7 @@ def test_views_place_base_and_tool_from_nothing(kind: str) -> None:
     plain = problem.with_parameters(replace(p, nominal=np.where(stretched, 0.0, p.nominal)))
     exact = at(plain, configurations(problem), np.zeros(len(p.free)))
     own = dict(zip(p.names, exact.parameters.nominal.tolist(), strict=True))
-    assert len(posed(exact.data, own)) == 12
+    assert len(with_poses(exact.data, own)) == 12
     start = ro.problem.starting_parameters(exact.robot, exact.data, None, {"": (0.0,) * 6}, own)
     found = exact.with_parameters(start.identify(["a2"]))
     # the tool is expected within 0.1 m of nowhere, which counts as much as a robot that is wrong by 5 mm

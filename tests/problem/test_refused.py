@@ -16,7 +16,7 @@ from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.reading import declared_noise
 from rpim_opt.problem.blocks import partitions
-from rpim_opt.problem.registration.camera import posed, starting_camera
+from rpim_opt.problem.registration.camera import starting_camera, with_poses
 from rpim_opt.problem.registration.frames import locate
 from rpim_opt.problem.workspace import configurations_at, touched_place, within
 from rpim_opt.report.console import touched_point
@@ -97,10 +97,10 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a point of two numbers": (lambda: touched_point("1,2"), "x,y,z [mm]"),
     "the middle of what nobody touched": (lambda: touched_place(problem()), "no touch of a point"),
     "a camera without a focal length": (
-        lambda: posed(few_views(3), own(fx=0.0)), "a focal length of 0 px, accepted: one greater than zero"
+        lambda: with_poses(few_views(3), own(fx=0.0)), "a focal length of 0 px, accepted: one greater than zero"
     ),
     "views that show three corners": (
-        lambda: posed(world("eye_in_hand").data.take(np.array([0, 1, 5, 12, 13, 17])), own()),
+        lambda: with_poses(world("eye_in_hand").data.take(np.array([0, 1, 5, 12, 13, 17])), own()),
         "no view that determines a pose",
     ),
     "two views for a focal length": (
@@ -123,8 +123,8 @@ def test_what_cannot_be_used_is_named(what: str) -> None:
 def test_views_with_few_corners_are_left_out_where_others_show_their_pose() -> None:
     data = few_views(4)
     some = data.take(np.array([i for i in range(len(data)) if data.configuration[i] != 1 or i % 12 < 3]))
-    found = posed(some, own())
-    whole = posed(data, own())
+    found = with_poses(some, own())
+    whole = with_poses(data, own())
     assert len(found) == 3
     assert np.allclose(found.blocks[0].y, whole.blocks[0].y[[0, 2, 3]], atol=1e-9)
 

@@ -75,8 +75,8 @@ def _metres_of(carried: bool, T: Any, **values: Any) -> Any:
 
 
 _WORDS = Words(
-    thing="a camera",
-    thing_at="The camera (z forwards, x right, y down in the image)",
+    target="a camera",
+    at_flange="The camera (z forwards, x right, y down in the image)",
     frame="in the frame of the board",
     noise_of="corners detected to a fifth of a pixel",
     wrong="a wrong corner",
@@ -109,7 +109,7 @@ eye_to_hand = replace(
     name="eye_to_hand",
     model=partial(_pixels_of, True),
     metres=partial(_metres_of, True),
-    words=_WORDS._replace(thing="a board", thing_at="The board", frame="in the frame of the camera"),
+    words=_WORDS._replace(target="a board", at_flange="The board", frame="in the frame of the camera"),
 )
 """A point of a board on the flange, seen by a camera beside the robot: r = (u, v) - pixels(T p), T the board in the
 camera's frame, which is the instrument's."""

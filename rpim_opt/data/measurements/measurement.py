@@ -26,8 +26,8 @@ XYZ = {"x": "length", "y": "length", "z": "length"}  # a position's coordinates
 class Words(NamedTuple):
     """Wording of a measurement type: target, reference frame, typical noise and mistake, meaning of columns."""
 
-    thing: str = "a reflector"
-    thing_at: str = "The reflector"
+    target: str = "a reflector"
+    at_flange: str = "The reflector"
     frame: str = "so the instrument has a frame of its own"
     noise_of: str = "a laser tracker, and a robot that repeats well"
     wrong: str = "the reflector was bumped"

@@ -169,7 +169,7 @@ def _of_conic(g: Array, h: Array) -> Array:
     return np.array([g[0] * h[0], g[1] * h[1], g[0] * h[2] + g[2] * h[0], g[1] * h[2] + g[2] * h[1], g[2] * h[2]])
 
 
-def posed(data: Dataset, own: Mapping[str, float]) -> Dataset:
+def with_poses(data: Dataset, own: Mapping[str, float]) -> Dataset:
     """Return the data with a pose for every view of a camera; other measurements as they are."""
     if not camera_blocks(data):
         return data

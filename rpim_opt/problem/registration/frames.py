@@ -20,7 +20,7 @@ from rpim_opt.data.dataset import Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.problem.blocks import Source, in_parts
 from rpim_opt.problem.problem import CalibrationProblem, identifiable
-from rpim_opt.problem.registration.camera import camera_blocks, posed, starting_camera
+from rpim_opt.problem.registration.camera import camera_blocks, starting_camera, with_poses
 from rpim_opt.problem.registration.certified import UNKNOWN, certified_hand_eye
 from rpim_opt.problem.registration.closed_forms import (
     NOMINAL_ERROR,
@@ -255,7 +255,7 @@ def starting_parameters(
     own = {**(own or {}), **starting_cameras(data, own or {})}
     places = tools
     if base is None:
-        base, located, _ = locate(robot, posed(data, own), tools)
+        base, located, _ = locate(robot, with_poses(data, own), tools)
         # a board or a camera that is turned otherwise is not visible
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
@@ -346,7 +346,7 @@ def relocated(problem: Source) -> Source | None:
         if not p.identified[base].all():
             return None
         try:
-            data = posed(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
+            data = with_poses(problem.sample().data, dict(zip(p.names, p.nominal.tolist(), strict=True)))
             at = {block.markers[0]: _frame_of(p, tool_prefix(block.markers[0])) for block in data.blocks}
             there, located, _ = locate(problem.robot, data, {marker: p.nominal[k] for marker, k in at.items()})
         except InputError:

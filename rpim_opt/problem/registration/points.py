@@ -15,7 +15,7 @@ import numpy as np
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.problem.problem import CalibrationProblem
-from rpim_opt.problem.registration.camera import posed
+from rpim_opt.problem.registration.camera import with_poses
 from rpim_opt.problem.registration.closed_forms import NOMINAL_ERROR, TOOL_ERROR, proper, rigid, transforms
 from rpim_opt.robot.kinematics import FRAME
 from rpim_opt.robot.mdh import Robot
@@ -81,7 +81,7 @@ def points_of(problem: CalibrationProblem) -> Points | None:
     if len(problem.arms) > 1:
         return None
     try:
-        data = posed(problem.data, own)
+        data = with_poses(problem.data, own)
     except InputError:
         return None
     blocks = [block for block in data.blocks if block.measurement.name in ("position", "pose")]

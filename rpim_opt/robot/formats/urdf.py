@@ -28,14 +28,14 @@ from rpim_opt.robot.chain import (
     MOUNT,
     ORIGIN,
     ROUNDING,
-    Carried,
     Chain,
     Origin,
     RobotSetup,
+    RowOrigins,
     corrected,
     describe,
-    displaced,
     origin_numbers,
+    origins_term,
     reach,
     require_same_arm,
     spliced,
@@ -237,7 +237,7 @@ def _displacements(way: _Way, table: Array, G: Array) -> list[Term]:
             if step.joint.kind or i == taker:
                 origins.append(Origin(step.joint.prefix, F if step.up else before, step.up))
         if origins:
-            terms.append(displaced(Carried(row, tuple(origins))))
+            terms.append(origins_term(RowOrigins(row, tuple(origins))))
     return terms
 
 
