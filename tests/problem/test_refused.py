@@ -93,7 +93,7 @@ REFUSED: dict[str, tuple[Callable[[], object], str]] = {
     "a point out of reach": (
         lambda: configurations_at(ro.load("position").problem, np.array([[9.0, 0, 0]])), "(9000, 0, 0) mm, out of reach"
     ),
-    "a point that is a word": (lambda: touched_point("here"), "--point: found 'here'"),
+    "a point that is a word": (lambda: touched_point("here"), "point: found 'here'"),
     "a point of two numbers": (lambda: touched_point("1,2"), "x,y,z [mm]"),
     "the middle of what nobody touched": (lambda: touched_place(problem()), "no touch of a point"),
     "a camera without a focal length": (
