@@ -218,7 +218,7 @@ def test_where_the_difference_is_is_the_studys() -> None:
     few, some, clean, blunders, sag = map(errors_of_peers, ("clean10", "clean25", "clean52", "blunders52", "physics52"))
     least_squares = times(few["scipy, lm"], few[OURS])
     assert least_squares > 1.2
-    said = "our command and figaroh's priors with the noise told are equally good ({} and {} mm)"
+    said = "our command and figaroh's priors with the noise stated are equally good ({} and {} mm)"
     assert said.format(*(f"{times(few[method], np.ones(1)):.3f}" for method in (OURS, MAP))) in STUDIES
     assert f"least squares has {least_squares:.2f} times our error" in STUDIES
     assert f"figaroh's `structural` ({times(some[STRUCTURAL], some[OURS]):.2f} times our error)" in STUDIES

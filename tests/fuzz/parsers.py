@@ -23,7 +23,7 @@ from rpim_opt.convex.constraint_parser import sentence
 from rpim_opt.convex.formulation import formulation_of
 from rpim_opt.data.measurements.registry import MEASUREMENTS
 from rpim_opt.data.tables.reading import read_data
-from rpim_opt.report.console import carried, listed_numbers, tool_frame
+from rpim_opt.report.console import listed_numbers, payload_of, tool_frame
 from rpim_opt.robot.chain import RobotSetup
 from rpim_opt.robot.library import find_robot
 from rpim_opt.store.problem_file import named_weight, problems_folder
@@ -247,7 +247,7 @@ def result(data: bytes, folder: Path) -> None:
 def options(data: bytes, folder: Path) -> None:
     """Read what options of commands mean."""
     text = _sentence(data)
-    for read in (parse_units, tool_frame, carried, named_weight, formulation_of):
+    for read in (parse_units, tool_frame, payload_of, named_weight, formulation_of):
         with suppress(ro.InputError):
             read(text)
     listed_numbers(text)
