@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from io import StringIO
 from pathlib import Path
 
 import pytest
@@ -52,6 +53,28 @@ def test_calibrate_prints_the_tables_and_writes_the_result(monkeypatch, capsys, 
     assert (d5["unit"], d5["nominal"]) == ("mm", pytest.approx(93.16))
     assert d5["identified"] - d5["nominal"] == pytest.approx(d5["deviation"])
     assert [p.name for p in tmp_path.iterdir()] == ["result.json"]
+
+
+class Terminal(StringIO):
+    """What a terminal receives."""
+
+    def isatty(self) -> bool:
+        return True
+
+
+def test_a_terminal_gets_whole_words(monkeypatch, capsys) -> None:
+    """Sentences are broken between words at the terminal's width; tables and all words are those of the piped text."""
+    assert run(monkeypatch, "inspect", "paper_arm") == 0
+    piped = capsys.readouterr().out
+    monkeypatch.setenv("COLUMNS", "60")
+    monkeypatch.setattr("sys.stdout", terminal := Terminal())
+    assert run(monkeypatch, "inspect", "paper_arm") == 0
+    shown = terminal.getvalue()
+    assert shown.split() == piped.split()
+    tables = [line for line in piped.splitlines() if "  " in line]
+    assert tables == [line for line in shown.splitlines() if "  " in line]
+    assert all(len(line) <= 60 for line in shown.splitlines() if "  " not in line)
+    assert any(len(line) > 60 for line in piped.splitlines() if "  " not in line)
 
 
 def test_a_weight_can_be_given(monkeypatch, capsys) -> None:

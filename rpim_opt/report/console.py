@@ -9,6 +9,8 @@ from contextlib import contextmanager, suppress
 from dataclasses import replace
 from math import radians
 from pathlib import Path
+from shutil import get_terminal_size
+from textwrap import TextWrapper
 from threading import Timer
 from typing import TYPE_CHECKING, Any, TextIO
 
@@ -23,10 +25,13 @@ if TYPE_CHECKING:
 
 def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
     """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
-    if not isinstance(text, str):
-        text = json_text(text).rstrip("\n")
-    encoding = getattr(stream or sys.stdout, "encoding", None) or "utf-8"
-    print(visible(text).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
+    stream = stream or sys.stdout
+    lines = visible(text if isinstance(text, str) else json_text(text).rstrip("\n")).split("\n")
+    if stream.isatty():  # break sentences at words; rows of tables, with wider gaps, stay lines
+        wrapper = TextWrapper(get_terminal_size().columns, break_long_words=False, break_on_hyphens=False)
+        lines = [line if "  " in line else wrapper.fill(line) for line in lines]
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    print("\n".join(lines).encode(encoding, "backslashreplace").decode(encoding), file=stream, flush=True)
 
 
 def fail(text: str, code: int) -> None:
@@ -99,10 +104,9 @@ def require_positive(where: str, value: float | None) -> None:
 
 def _numbers(option: str, text: str, counts: tuple[int, ...], accepted: str, least: float = -LARGEST) -> list[float]:
     """Return the numbers of ``1,2,3``; InputError for another count of them, or one that is out of range."""
-    try:
+    values: list[float] = []
+    with suppress(ValueError):
         values = [float(part) for part in text.split(",")]
-    except ValueError:
-        values = []
     if len(values) not in counts or not all(abs(value) < LARGEST for value in values) or values[0] < least:
         raise InputError(option, f"'{text}'", accepted)
     return values
@@ -118,17 +122,15 @@ def tool_frame(text: str | None) -> list[float] | None:
 
 def touched_point(text: str | None) -> list[float] | None:
     """Return the point [m] of ``--point``."""
-    if text is None:
-        return None
-    return [1e-3 * v for v in _numbers("--point", text, (3,), "x,y,z [mm] in the robot's base frame")]
+    accepted = "x,y,z [mm] in the robot's base frame"
+    return None if text is None else [1e-3 * v for v in _numbers("--point", text, (3,), accepted)]
 
 
 def payload_of(text: str | None) -> tuple[float | None, list[float] | None]:
     """Return mass [kg] and centre of mass [m], or None, of ``--payload``."""
     if text is None:
         return None, None
-    accepted = "a mass [kg], or mass and centre: kg,x,y,z [mm]"
-    mass, *centre = _numbers("--payload", text, (1, 4), accepted, least=0.0)
+    mass, *centre = _numbers("--payload", text, (1, 4), "a mass [kg], or mass and centre: kg,x,y,z [mm]", least=0.0)
     return mass, [1e-3 * v for v in centre] or None
 
 
@@ -139,9 +141,7 @@ def requirement_of(limit: float | None, box: str | None, stated: Requirement | N
     require_positive("--limit", limit)
     if box is not None and limit is None and stated is None:
         raise InputError("--box", "no limit", "--limit with it [mm]")
-    changes: dict[str, Any] = {}
-    if limit is not None:
-        changes["limit"] = 1e-3 * limit
+    changes: dict[str, Any] = {} if limit is None else {"limit": 1e-3 * limit}
     if box is not None:
         ends = [1e-3 * end for end in _numbers("--box", box, (6,), "six numbers: x0,x1,y0,y1,z0,z1 [mm]")]
         changes["box"] = tuple(zip(ends[::2], ends[1::2], strict=True))
@@ -157,11 +157,11 @@ def listed_words(text: str) -> list[str]:
 
 def listed_numbers(text: str) -> list[str | int | float]:
     """Return the words of ``learned,1.0``, those that are numbers as numbers."""
-    values: list[str | int | float] = []
-    for word in listed_words(text):
-        value: str | int | float = word
-        for kind in (float, int):
+
+    def value(word: str) -> str | int | float:
+        for kind in (int, float):
             with suppress(ValueError):
-                value = kind(word)
-        values.append(value)
-    return values
+                return kind(word)
+        return word
+
+    return [value(word) for word in listed_words(text)]
