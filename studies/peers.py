@@ -473,9 +473,14 @@ def _figure(rows: list[dict[str, Any]], situations: list[str], seeds: list[int])
     from matplotlib.ticker import LogLocator, NullFormatter, ScalarFormatter
 
     names = list(METHODS)[::-1]
-    figure = Figure(figsize=(2.2 + 2.1 * len(situations), 0.3 * len(names) + 1.2), layout="constrained")
-    axes = np.atleast_1d(figure.subplots(1, len(situations), sharey=True))
-    for ax, situation in zip(axes, situations, strict=True):
+    columns = min(len(situations), 4)  # more would be too small to read beside a text
+    lines = -(-len(situations) // columns)
+    size = (2.2 + 2.1 * columns, lines * (0.3 * len(names) + 1.2))
+    figure = Figure(figsize=size, layout="constrained")
+    axes = figure.subplots(lines, columns, sharey=True, squeeze=False).ravel()
+    for unused in axes[len(situations) :]:
+        unused.remove()
+    for ax, situation in zip(axes, situations, strict=False):
         errors = _errors(rows, situation, seeds)
         for y, method in enumerate(names):
             values = errors.get(method, np.zeros(0))
@@ -491,5 +496,5 @@ def _figure(rows: list[dict[str, Any]], situations: list[str], seeds: list[int])
         ax.set_xlabel("RMS error [mm]", fontsize=8)
         ax.tick_params(axis="x", labelsize=7)
         ax.grid(axis="x", alpha=0.3)
-    axes[0].set_yticks(range(len(names)), names, fontsize=8)
+        ax.set_yticks(range(len(names)), names, fontsize=8)
     return figure
