@@ -27,7 +27,7 @@ def show(text: str | dict[str, Any], stream: TextIO | None = None) -> None:
     """Print a text without control characters, or a document, flushed so that a closed pipe is noticed."""
     stream = stream or sys.stdout
     lines = visible(text if isinstance(text, str) else json_text(text).rstrip("\n")).split("\n")
-    if stream.isatty():  # break sentences at words; rows of tables, with wider gaps, stay lines
+    if stream and stream.isatty():  # break sentences at words; rows of tables, with wider gaps, stay lines
         wrapper = TextWrapper(get_terminal_size().columns, break_long_words=False, break_on_hyphens=False)
         lines = [line if "  " in line else wrapper.fill(line) for line in lines]
     encoding = getattr(stream, "encoding", None) or "utf-8"
