@@ -24,7 +24,7 @@ from typer.core import TyperGroup
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound, NotDelivered, RpimError
 from rpim_opt.basics.files import inside, sha256_of
-from rpim_opt.basics.text import listed, progress_bar, table
+from rpim_opt.basics.text import progress_bar, table
 from rpim_opt.report import console
 
 HELP = """Robot calibration by convex optimization.
@@ -282,18 +282,15 @@ def new(
 def inspect(problem: Problem, variant: Variant = None) -> Answer:
     """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
     with console.progress() as say:
-        from rpim_opt.calibration.lack_of_fit import quick_lack_of_fit
-
         say("reading the problem")
         instance = ro.load(problem, variant)
-        say("inspecting")
+        say("inspecting, with a quick fit")
         whole = instance.problem
         apart = instance.validation
         validation = {} if apart is None else {name: apart.of_robot(name) for name in {*apart.robot}}
-        parts = {name: ro.problem.inspect(whole.alone(name), validation.get(name)) for name in whole.arms}
+        prior = instance.prior if len(whole.arms) == 1 else None  # names of one robot's parameters may be others'
+        parts = {name: ro.calibration.inspect(whole.alone(name), validation.get(name), prior) for name in whole.arms}
         together = ro.problem.observe(whole) if len(parts) > 1 else None
-        say("analysing the residuals of a quick fit")
-        lacking, outliers = quick_lack_of_fit(whole)
     document: dict[str, Any] = {"title": instance.record.title, "source": instance.record.source}
     text = "\n".join(filter(None, [instance.record.title, instance.record.source]))
     for name, part in parts.items():
@@ -301,12 +298,6 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
     if together is not None:
         text += f"\n\nAll robots together: {together}"
-    document["lack_of_fit"] = None
-    if lacking is not None:
-        document["lack_of_fit"] = {**lacking.content(), "outliers": [row.label for row in outliers]}
-        text += f"\n\nA quick fit of {lacking.configurations} configurations. {lacking}"
-        if outliers:
-            text += f"\nExcluded outliers: {listed([str(row) for row in outliers], 10)}."
     return Answer(text, document)
 
 

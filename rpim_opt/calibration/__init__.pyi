@@ -4,6 +4,8 @@ from .acceptance import accept as accept
 from .certificate import Certificate as Certificate
 from .held_out import refit_all as refit_all
 from .identify import calibrate as calibrate
+from .inspection import Inspection as Inspection
+from .inspection import inspect as inspect
 from .leverage import Improvement as Improvement
 from .leverage import Influence as Influence
 from .leverage import improvement as improvement

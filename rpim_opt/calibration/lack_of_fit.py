@@ -11,22 +11,18 @@ import scipy
 from scipy.special import fdtri
 
 from rpim_opt.basics.arrays import Array
-from rpim_opt.basics.exceptions import InputError, NoSolutionFound
+from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import joined
 from rpim_opt.basics.threads import one_blas_thread
-from rpim_opt.bayes.hyperparameters import ExcludedRow, sampled
 from rpim_opt.bayes.model_selection import SESSIONS, SPEAK, WARMTH, Candidate, Comparison
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
-from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.outcome import Outcome
 from rpim_opt.calibration.verdict import against_gravity
-from rpim_opt.problem.blocks import Source
 from rpim_opt.problem.noise import UNITS, Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
 
-QUICK = 60  # configurations that are looked at before calibrating
 FEWEST = 6  # equations that must be left over, or repeated, to judge by
 CORRELATED = 4.0  # z-score from which on residuals are said to be autocorrelated
 ROUGH, FINE = 2.0, 0.3  # repeatability over noise above which the robot is the limit, below which the instrument is
@@ -251,15 +247,6 @@ def judged(result: Outcome) -> LackOfFit | None:
         return lack_of_fit(result)
     except np.linalg.LinAlgError:
         return None
-
-
-def quick_lack_of_fit(problem: Source) -> tuple[LackOfFit | None, list[ExcludedRow]]:
-    """Return the lack of fit of a quick fit to at most 60 configurations, None if it fails, and its outliers."""
-    try:
-        result = calibrate(sampled(problem, QUICK))
-        return judged(result), [] if result.learned is None else list(result.learned.left_out)
-    except (InputError, NoSolutionFound, np.linalg.LinAlgError):
-        return None, []
 
 
 def _parts(compared: Comparison, model: Candidate, known: Repeatability | None = None) -> dict[str, float]:

@@ -34,7 +34,8 @@ SLIGHTLY = "Slight, but significant"
 LIMITED = "the formulation, not the robot, limits the fit"
 """Beginning of the cause that loss, penalty or constraints contradict the data."""
 REMARKS = (BAD, SLIGHTLY)  # beginnings of what is said of robots that are delivered, too
-OVERSTATED = 0.05  # residual RMS over the stated noise below which the noise is not that of these data; from 20 um on
+OVERSTATED = 0.05
+"""Residual RMS over the stated noise below which it is not theirs, from 20 um on; of nominal errors 1 / `NOISY`."""
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
@@ -55,10 +56,7 @@ SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
 BENDS = ("compliance", "bend")  # beginnings of the names of parameters with which gravity bends an arm
-NOTHING = (
-    "None of the tested input mistakes explains it. Check the nominal parameters; the arm may be compliant,"
-    " or less repeatable than stated. Run `rpim-opt inspect`."
-)
+NOTHING = "None of the tested input mistakes explains it. Check the nominal parameters and the arm: is it compliant?"
 
 
 @dataclass(frozen=True)
@@ -195,8 +193,9 @@ def _residuals(result: Outcome, kept: np.ndarray) -> Iterator[str]:
     size = residuals["length"][0]
     ratio = max(residuals["length"][1], residuals["pixel"][1])
     share = size / arm_length(result.problem)
-    for each, ratio_of in residuals.values():
-        if each > COMPUTED_RMS and 0 < ratio_of < OVERSTATED:  # 0 where the dimension was not measured
+    for each, (size_of, ratio_of) in residuals.items():
+        nominal = noise_ratio(result.problem, result.nominal_errors(dimension=each), each)  # with frames fitted
+        if size_of > COMPUTED_RMS and 0 < min(ratio_of / OVERSTATED, NOISY * nominal) < 1:  # 0: it was not measured
             yield f"Residuals are {ratio_of:.2g} times the stated noise, which is in another unit or far too large."
     if ratio > NOISY and share > REACH:
         yield (
@@ -390,7 +389,7 @@ def _beside_a_good_fit(
     beyond the noise.
     """
     kept = kept_rows(result)
-    causes = []
+    causes = list(diagnosis.filled_rows(ordered.data))  # which may fit
     if result.excluded is not None and len(problem.arms) == 1:
         by_result = replace(ordered, robots=result.robot)
         causes = first(

@@ -6,8 +6,6 @@ from .design import Observability as Observability
 from .design import choose as choose
 from .design import observe as observe
 from .design import random_candidates as random_candidates
-from .diagnosis import Inspection as Inspection
-from .diagnosis import inspect as inspect
 from .linear import LinearModel as LinearModel
 from .multi_robot import together as together
 from .noise import Repeatability as Repeatability

@@ -1,10 +1,10 @@
-"""Input check before calibration: ranges, suspicious rows, observability."""
+"""Likely causes of a poor fit: what rows, points of the nominal robot and residuals show."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import chain, combinations, combinations_with_replacement, pairwise, product
 from typing import Any, NamedTuple
@@ -12,21 +12,17 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import bdtrc, fdtrc
 
-from rpim_opt.basics.arrays import TINY, Array, rms, statistics
-from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import Tabled, counted, joined, listed, table, three_digits
+from rpim_opt.basics.arrays import TINY, Array, rms
+from rpim_opt.basics.text import joined, listed, three_digits
 from rpim_opt.basics.units import display
 from rpim_opt.data.dataset import Block, Dataset
 from rpim_opt.data.measurements.measurement import of_fixture
-from rpim_opt.problem.design import Observability, observe
 from rpim_opt.problem.linear import LinearModel
 from rpim_opt.problem.misreadings import BETTER, RARE, WRONG, better_reading, coupling, signs
-from rpim_opt.problem.noise import UNITS, Equations
-from rpim_opt.problem.problem import SHIFTED, CalibrationProblem, near_parallel
+from rpim_opt.problem.noise import Equations
+from rpim_opt.problem.problem import SHIFTED, CalibrationProblem
 from rpim_opt.problem.registration.closed_forms import transformed
-from rpim_opt.problem.registration.frames import fitted_frames, ridge_deviations
 from rpim_opt.problem.registration.points import FAR, Fit, Points, agreeing, fit_points, lengths_of, misfit, points_of
-from rpim_opt.problem.row_functions import about_means, repeated
 from rpim_opt.robot.kinematics import FRAME, forward_kinematics
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import tool_prefix
@@ -80,191 +76,6 @@ PLACES, SPANS = 40, 12
 MOST_EQUATIONS = 3000  # equations up to which a change is looked for
 
 
-@dataclass(frozen=True, eq=False, repr=False)
-class Inspection(Tabled):
-    """Result of `inspect`.
-
-    ``residual`` (N,) is the error of every row of the ``problem`` [m], robot nominal, identified frames fitted;
-    ``standing_out`` are the labels of rows whose residual is far above the others', the largest first; ``repeated`` are
-    groups of labels measured in the same configuration by the same reflector, and ``repeatability`` the standard
-    deviation of repeated measurements about their means [m], of one coordinate; None without any. ``warnings`` (units,
-    signs, frames, limits, coverage), ``proposals`` (what the problem file could say) and ``contact`` (what touches
-    show) are sentences; ``observability`` is what the configurations can show.
-
-    >>> import rpim_opt as ro
-    >>> found = ro.problem.inspect(ro.load("paper_arm", variant="misprints").problem)
-    >>> found.standing_out, found.observability.rank, len(found.warnings)
-    (('T8-6', 'T8-7'), 20, 0)
-    """
-
-    problem: CalibrationProblem
-    residual: Array
-    standing_out: tuple[str, ...]
-    repeated: tuple[tuple[str, ...], ...]
-    repeatability: float | None
-    warnings: tuple[str, ...]
-    proposals: tuple[str, ...]
-    observability: Observability
-    contact: tuple[str, ...] = ()
-
-    @property
-    def _mm(self) -> dict[str, float]:
-        """Errors of the rows by label [mm]."""
-        return dict(zip(self.problem.data.label, (1e3 * self.residual).tolist(), strict=True))
-
-    def _short(self) -> str:
-        o = self.observability
-        seen = f"{o.rank} of {len(o.names)} combinations identifiable"
-        return f"{self.problem.data._short()}, {seen}, {counted(len(self.warnings), 'warning')}"
-
-    def _frame_rows(self) -> list[dict[str, Any]]:
-        """Return the joints and how far they move."""
-        robot = self.problem.robot
-        rows = []
-        for i, (q, dimension) in enumerate(zip(_all_q(self.problem.data).T, robot.joint_dimensions, strict=True)):
-            unit, si = display(dimension)
-            row = {"joint": f"q{i + 1}", "unit": unit, "from": q.min() / si, "to": q.max() / si}
-            row |= {"limits": None, "share": None}
-            if np.isfinite(robot.limits[i]).all():
-                row |= {"limits": (robot.limits[i] / si).tolist(), "share": float(np.ptp(q) / np.ptp(robot.limits[i]))}
-            rows.append(row)
-        return rows
-
-    def _notes(self) -> list[str]:
-        return [*(f"Warning: {text}" for text in self.warnings), *(f"Proposal: {text}" for text in self.proposals)]
-
-    def __str__(self) -> str:
-        joints = []
-        for r in self._frame_rows():
-            figures = [f"{value:.2f}" for value in (r["from"], r["to"], r["to"] - r["from"])]
-            limits = ["-", "-"]
-            if r["limits"]:
-                limits = [f"{r['limits'][0]:.0f} to {r['limits'][1]:.0f}", f"{100 * r['share']:.0f} %"]
-            joints.append([r["joint"], r["unit"], *figures, *limits])
-        measured = []
-        for r in self._measured():
-            figures = ["-" if r[k] is None else f"{r[k]:.3f}" for k in ("from", "to")]
-            of = [f"{r[f'sigma_{u}']:.3g} {u}" for u in ("mm", "mrad", "px") if r.get(f"sigma_{u}") is not None]
-            measured.append([r["measured"], r["unit"], *figures, *(of or ["-"])])
-        data, errors = self.problem.data, 1e3 * self.residual
-        lines = [f"{len(data)} rows in {len(np.unique(data.configuration))} configurations."]
-        if np.isfinite(errors).any():
-            largest = f"{np.nanmax(errors):.3f} mm max ({data.label[np.nanargmax(errors)]})"
-            lines[0] += f" Nominal error {np.nanmean(errors):.3f} mm mean, {largest}."
-        if self.repeated:
-            groups = listed([", ".join(group) for group in self.repeated], 5, "; ")
-            spread = f", repeatable to {1e3 * self.repeatability:.3g} mm" if self.repeatability else ""
-            lines.append(f"Measured more than once in the same configuration{spread}: {groups}.")
-        if self.standing_out:
-            named = listed([f"{label} ({self._mm[label]:.2f} mm)" for label in self.standing_out], 10)
-            lines.append(f"Exceptionally large error of the nominal robot, or an outlier: {named}.")
-        notes = self._notes()
-        parts = [
-            table(["joint", "unit", "from", "to", "span", "limits", "covered"], joints),
-            table(["measured", "unit", "from", "to", "noise (1 sigma)"], measured),
-            "\n".join(lines),
-            str(self.observability),
-            "\n".join(self.contact),
-            "\n".join(notes[: len(self.warnings)]),
-            "\n".join(notes[len(self.warnings) :]),
-        ]
-        return "\n\n".join(filter(None, parts))
-
-    def content(self) -> dict[str, Any]:
-        """Return the same as a document; joints and measured values in the unit that they name."""
-        o = self.observability
-        return {
-            "joints": self._frame_rows(),
-            "measured": self._measured(),
-            "rows": len(self.residual),
-            "configurations": len(np.unique(self.problem.data.configuration)),
-            "nominal": statistics(self.residual),
-            "standing_out": [{"label": label, "error_mm": self._mm[label]} for label in self.standing_out],
-            "repeated": self.repeated,
-            "repeatability_mm": None if self.repeatability is None else 1e3 * self.repeatability,
-            "observability": {
-                "parameters": o.names, "rank": o.rank, "weak": o.weak,
-                "condition": o.condition, "raw_condition": o.raw_condition, **o.indices,
-                "unidentifiable": o.unidentifiable, "redundant": o.redundant,
-            },
-            "contact": self.contact,
-            "warnings": self.warnings,
-            "proposals": self.proposals,
-        }  # fmt: skip
-
-    def _measured(self) -> list[dict[str, Any]]:
-        """Return the range and typical deviation of every measured column by kind, reflector and fixture."""
-        rows: dict[str, dict[str, Any]] = {}
-        for block in self.problem.data.blocks:
-            kind = block.measurement
-            sigma = np.sqrt(np.median(np.einsum("nii->ni", block.covariance), axis=0))
-            of = dict(zip(kind.components, sigma.tolist(), strict=True))
-            where = ", ".join(filter(None, [" to ".join(filter(None, block.markers)), block.fixture]))
-            for i, (column, dimension) in enumerate((kind.columns or kind.components).items()):
-                unit, si = display(dimension)
-                what = f"{kind.name}{f' of {where}' if where else ''}: {column}"
-                row = {"measured": what, "unit": unit, "from": None, "to": None}
-                if kind.columns:
-                    row |= {"from": block.y[:, i].min() / si, "to": block.y[:, i].max() / si}
-                each, size = UNITS.get(dimension, ("mrad", 1e-3))
-                rows[what] = row | {f"sigma_{each}": of[column] / size if column in of else None}
-        return list(rows.values())
-
-
-def inspect(problem: CalibrationProblem, validation: Dataset | None = None) -> Inspection:
-    """Check a problem's data: ranges, coverage, repeated rows, likely input mistakes, identifiability.
-
-    Mistakes are units, signs, zeros, orders and couplings of joints, rows that are shifted, exchanged or have no value,
-    left-handed frames, another robot, an instrument that moved: another reading of the data that leaves less than a
-    fifth of the position error is named, with what to write. Of the rows that were kept apart for ``validation`` none
-    should be an identification row.
-
-    >>> from dataclasses import replace
-    >>> import rpim_opt as ro
-    >>> problem = ro.load("position").problem
-    >>> wrong = replace(problem.data.blocks[0], q=problem.data.blocks[0].q * [1, 1, -1, 1, 1, 1])
-    >>> said = ro.problem.inspect(problem.on(replace(problem.data, blocks=(wrong,)))).warnings[-1]
-    >>> said.split(":")[-1]
-    ' write sign, and add the zeros to theta_deg, of these joints in robot.toml.'
-    """
-    if not problem.keeps_rows:
-        raise InputError("inspect", "data in blocks", "one of them: inspect(part) for part in problem.rows()")
-    data, free = problem.data, problem.parameters.free.names
-    fitted, x = fitted_frames(problem)
-    residual = fitted.errors(x)
-    far, order = far_off(residual), np.argsort(-np.nan_to_num(residual))
-    groups: list[tuple[str, ...]] = []
-    squares, freedom = 0.0, 0
-    for block in data.blocks:
-        lengths = [i for i, d in enumerate(block.measurement.columns.values()) if d == "length"]
-        which = repeated(block)
-        count = np.bincount(which)
-        groups += [tuple(data.label[i] for i in block.row[which == k]) for k in np.flatnonzero(count > 1)]
-        squares += float(np.sum(about_means(block.y[:, lengths], which) ** 2))
-        freedom += (len(which) - len(count)) * len(lengths)
-    needed = [name for name in near_parallel(problem.robot) if name not in free]
-    proposals: tuple[str, ...] = ()
-    if needed:
-        pairs = ", ".join(f"{name[4:]} and {int(name[4:]) + 1}" for name in needed)
-        proposals = (f"the axes {pairs} are nearly parallel: add {', '.join(needed)} to `identify`.",)
-    # all are identified again, with frames where they were fitted
-    whole = problem.with_parameters(replace(fitted.parameters, identified=problem.parameters.identified))
-    ordered = in_table_order(problem, validation)
-    warnings = [*_ranges(problem), *copied_rows(data), *shared_rows(data, validation), *single_rows(ordered)]
-    warnings += first(other_readings(ordered), shown_by_fit(whole))
-    return Inspection(
-        problem=problem,
-        residual=residual,
-        standing_out=tuple(data.label[i] for i in order if far[i] and len(data) > 4),
-        repeated=tuple(groups),
-        repeatability=float(np.sqrt(squares / freedom)) if freedom else None,
-        warnings=tuple(warnings),
-        proposals=proposals,
-        observability=observe(whole),
-        contact=tuple(contact_sentences(problem)),
-    )
-
-
 def in_table_order(problem: CalibrationProblem, *apart: Dataset | None) -> CalibrationProblem:
     """Return a problem with rows that were kept apart, all at their places in the table by the numbers in their labels.
 
@@ -287,12 +98,6 @@ def _natural(label: str) -> tuple[str | int, ...]:
     return tuple(int(part) if k % 2 else part for k, part in enumerate(re.split(r"(\d+)", label)))
 
 
-def far_off(errors: Array) -> np.ndarray:
-    """Return which errors (N,) are `FAR` robust standard deviations above their median."""
-    middle = np.nanmedian(errors)
-    return errors > middle + FAR * 1.4826 * np.nanmedian(np.abs(errors - middle))
-
-
 def first(*explanations: Iterable[str]) -> list[str]:
     """Return the sentences of the first explanation that has any; later ones are not looked for."""
     return next((sentences for sentences in map(list, explanations) if sentences), [])
@@ -301,7 +106,8 @@ def first(*explanations: Iterable[str]) -> list[str]:
 # What is said of a table
 
 
-def _all_q(data: Dataset) -> Array:
+def all_q(data: Dataset) -> Array:
+    """Return the joint values (N, dof) of all points of all rows."""
     return np.concatenate([block.q.reshape(-1, block.q.shape[2]) for block in data.blocks])
 
 
@@ -310,28 +116,6 @@ def _rows(labels: Sequence[str], of_one: str, of_several: str) -> str:
     if len(labels) == 1:
         return f"row {labels[0]} {of_one}"
     return f"rows {listed(labels)} {of_several}"
-
-
-def _ranges(problem: CalibrationProblem) -> Iterator[str]:
-    """Say which joints leave their limits or hardly move, and which rows may be copied."""
-    robot = problem.robot
-    q = _all_q(problem.data)
-    for i, dimension in enumerate(robot.joint_dimensions):
-        unit, si = display(dimension)
-        low, high = robot.limits[i]
-        if q[:, i].min() < low - 1e-9 or q[:, i].max() > high + 1e-9:
-            yield f"joint {i + 1} exceeds its limits {low / si:.1f} to {high / si:.1f} {unit}."
-        if np.ptp(q[:, i]) < LEAST_TRAVEL[robot.joint_types[robot.leading[i]]]:
-            yield f"joint {i + 1} moves only {np.ptp(q[:, i]) / si:.2f} {unit}: its parameters are poorly identifiable."
-    for block in problem.data.blocks:
-        if block.y.shape[1] < 3:
-            continue
-        label = [problem.data.label[row] for row in block.row]
-        _, first, which = np.unique(block.y, axis=0, return_index=True, return_inverse=True)
-        for i, k in enumerate(first[which.ravel()]):  # a column in NumPy 2.0
-            if not np.allclose(block.q[i], block.q[k]):
-                both = f"rows {label[k]} and {label[i]}"
-                yield f"{both} have the same measured values in different configurations: copied?"
 
 
 def arm_length(robot: Robot, blocks: Iterable[Block]) -> float:
@@ -513,7 +297,7 @@ def roundings(problem: CalibrationProblem, error: float, most: float) -> Iterato
 def _roundings(problem: CalibrationProblem) -> Iterator[Rounding]:
     """Yield roundings of joint and measured values that are there, whatever they explain."""
     turning = np.array(problem.robot.joint_dimensions) == "angle"
-    angles = _all_q(problem.data)[:, turning]
+    angles = all_q(problem.data)[:, turning]
     slopes = problem.joint_slopes()[Equations.of(problem.data).length]
     arm = float(np.sqrt(np.sum(slopes**2) / len(problem.data)))  # how far all joints move a point, a radian each
     decimals = (np.abs(np.degrees(angles)) % 1).round(6)
@@ -934,35 +718,22 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
     return without
 
 
-def shown_by_fit(problem: CalibrationProblem) -> Iterator[str]:
-    """Report what residuals of a fit with the stated scales show, without rows far off; nothing within the noise."""
-    near = np.flatnonzero(~far_off(problem.errors(ridge_deviations(problem))))
-    alone = problem.on(problem.data.take(near))
-    x = ridge_deviations(alone)
-    norms, count = alone.whitened_errors(x)
-    if norms @ norms > NOTICED**2 * count.sum():
-        yield from shown_by_residuals(alone, x, transmission=False)
-
-
-def shown_by_residuals(
-    problem: CalibrationProblem, x: Array, *, transmission: bool = True, slight: bool = False
-) -> Iterator[str]:
+def shown_by_residuals(problem: CalibrationProblem, x: Array, *, slight: bool = False) -> Iterator[str]:
     """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
     Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few;
-    if ``transmission``, the slope of a joint's zero times the value of a joint, all of these times the way from the row
-    before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
-    Else backlash and rows of two kinds are looked for. Nothing is reported where gravity and eccentric gears explain
-    more, which are not in the model: a lack of fit, and no mistake. Of ``slight`` residuals, no larger than they may
-    be, the addition is reported if errors would be a sixth smaller without it, and nothing else is looked for.
+    the slope of a joint's zero times the value of a joint, all of these times the way from the row before, and the
+    slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too. Else backlash
+    and rows of two kinds are looked for. Nothing is reported where gravity and eccentric gears explain more, which are
+    not in the model: a lack of fit, and no mistake. Of ``slight`` residuals, no larger than they may be, the addition
+    is reported if errors would be a sixth smaller without it, and nothing else is looked for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
     model = problem.linearize(x)
     acceptable = _acceptable_part(problem, x)
     most = min(SLIGHT if slight else MOVED, acceptable**2)
-    additions = [_moves(problem, x), *([_gears(problem, model), _scales(problem, x, model)] if transmission else [])]
-    best = _explained(model, x, chain.from_iterable(additions), most)
+    best = _explained(model, x, chain(_moves(problem, x), _gears(problem, model), _scales(problem, x, model)), most)
     if slight:
         yield from _said_of_addition(best)
         return
@@ -979,7 +750,7 @@ def shown_by_residuals(
         kinds = None
     if kinds is None and best is not None:
         yield from _said_of_addition(best)
-    elif kinds is not None or transmission:
+    else:
         part = min(TWO_KINDS, acceptable, np.inf if kinds is None else kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
         yield from first(two_positions(problem, x, part), said)
@@ -1296,23 +1067,3 @@ def _scales(problem: CalibrationProblem, x: Array, model: LinearModel) -> Iterat
             axes = "check whether the instrument's axes are square"
             what = (f"column {'xyz'[i]} contains", axes, f"of column {'xyz'[j]}")
         yield scaled(of_axis[:, i] * y[:, j], *what)
-
-
-# What touches say
-
-
-def contact_sentences(problem: CalibrationProblem) -> Iterator[str]:
-    """Yield sentences on what touches identify and what they do not; none without touches."""
-    touches = problem.touches
-    if touches is None:
-        return
-    s = problem.linearize(np.zeros(len(problem.parameters.free))).svd[1]
-    kinds = {"points": touches.planar.count(False), "planes": touches.planar.count(True)}
-    things = " and ".join(f"{number} {name}" for name, number in kinds.items() if number)
-    yield (
-        f"{sum(map(len, touches.rows))} touches of {things}: {int(np.count_nonzero(s > 1))} of {len(s)} parameter "
-        "combinations are identified better than by their prior scales. Touches do not identify the base frame or the "
-        "offset of the first joint."
-    )
-    if all(tie.kind != "known_distance" for tie in touches.ties):
-        yield "The scale of the robot rests on its nominal lengths: a [[known_distance]] would determine it."

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from dataclasses import replace
 
@@ -10,9 +11,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
-from rpim_opt.calibration import likely_causes
+from rpim_opt.calibration import inspect, likely_causes
 from rpim_opt.calibration.lack_of_fit import lack_of_fit
-from rpim_opt.problem import inspect
 from rpim_opt.problem.diagnosis import left_out_together, other_rows, rows_without_values
 from rpim_opt.problem.misreadings import better_reading
 from rpim_opt.robot.formats.tables import read_robot
@@ -157,7 +157,7 @@ def test_good_data_are_not_accused(robot: str) -> None:
     """Also where the instrument is worse than stated by less than what is looked into, and few rows are there."""
     problem = simulated_arm(robot, 3)
     assert likely_causes(calibrated(problem)) == []
-    assert not [text for text in inspect(problem).warnings if "hardly" not in text]
+    assert not [text for text in inspect(problem).judgement if "hardly" not in text]
 
 
 def test_a_robot_that_bends_is_no_mistake() -> None:
@@ -178,18 +178,19 @@ def test_validation_rows_that_are_identification_rows_are_named() -> None:
     for validation, count in ((copies, 2), (own, 0)):
         causes = likely_causes(validated(result, validation))
         assert len(causes) == (count > 0)
-    found = inspect(problem, copies).warnings
+    found = inspect(problem, copies).judgement
     assert any("2 of 2 rows of the validation set are identification rows as well: P4, P10" in t for t in found)
-    assert not inspect(problem, own).warnings
+    (said,) = inspect(problem, own).judgement  # which are of another arm
+    assert said.startswith("Median error on 10 held-out rows")
 
 
 def test_rows_of_another_reflector_are_named() -> None:
     problem = simulated_arm("ur5e", markers=2)
     wrong = reflectors_exchanged(problem)
-    for texts in (inspect(wrong).warnings, likely_causes(calibrated(wrong))):
+    for texts in (inspect(wrong).judgement, likely_causes(calibrated(wrong))):
         (text,) = [text for text in texts if "fit another reflector" in text]
         assert all(f"P{i + 1}{m}" in text for i in (5, 11, 30) for m in "AB"), text
-    assert not inspect(problem).warnings
+    assert not inspect(problem).judgement
 
 
 def test_reflectors_that_were_swapped_from_a_row_on_are_named_beside_single_rows() -> None:
@@ -203,7 +204,7 @@ def test_reflectors_that_were_swapped_from_a_row_on_are_named_beside_single_rows
     marker[:40] = [{"A": "B", "B": "A"}.get(name, name) for name in marker[:40]]
     swapped = ro.Dataset.of(data.q, y, data.blocks[0].covariance[:1], marker=marker, label=data.label)
     wrong = problem.on(replace(swapped, configuration=data.configuration))
-    for texts in (inspect(wrong).warnings, ro.calibrate(wrong).verdict.reasons):
+    for texts in (inspect(wrong).judgement, ro.calibrate(wrong).verdict.reasons):
         assert any("fit another reflector" in text for text in texts), texts
 
 
@@ -220,12 +221,12 @@ def test_a_small_motion_of_the_instrument_is_named_before_calibrating_too(robot:
     """Half a millimetre, as large as the nominal robot's errors, which hide it until they are fitted."""
     shift = np.array([0.4e-3, 0.25e-3, 0.0]) * (np.arange(COUNT) >= 29)[:, None]
     moved = values(lambda y: y + shift)(simulated_arm(robot))
-    for texts in (inspect(moved).warnings, likely_causes(ro.calibrate(moved))):
+    for texts in (inspect(moved).judgement, likely_causes(ro.calibrate(moved))):
         (text,) = [text for text in texts if "hardly" not in text]
         assert "from row P30 on the points are 0.4" in text
         assert "did the instrument or the robot's base move?" in text
     alone = values(lambda y: y + 3e-3 * (np.arange(COUNT) == 7)[:, None])(simulated_arm(robot))
-    assert not [text for text in inspect(alone).warnings if "hardly" not in text]
+    assert not [text for text in inspect(alone).judgement if "hardly" not in text]
 
 
 LAST = np.arange(80)[:, None] >= 60
@@ -328,14 +329,18 @@ def test_joint_values_that_were_logged_as_16_bit_floats_are_named() -> None:
 
 
 def made(monkeypatch, folder, problem, *options: str, robot: str = "ur5e") -> None:
-    """Make the folder ``cell`` from a raw table of what was measured."""
-    (block,) = problem.data.blocks
-    header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m"])
-    rows = [
-        ",".join([label, *(f"{v:.6f}" for v in np.degrees(q)), *(f"{v:.7f}" for v in y)])
-        for label, q, y in zip(problem.data.label, block.q[:, 0], block.y, strict=True)
-    ]
-    (folder / "raw.csv").write_text("\n".join([header, *rows]))
+    """Make the folder ``cell`` from a raw table of what was measured, in the order of the configurations."""
+    data = problem.data
+    header = ",".join(["label", *(f"q{i}_deg" for i in range(1, 7)), "x_m", "y_m", "z_m", "marker"])
+    rows = {
+        (data.configuration[row], data.label[row]): ",".join(
+            [data.label[row], *(f"{v:.6f}" for v in np.degrees(q[0])), *(f"{v:.7f}" for v in y), *block.markers]
+        )
+        for block in data.blocks
+        for row, q, y in zip(block.row, block.q, block.y, strict=True)
+    }
+    header = header if data.blocks[0].markers[0] else header.removesuffix(",marker")
+    (folder / "raw.csv").write_text("\n".join([header, *(rows[key].rstrip(",") for key in sorted(rows))]))
     table = str(folder / "raw.csv")
     assert run(monkeypatch, "new", str(folder / "cell"), "--robot", robot, "--data", table, *options) == 0
 
@@ -353,6 +358,72 @@ def test_the_command_says_it(monkeypatch, capsys, tmp_path) -> None:
         assert "mm instead of" in said
     assert run(monkeypatch, "report", out) == 0
     assert "joints 2 and 3 exchanged" in (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+
+
+def swapped(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Exchange the values of two reflectors from halfway on."""
+    first, second = problem.data.blocks
+    late = np.arange(len(first.y))[:, None] >= len(first.y) // 2
+    exchanged = [np.where(late, b.y, a.y) for a, b in ((first, second), (second, first))]
+    blocks = tuple(replace(block, y=y) for block, y in zip(problem.data.blocks, exchanged, strict=True))
+    return problem.on(replace(problem.data, blocks=blocks))
+
+
+def of_another_nest(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Measure every fifth row at a second reflector, which no column names."""
+    first, second = (block.y for block in simulated_arm("ur5e", count=len(problem.data), markers=2).data.blocks)
+    return values(lambda _: np.where(np.arange(len(first))[:, None] % 5 == 2, second, first))(problem)
+
+
+COUNTED = "between table and robot file: "
+OF_THE_SHEET = {
+    "a length of the other sign": ("a_mm = -425", "a_mm = 425", f"{COUNTED}a3 of the other sign in the robot file, or"),
+    "a theta of 90 degrees": ("a_mm = -425", "a_mm = -425\ntheta_deg = 90", f"{COUNTED}zero of joint 3 -90.0 deg. "),
+}
+OF_THE_TABLE = {
+    "reflectors swapped": (swapped, 2, "fit another reflector"),
+    "another nest": (of_another_nest, 1, "fit another reflector"),
+    "joints in another order": (
+        joints(lambda q: q[..., [0, 2, 1, 3, 5, 4]]), 1, "joints 2 and 3 exchanged and joints 5 and 6 exchanged"
+    ),
+    "cm as mm": (values(lambda y: y / 10), 1, "in cm, not mm"),
+    "one coordinate mirrored": (values(lambda y: y * [1, -1, 1]), 1, "the measured frame mirrored"),
+    "U95 in um": (values(lambda y: y), 1, "the stated noise, which is in another unit or far too large"),
+}  # fmt: skip
+QUICKLY_NAMED = ("a length of the other sign", "reflectors swapped", "U95 in um")
+
+
+@pytest.mark.parametrize(
+    "mistake",
+    [
+        each if each in QUICKLY_NAMED else pytest.param(each, marks=pytest.mark.slow)
+        for each in (*OF_THE_SHEET, *OF_THE_TABLE)
+    ],
+)
+def test_inspect_and_calibrate_name_the_same_causes_in_one_order(monkeypatch, capsys, tmp_path, mistake: str) -> None:
+    """Of mistakes in the table and in the robot file, and with the same verdict."""
+    robot, change, markers = "ur5e", values(lambda y: y), 1
+    if mistake in OF_THE_SHEET:
+        right, wrong, said = OF_THE_SHEET[mistake]
+        robot = str(tmp_path / "sheet.toml")
+        (tmp_path / "sheet.toml").write_text((READY / "ur5e.toml").read_text().replace(right, wrong))
+    else:
+        change, markers, said = OF_THE_TABLE[mistake]
+    made(monkeypatch, tmp_path, change(simulated_arm("ur5e", markers=markers)), robot=robot)
+    file = tmp_path / "cell" / "problem.toml"
+    if mistake == "U95 in um":  # 15 um, of which the standard deviation is half
+        file.write_text(re.sub(r"position_mm = .*", "position_mm = 7.5", file.read_text()))
+    capsys.readouterr()
+    assert run(monkeypatch, "inspect", str(tmp_path / "cell"), "--json") == 0
+    before = json.loads(capsys.readouterr().out)
+    run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--json")
+    after = json.loads(capsys.readouterr().out)
+    found = before["judgement"], [text for text in (after["caution"], *after["verdict"]["reasons"]) if text]
+    for texts in found:
+        assert any(said in text for text in texts), texts
+    causes = [[text for text in texts if text.startswith(("Likely: ", "Signs or zeros"))] for texts in found]
+    assert causes[0] == causes[1]
+    assert before["delivered"] == after["verdict"]["delivered"]
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -479,7 +550,7 @@ def repeated(q: np.ndarray, rows: np.ndarray) -> np.ndarray:
     ],
 )
 def test_rows_that_were_filled_in_are_named(wrong, rows: list[int], said: str) -> None:
-    found = inspect(wrong(np.array(rows))(simulated_arm("irb120"))).warnings
+    found = inspect(wrong(np.array(rows))(simulated_arm("irb120"))).judgement
     assert any(said in text for text in found), found
 
 
@@ -502,7 +573,7 @@ def test_measured_points_of_a_grid_are_not_called_filled_in_whatever_their_unit(
     """Those of 60 mm in inches, read as mm, are half way to 5 um, which is the instrument's noise over 25.4."""
     grid = np.stack(np.meshgrid(*3 * [0.06 * np.arange(4)]), axis=-1).reshape(-1, 3)[:COUNT] / 25.4
     noisy = grid + 4e-6 * np.random.default_rng(5).normal(size=grid.shape)
-    found = inspect(values(lambda _: noisy)(simulated_arm("irb120"))).warnings
+    found = inspect(values(lambda _: noisy)(simulated_arm("irb120"))).judgement
     assert not any("half way" in text for text in found), found
 
 
@@ -603,7 +674,7 @@ def test_another_unit_from_halfway_on_is_named() -> None:
     half = np.arange(COUNT) < COUNT // 2
     wrong = joints(lambda q: np.where(half[:, None, None], q, np.radians(q)))(simulated_arm("ur5e"))
     causes = likely_causes(ro.calibrate(wrong))
-    for said in (causes[1], ro.problem.inspect(wrong).warnings[-1]):
+    for said in (causes[1], inspect(wrong).judgement[-1]):
         assert re.search("from about row P(19|2)", said)
         assert "as radians, not degrees" in said
 
@@ -767,8 +838,10 @@ def test_joint_values_that_were_not_updated_are_named_across_held_out_rows() -> 
     problem = joints(lambda q: np.where(stale, np.roll(q, 1, axis=0), q))(simulated_arm("irb120"))
     held = np.arange(COUNT) % 4 == 3  # two of the rows before these among them
     rows = [problem.data.take(np.flatnonzero(part)) for part in (~held, held)]
-    said = inspect(problem.on(rows[0]), rows[1]).warnings
-    assert any(text.startswith("rows P5, P15, P25, P35 have the joint values of the row before") for text in said), said
+    said = inspect(problem.on(rows[0]), rows[1]).judgement
+    assert any(
+        text.startswith("Likely: rows P5, P15, P25, P35 have the joint values of the row before") for text in said
+    ), said
 
 
 def test_many_single_outliers_are_no_instrument_that_moved() -> None:
@@ -791,7 +864,7 @@ def test_a_lost_reading_is_named_also_where_rows_are_held_out() -> None:
     found = [likely_causes(validated(calibrated(problem.on(rows[0])), rows[1]))]
     for label in ("P{}", "P{}_A"):  # of a configuration, and of a reflector there
         apart = [replace(part, label=tuple(label.format(each[1:]) for each in part.label)) for part in rows]
-        found.append(inspect(problem.on(apart[0]), apart[1]).warnings)
+        found.append(inspect(problem.on(apart[0]), apart[1]).judgement)
     for texts in found:
         assert any("with measured values 1 row too high" in text for text in texts), texts
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.calibration.lack_of_fit import FEWEST, LackOfFit, autocorrelation, judged, lack_of_fit, quick_lack_of_fit
+from rpim_opt.calibration.lack_of_fit import FEWEST, LackOfFit, autocorrelation, judged, lack_of_fit
 from rpim_opt.report.report import page
 from tests.simulate import ALL, ARM, simulated
 
@@ -180,13 +180,14 @@ def test_paragraph_of_a_file_is_that_of_the_result(tmp_path):
 
 def test_quick_look_agrees_with_the_calibration():
     problem = arm(1, compliance=BENT)
-    quick, outliers = quick_lack_of_fit(problem)
+    found = ro.calibration.inspect(problem)
+    quick = found.lack_of_fit
     assert quick is not None
-    assert not outliers
+    assert not found.outliers
     full = lack_of_fit(ro.calibrate(problem))
     assert quick.missing == full.missing
     assert quick.share == pytest.approx(full.share, abs=0.02)
-    assert "too few to separate" in str(quick_lack_of_fit(problem.on(problem.data.take([0, 1])))[0])
+    assert "too few to separate" in str(ro.calibration.inspect(problem.on(problem.data.take([0, 1]))))
 
 
 def test_the_quick_look_leaves_out_what_the_calibration_leaves_out():
@@ -194,7 +195,8 @@ def test_the_quick_look_leaves_out_what_the_calibration_leaves_out():
     y = problem.data.blocks[0].y.copy()
     y[5, 2] += 0.008
     spoiled = problem.on(ro.Dataset.of(problem.data.q, y, NOISE))
-    quick, outliers = quick_lack_of_fit(spoiled)
+    found = ro.calibration.inspect(spoiled)
+    quick, outliers = found.lack_of_fit, found.outliers
     assert [row.label for row in outliers] == [spoiled.labels[5]]
     assert outliers[0].error == pytest.approx(0.008, rel=0.1)
     assert quick is not None

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.calibration.inspection import contact_sentences
 from rpim_opt.problem.diagnosis import (
-    contact_sentences,
     other_places,
     rounded,
     rows_without_values,
@@ -135,10 +135,10 @@ def test_readings_of_one_configuration_are_said_to_agree() -> None:
     y = problem.data.blocks[0].y
     q = problem.data.q
     again = ro.Dataset.of(np.vstack([q, q[:2]]), np.vstack([y, y[:2] + 1e-4]), 5e-5)
-    said = str(ro.problem.inspect(problem.on(again)))
+    said = str(ro.calibration.inspect(problem.on(again)))
     assert "Measured more than once in the same configuration, repeatable to " in said
     assert "1, 13" in said
-    assert "more than once" not in str(ro.problem.inspect(problem))
+    assert "more than once" not in str(ro.calibration.inspect(problem))
 
 
 def test_several_robots_have_no_positions() -> None:

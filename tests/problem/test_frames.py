@@ -185,7 +185,7 @@ def test_a_problem_from_arrays_has_its_frames_where_the_data_put_them() -> None:
     result = ro.calibrate(problem)
     assert np.array_equal(result.problem.parameters.nominal, problem.parameters.nominal)
     assert np.array_equal(problem.errors(result.x), result.errors())
-    assert ro.problem.inspect(arm).observability.rank == ro.problem.observe(arm).rank
+    assert ro.calibration.inspect(arm).observability.rank == ro.problem.observe(arm).rank
 
 
 REFLECTORS = {"A": [0.04, 0, 0.03, 0, 0, 0], "B": [0, 0.04, 0.03, 0, 0, 0], "C": [-0.04, 0, 0.05, 0, 0, 0]}
@@ -213,7 +213,7 @@ def test_several_reflectors_come_from_arrays_in_one_call(tool: dict[str, list[fl
 
 def test_reflectors_that_have_no_name_or_no_start_are_named() -> None:
     robot = ro.load("markers").problem.robot
-    warned = ro.problem.inspect(ro.problem_from(robot, of_reflectors([]))).warnings
+    warned = ro.calibration.inspect(ro.problem_from(robot, of_reflectors([]))).judgement
     assert any("are they of several reflectors?" in text for text in warned), warned
     data = of_reflectors(["A", "B", "C"] * 25)
     with pytest.raises(ro.InputError, match=r"found 'C', accepted: .* \(\[tool.C\]\): 'A', 'B'\."):

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
+from rpim_opt.calibration import inspect
 from rpim_opt.data.measurements.pose import pose
-from rpim_opt.problem import inspect
 from rpim_opt.problem.registration.global_start import mapped
 from rpim_opt.robot.kinematics import forward_kinematics, numeric_frame
 from rpim_opt.robot.library import find_robot
@@ -117,7 +117,7 @@ def test_another_description_of_the_same_robot_is_named() -> None:
         f"Signs or zeros of joints differ between table and robot file: {both} (these explain the data equally well, "
     )
     assert result.caution.startswith(said)
-    assert both in inspect(problem.on(replace(problem.data, blocks=(turned,)))).warnings[-1]
+    assert both in inspect(problem.on(replace(problem.data, blocks=(turned,)))).judgement[0]
 
 
 def test_of_two_descriptions_that_the_one_with_the_stated_reflector_is_taken() -> None:
@@ -224,13 +224,16 @@ def test_a_left_handed_frame_with_a_reversed_joint_is_named_beside_the_descripti
 
 @pytest.mark.parametrize("name", ["a3", "d4"])
 def test_a_length_of_the_wrong_sign_is_no_matter_of_the_joints_alone(name: str) -> None:
-    """Half a turn of joints explains it as well: then the robot file is to be checked, too."""
+    """Half a turn of joints explains it as well: the number of the robot file comes first, here and in `inspect`."""
     problem = ro.load("position").problem
     joint, column = int(name[1:]) - 1, ["alpha", "a", "theta", "d", "beta"].index(name[0])
     mdh, nominal = problem.robot.mdh.copy(), problem.parameters.nominal.copy()
     mdh[joint, column] *= -1
     nominal[problem.parameters.names.index(name)] *= -1
     parameters = replace(problem.parameters, nominal=nominal)
-    result = ro.calibrate(ro.CalibrationProblem(replace(problem.robot, mdh=mdh), parameters, problem.data))
-    assert result.caution.endswith("in the file acts like zeros of 180 deg: check it first.")
+    wrong = ro.CalibrationProblem(replace(problem.robot, mdh=mdh), parameters, problem.data)
+    result = ro.calibrate(wrong)
+    assert f"robot file: {name} of the other sign in the robot file, or " in result.caution
+    assert result.caution.endswith(f"Check the sign of {name} first.")
+    assert inspect(wrong).judgement[0] == result.caution
     assert not ro.calibrate(problem).caution

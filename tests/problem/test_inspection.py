@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.problem.diagnosis import inspect, odd_column, other_places
+from rpim_opt.calibration import inspect
+from rpim_opt.problem.diagnosis import odd_column, other_places
 from rpim_opt.robot.library import find_robot
 from tests.test_cli import run
 
@@ -18,7 +19,7 @@ CLEAN = ("position", "pose", "markers", "cable", "distance", "mixed", "seven_axi
 @pytest.mark.parametrize("name", CLEAN)
 def test_good_data_raise_no_suspicion(name: str) -> None:
     found = inspect(ro.load(name).problem)
-    assert not [text for text in found.warnings if "better" in text or "?" in text]
+    assert not [text for text in (*found.warnings, *found.judgement) if "better" in text or "?" in text]
     assert "parameter combinations are identifiable" in str(found)
 
 
@@ -45,15 +46,15 @@ MISTAKES = {
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_likely_mistakes_are_named(mistake: str) -> None:
     name, change, expected = MISTAKES[mistake]
-    warnings = inspect(changed(name, **change)).warnings
-    assert any(expected in text and "times better" in text for text in warnings), warnings
+    said = inspect(changed(name, **change)).judgement
+    assert any(expected in text and "times better" in text for text in said), said
 
 
 def test_a_ready_robot_of_nearly_the_same_drawing_is_named() -> None:
     problem = ro.load("mixed").problem
     assert problem.robot.name.endswith("UR10e")
     older = ro.read_robot(find_robot("ur10"))
-    (text,) = [each for each in inspect(replace(problem, robots=older)).warnings if "times better" in each]
+    (text,) = [each for each in inspect(replace(problem, robots=older)).judgement if "times better" in each]
     assert "the ready robot ur10e" in text
 
 
@@ -71,8 +72,8 @@ def test_rows_that_stand_out_are_named() -> None:
     y = block.y.copy()
     y[[3, 17]] += [0.05, 0.0, 0.0]
     found = inspect(problem.on(replace(problem.data, blocks=(replace(block, y=y),))))
-    assert set(found.standing_out) == {"c3", "c17"}
-    assert "Exceptionally large error of the nominal robot, or an outlier: " in str(found)
+    assert {row.label for row in found.outliers} == {"c3", "c17"}
+    assert "\nExcluded outliers: " in str(found)
 
 
 def test_repeated_rows_tell_the_repeatability() -> None:
@@ -83,7 +84,7 @@ def test_repeated_rows_tell_the_repeatability() -> None:
     found = inspect(problem.on(replace(data, blocks=(replace(data.blocks[0], y=y),))))
     assert len(found.repeated) == 20
     assert ("c0.0", "c0.1", "c0.2") in found.repeated
-    assert found.repeatability == pytest.approx(2e-5, rel=0.2)
+    assert found.lack_of_fit.repeated == pytest.approx(3**0.5 * 2e-5, rel=0.2)  # of three coordinates
 
 
 def test_copied_values_limits_and_coverage() -> None:

@@ -292,7 +292,7 @@ def test_the_covariance_of_one_robots_commands_is_that_of_the_whole() -> None:
         ),
         (lambda a, b: ro.together(a, b, shared=["d?"]), "shared 'd1': found nominal values"),
         (lambda a, b: ro.together(a, b, shared=TOOL).robot, r"robot: found 2 in one problem \(A, B\)"),
-        (lambda a, b: ro.problem.inspect(ro.together(a, b, shared=TOOL)), r"accepted: one: problem.alone\('A'\)"),
+        (lambda a, b: ro.calibration.inspect(ro.together(a, b, shared=TOOL)), r"accepted: one: problem.alone\('A'\)"),
         (lambda a, b: ro.together(a, b, shared=TOOL).alone("C"), "robot: found 'C'"),
         (lambda a, b: ro.together(a, b, shared=TOOL).on(a.data), "rows that name no robot"),
         (lambda a, b: a.on(ro.Dataset.of_robots({"A": a.data})), "rows of robot 'A'"),

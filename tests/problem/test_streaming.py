@@ -172,7 +172,7 @@ def test_what_needs_rows_says_so(whole: CalibrationProblem, parts: list[ro.Datas
         with pytest.raises(ro.InputError, match="QR factor"):
             ro.calibrate(problem, ro.tikhonov, rule)
     with pytest.raises(ro.InputError, match="data in blocks"):
-        ro.problem.inspect(problem)
+        ro.calibration.inspect(problem)
     with pytest.raises(ro.InputError, match="data in blocks"):
         ro.store.save_result(ro.calibrate(problem, ro.tikhonov, 1.0), "nowhere.json")
     with pytest.raises(ro.InputError, match="data in blocks"):

@@ -359,9 +359,9 @@ def test_designed_configurations_tell_more_than_drawn_ones() -> None:
 
 
 def test_inspect_says_what_touches_show() -> None:
-    said = " ".join(ro.problem.inspect(ro.load("contact").problem).contact)
+    said = " ".join(ro.calibration.inspect(ro.load("contact").problem).contact)
     assert "60 touches of 10 points" in said
-    assert ro.problem.inspect(ro.load("paper_arm").problem).contact == ()
+    assert ro.calibration.inspect(ro.load("paper_arm").problem).contact == ()
 
 
 @pytest.mark.parametrize(

@@ -31,7 +31,7 @@ OBJECTS = {
     "estimate": RESULT.program.solve(1.0),
     "uncertainty": ro.calibration.Uncertainty(RESULT),
     "influence": ro.influence(RESULT),
-    "inspection": ro.problem.inspect(INSTANCE.problem),
+    "inspection": ro.calibration.inspect(INSTANCE.problem),
     "observability": ro.problem.observe(INSTANCE.problem),
     "formulation": ro.robust,
     "prediction": RESULT.predict(INSTANCE.validation.q[:3]),

@@ -59,7 +59,7 @@ def test_errors_of_joints_that_follow_are_found_and_go_back_into_the_file(arm: r
     problem = empty.on(ro.Dataset.of(q, y, 1e-5))
     result = ro.calibrate(problem, ro.tikhonov, weight=1e-6)
     assert np.abs(result.x - truth).max() < 1e-5
-    assert ro.problem.inspect(problem)
+    assert ro.calibration.inspect(problem)
     ro.store.save_result(result, "result.json")
     assert np.array_equal(ro.load_result("result.json").robot.joint_map, robot.joint_map)
     ro.use.export_files(result, "identified.urdf", urdf="arm.urdf")

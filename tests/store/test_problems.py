@@ -235,8 +235,8 @@ def test_six_rows_that_a_reading_fits_by_chance_are_read_as_they_are_written() -
     """Two columns a row higher in another unit leave 2 um of 58 um: one of six million choices of three mistakes."""
     problem = ro.load(REAL / "motoman_right").problem
     rows = [problem.data.label.index(f"c{i}") for i in (184, 185, 186, 188, 189, 190)]
-    found = ro.problem.inspect(problem.on(problem.data.take(rows)))
-    assert not any("the data fit" in warning for warning in found.warnings)
+    found = ro.calibration.inspect(problem.on(problem.data.take(rows)))
+    assert not any("the data fit" in said for said in found.judgement)
 
 
 @real

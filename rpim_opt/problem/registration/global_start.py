@@ -94,28 +94,26 @@ class JointMapping:
     behind: str = ""  # joints that fit as well in a left-handed frame, as stated or one of them reversed
     same: tuple[Alternative, ...] = ()  # other descriptions of the same robot that change as few joints
     moved: float = 0.0  # how far a reflector is from its stated place in the flange frame [m]
+    lengths: tuple[str, ...] = ()  # one of which, with the other sign and joints as stated, is the same robot
 
     @property
     def explanations(self) -> str:
-        """Return signs and zeros as text, with the other descriptions of the same robot."""
-        return ", or ".join(described(self.joint_types, each.sign, each.zero) for each in (self, *self.same))
+        """Return the descriptions of the robot as text: lengths of the other sign, one number each, then mappings."""
+        counted = [described(self.joint_types, each.sign, each.zero) for each in (self, *self.same)]
+        return ", or ".join([*(f"{name} of the other sign in the robot file" for name in self.lengths), *counted])
 
     @property
     def caution(self) -> str:
         """Return what table and robot file disagree about (signs, zeros), and what to check and to write."""
-        equally = ""
-        if self.same:
-            far = ", or ".join(f"{three_digits(1e3 * each.moved)} mm" for each in (self, *self.same))
-            equally = f" (these explain the data equally well, with a reflector {far} from its stated place)"
+        far = ", or ".join(f"{three_digits(1e3 * each.moved)} mm" for each in (self, *self.same))
+        there = f", with a reflector {far} from its stated place" if self.same else ""
+        equally = f" (these explain the data equally well{there})" if self.same or self.lengths else ""
         text = (
             f"Signs or zeros of joints differ between table and robot file: {self.explanations}{equally}. The result "
             f"holds for the table's joint values. Check the pendant: if it displays the table's values, {WRITE}; if it "
             "displays the robot file's, correct the table's columns and calibrate again before using this robot."
         )
-        half_turns = np.isclose(np.abs(self.zero), np.pi) & (np.array(self.joint_types) == "revolute")
-        if half_turns.any():
-            text += " A length (a, d) of the wrong sign in the file acts like zeros of 180 deg: check it first."
-        return text
+        return f"{text} Check the sign of {' and '.join(self.lengths)} first." if self.lengths else text
 
     @property
     def sentence(self) -> str:
@@ -503,6 +501,7 @@ def _judged(
     return JointMapping(
         points.robot.joint_types, sign[i], found.zeros[i], nominal, left, starts, tuple(others),
         mirrored=AS_STATED in behind, behind=" or ".join(behind), same=found.same(first), moved=float(found.moved[i]),
+        lengths=_of_other_sign(points, MIRRORED * left),
     )  # fmt: skip
 
 
@@ -512,11 +511,26 @@ def _behind_a_mirror(points: Points, largest: float) -> list[str]:
         return []
     robot, other = points.robot, mirrored(points)
     sign = _one_reversed(robot.dof)
-    candidates = Candidates.of([replace(other, q=each * other.q) for each in sign])
-    fits = fit_arms(candidates, LONG, zeros=True, noise=LEAST_NOISE)
-    small = [np.abs(_gauged(robot, zero)).max() < NEAR_ZERO for zero in fits.zero]
-    explained_so = np.flatnonzero(small & (rms(fits) < largest))
-    return [described(robot.joint_types, sign[k], np.zeros(robot.dof)) for k in explained_so]
+    as_well = _explain([replace(other, q=each * other.q) for each in sign], largest)
+    return [described(robot.joint_types, sign[k], np.zeros(robot.dof)) for k in np.flatnonzero(as_well)]
+
+
+def _of_other_sign(points: Points, largest: float) -> tuple[str, ...]:
+    """Return the lengths of the DH table one of which, with the other sign, explains points to ``largest`` [m]."""
+    names = []
+    for joint, column in zip(*np.nonzero(points.robot.mdh[:, [1, 3]]), strict=True):
+        mdh = points.robot.mdh.copy()
+        mdh[joint, (1, 3)[column]] *= -1
+        if _explain([replace(points, robot=replace(points.robot, mdh=mdh))], largest)[0]:
+            names.append(f"{'ad'[column]}{joint + 1}")
+    return tuple(names)
+
+
+def _explain(tries: Sequence[Points], largest: float) -> np.ndarray:
+    """Return which points (B,) of one robot it explains to ``largest`` [m], with joint zeros near the stated ones."""
+    fits = fit_arms(Candidates.of(tries), LONG, zeros=True, noise=LEAST_NOISE)
+    small = [np.abs(_gauged(tries[0].robot, zero)).max() < NEAR_ZERO for zero in fits.zero]
+    return small & (rms(fits) < largest)
 
 
 def _apart(one: Array, other: Array, lengths: bool) -> float:

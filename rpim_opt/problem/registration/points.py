@@ -33,8 +33,7 @@ UNEXPLAINED = 0.01
 LARGEST_BATCH = 4_000_000  # entries of the Jacobians in memory at once
 DRAWS, BEST_DRAWS, LEAST_SHARE = 400, 20, 1 / 3
 """Few rows that are fitted to find those that agree, how many of these are refined, and the share that has to agree."""
-FAR = 5.0
-"""A row is in question from so many medians of the errors on, or robust standard deviations above their median."""
+FAR = 5.0  # medians of the errors from which on a row is in question
 
 
 @dataclass(frozen=True, eq=False)
