@@ -6,9 +6,10 @@ import re
 from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic_core import ErrorDetails
 
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.units import UNITS, quantities
+from rpim_opt.basics.units import UNITS, quantities, split_unit
 
 Length = Annotated[float, "length"]
 Angle = Annotated[float, "angle"]
@@ -16,7 +17,11 @@ Mass = Annotated[float, "mass"]
 Name = Annotated[str, Field(max_length=200)]
 """A name or a pattern of names: long ones would take for ever to be matched."""
 Model = TypeVar("Model", bound=BaseModel)
-OF_UNION = re.compile(r"(str|float|dict|list)(\[.*])?")  # in pydantic's places the one of several types, and no key
+TYPES = {
+    "string_type": "a text in quotes", "list_type": "a list in brackets", "dict_type": "a table",
+    "model_type": "a table", "bool_type": "true or false", "int_type": "an integer", "float_type": "a number",
+}  # fmt: skip
+OF_UNION = re.compile(r"(str|float|dict|list|literal)(\[.*])?")  # in pydantic's places one of several types, no key
 
 
 class Misfit(InputError, ValueError):
@@ -58,19 +63,33 @@ def validate(model: type[Model], content: dict[str, Any], file: object, table: s
         return model.model_validate(content)
     except ValidationError as error:
         first = error.errors()[0]
+        place, found = _stated(first, content)
+        where = ".".join(filter(None, (table, place)))
         misfit = (first.get("ctx") or {}).get("error")
-        where = table
-        for part in first["loc"]:  # joint 3.a, as a person counts
-            if isinstance(part, int):
-                where += f" {part + 1}"
-            elif not OF_UNION.fullmatch(part):
-                where += f".{part}" if where else part
         if isinstance(misfit, Misfit):
-            where = ".".join(filter(None, (where, misfit.where))) or "the top level"
-            raise InputError(f"key {where}", misfit.found, misfit.accepted, file) from None
+            where = ".".join(filter(None, (where, misfit.where)))
+            where = f"key {where}" if where else "the top level"
+            raise InputError(where, misfit.found, misfit.accepted, file) from None
         if first["type"] == "missing":
             raise InputError(f"key {where}", "nothing", "this key is required", file) from None
-        wanted = first["msg"].removeprefix("Value error, ").removeprefix("Input should be ")
-        if first["type"] in ("too_short", "too_long"):
-            wanted = f"a list of {wanted.partition('should have ')[2].partition(' after')[0]}"
-        raise InputError(f"key {where}", repr(first["input"])[:60], wanted, file) from None
+        wanted = []
+        for each in error.errors():
+            if _stated(each, content)[0] == place:  # of several types that the key may have
+                text = each["msg"].removeprefix("Input should be ").replace("List should have", "a list of")
+                wanted.append(TYPES.get(each["type"], text.partition(" after validation")[0]))
+        raise InputError(f"key {where}", repr(found)[:60], " or ".join(dict.fromkeys(wanted)), file) from None
+
+
+def _stated(error: ErrorDetails, content: Any) -> tuple[str, Any]:
+    """Return a key as a person counts, ``joint 3.a_mm``, and its value, both as ``content`` states them if it does."""
+    place = ""
+    for part in error["loc"]:
+        if isinstance(part, int):
+            place += f" {part + 1}"
+            content = content[part]
+        elif not OF_UNION.fullmatch(part):
+            names = content if isinstance(content, dict) else {}
+            name = next((name for name in names if part in (name, split_unit(name)[0])), part)
+            place += f".{name}" if place else name
+            content = names.get(name)
+    return place, error["input"] if content is None else content

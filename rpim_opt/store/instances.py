@@ -131,7 +131,8 @@ def load(
         formulation = _formulation(definition, problem)
         prior = problem_file.stated_prior(table.prior, table.scale, problem.parameters, path, measurements)
         details = problem_file.stated_details(table.record)
-        TableOptions.stated(table.reading)
+        with problem_file.at_key("reading", path, part=True):
+            TableOptions.stated(table.reading)
         requirement = problem_file.stated_requirement(table.acceptance, problem.robot, path)
     for file in table.published:
         if not inside(path.parent, file, "table published", path).is_file():
@@ -225,20 +226,22 @@ Arguments and errors as for `calibration.calibrate`; what is not stated is as th
 
 def _formulation(stated: problem_file.ProblemFile, problem: CalibrationProblem) -> Formulation:
     """Return the formulation with the file's constraints, each of which must fit the parameters."""
-    formulation = formulation_of(stated.table.formulation)
-    own = stated.table.constraints.all(problem.robot, problem.data)
-    formulation = replace(formulation, constraints=(*formulation.constraints, *own))
-    parameters = problem.identified
-    for constraint in formulation.constraints:
-        if isinstance(constraint, Box):
-            constraint.bounds(parameters)
-            continue
-        from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
+    with problem_file.at_key("formulation", stated.path):
+        formulation = formulation_of(stated.table.formulation)
+    with problem_file.at_key("constraints", stated.path, part=True):
+        own = stated.table.constraints.all(problem.robot, problem.data)
+        formulation = replace(formulation, constraints=(*formulation.constraints, *own))
+        parameters = problem.identified
+        for constraint in formulation.constraints:
+            if isinstance(constraint, Box):
+                constraint.bounds(parameters)
+                continue
+            from rpim_opt.convex.unknown import Unknown  # a variable of CVXPY
 
-        z = Unknown(parameters.names)
-        constraint(z, arguments_of(z, parameters))
-        if isinstance(constraint, Parsed):
-            constraint.require_near(parameters)
+            z = Unknown(parameters.names)
+            constraint(z, arguments_of(z, parameters))
+            if isinstance(constraint, Parsed):
+                constraint.require_near(parameters)
     return formulation
 
 

@@ -361,7 +361,13 @@ def read_problem(
         tools = {"": _frame(table.tool, "tool", path)}
     elif table.tool:
         tools = {marker: _frame(place, f"tool.{marker}", path) for marker, place in table.tool.items()}
-    file = ProblemFile(path, table, placed, arm.robot, kinds, tools, base, _board(table, path))
+    board = None
+    if isinstance(table.target, str):
+        board = read_board(inside(path.parent, table.target, "key target", path))
+    elif table.target is not None:
+        with at_key("target", path):
+            board = grid_board(**dict(validate(GridTable, table.target, path, "target")))
+    file = ProblemFile(path, table, placed, arm.robot, kinds, tools, base, board)
     if not file.observations:
         raise InputError("key identification", "nothing", "the name of a table, or [[observation]] tables", path)
     for each in file.observations:
@@ -400,15 +406,6 @@ def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> Robot
         raise InputError("model", f"{model!r}"[:80], accepted)
     whole = KinematicModel((*arm.robot.model.terms, *model.terms))
     return replace(arm, robot=replace(arm.robot, gravity=gravity, model=whole))
-
-
-def _board(table: ProblemTable, path: Path) -> Board | None:
-    if table.target is None:
-        return None
-    if isinstance(table.target, str):
-        return read_board(inside(path.parent, table.target, "key target", path))
-    with _at_key("target", path):
-        return grid_board(**dict(validate(GridTable, table.target, path, "target")))
 
 
 def _overlay(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -468,29 +465,32 @@ def stated_prior(
         raise InputError(error.where.replace("prior, key ", "key prior."), error.found, error.accepted, path) from None
     files = table.files(path)
     for i, text in enumerate(table.known, start=1):
-        with _at_key(f"prior.known {i}", path):
+        with at_key(f"prior.known {i}", path):
             prior &= Prior.known(text)
     if files:
         from rpim_opt.store.result_file import load_result  # most folders name no earlier result
 
         load = partial(load_result, measurements=measurements)
         if table.earlier:
-            with _at_key("prior.from", path):
+            with at_key("prior.from", path):
                 prior &= Prior.from_result(load(files[table.earlier]), table.inflate, table.without)
         if table.population:
-            with _at_key("prior.population", path):
+            with at_key("prior.population", path):
                 prior &= Prior.from_population({name: load(files[name]) for name in table.population})
     prior.stated(parameters)
     return prior
 
 
 @contextmanager
-def _at_key(key: str, path: Path) -> Iterator[None]:
-    """Let an InputError that names no file name a key of the problem file."""
+def at_key(key: str, path: Path, part: bool = False) -> Iterator[None]:
+    """Let an InputError that names no file name a key of the problem file; with ``part`` also what it names itself."""
     try:
         yield
     except InputError as error:
-        raise error if error.file else InputError(f"key {key}", error.found, error.accepted, path) from None
+        where = f"key {key}"
+        if part and not error.where.startswith(where):
+            where += f", {error.where.removeprefix('--')}"
+        raise error if error.file else InputError(where, error.found, error.accepted, path) from None
 
 
 def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
@@ -507,16 +507,7 @@ def stated_details(table: Mapping[str, Any]) -> dict[str, str]:
 
 
 def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requirement | None:
-    """Return the requirement of ``[acceptance]``; None for an empty table.
-
-    ::
-
-        limit_mm = 0.1                  the robot reaches positions within this, with
-        confidence = 0.95               at every configuration whose nominal reflector is
-        x_mm = [300.0, 800.0]           in this box of the robot's base frame (with y_mm and z_mm), and
-        q1_deg = [-90.0, 90.0]          whose joints are within these, the others within the measured ranges
-        marker = "smr1"
-    """
+    """Return the requirement of ``[acceptance]`` (its keys: the guide "Results"); None for an empty table."""
     if not table:
         return None
     joints = _joints(robot)
@@ -532,7 +523,8 @@ def stated_requirement(table: dict[str, Any], robot: Robot, path: Path) -> Requi
         raise InputError("table acceptance", f"{', '.join(axes)} alone", "x_mm, y_mm and z_mm of a box, or none", path)
     box = (sides["x"], sides["y"], sides["z"]) if axes else None
     ranges = tuple((int(name[1:]), side) for name, side in sides.items() if name not in BOX)
-    return Requirement(keys["limit"], box, ranges, keys["marker"], keys["confidence"])
+    with at_key("acceptance", path, part=True):
+        return Requirement(keys["limit"], box, ranges, keys["marker"], keys["confidence"])
 
 
 def place_fixtures(placed: Mapping[str, Any], data: Dataset) -> dict[str, float]:

@@ -149,7 +149,7 @@ def test_a_folder_learns_from_a_population(folder: Path) -> None:
         ('known = ["d5 +- 1 mm", "a2 + q3 +- 1 mm"]', "'q3'"),
         ('known = "a2 +- 1 mm"', "key prior.known"),
         ("tails = 0", "key prior.tails"),
-        ('tails = "normal"', "key prior.tails: found 'normal', accepted: a valid number"),
+        ('tails = "normal"', "key prior.tails: found 'normal', accepted: a number"),
         ("[prior.scale]\ntheta5_mrad = true", "key prior.scale.theta5_mrad: found True"),
         ("frames = -1", "key prior.frames"),
         ("[prior.scale]\ntheta5 = 1.0", "table scale, key theta5"),

@@ -285,6 +285,33 @@ def test_a_curved_valley_is_walked_to_its_end(
     assert len(calls) <= most
 
 
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ('formulation = "tikonov"', "key formulation: found 'tikonov', accepted: least_squares"),
+        ("selector = 1.0", "key selector: found 1.0, accepted: a text in quotes"),
+        ('identify = "a?"', "key identify: found 'a?', accepted: a list in brackets or 'auto'"),
+        ('base = "here"', "key base: found 'here', accepted: a table or 'auto'"),
+        ("prior = 3", "key prior: found 3, accepted: a table."),
+        ("weight = 1.0", "the top level: found unknown key 'weight'"),
+        ("acceptance = { limit_mm = 0.1, x_mm = [1.0] }", "key acceptance.x_mm: found [1.0], accepted: a list of"),
+        ("acceptance = { limit_mm = 0.1, confidence = 2.0 }", "key acceptance, confidence: found 2"),
+        ('reading = { units = "foo" }', "key reading, units: found 'foo'"),
+        ('constraints = { at_nominal = ["zz"] }', "key constraints, at_nominal: found 'zz', accepted: identified"),
+    ],
+)
+def test_a_refusal_names_file_and_key_as_they_stand_there(tmp_path: Path, key: str, said: str) -> None:
+    folder = tmp_path / "arm"
+    shutil.copytree(problems_folder() / "position", folder)
+    file = folder / "problem.toml"
+    name = key.partition(" ")[0]
+    others = [line for line in file.read_text(encoding="utf-8").splitlines() if not line.startswith(f"{name} =")]
+    file.write_text("\n".join([key, *others]), encoding="utf-8")
+    with pytest.raises(ro.InputError) as caught:
+        ro.load(folder)
+    assert str(caught.value).startswith(f"{file}, {said}"), caught.value
+
+
 def test_repeatability_is_a_word_or_a_table(tmp_path: Path) -> None:
     folder = tmp_path / "arm"
     shutil.copytree(problems_folder() / "position", folder)
@@ -296,7 +323,7 @@ def test_repeatability_is_a_word_or_a_table(tmp_path: Path) -> None:
     with pytest.raises(ro.InputError, match="key repeatability: found 'some', accepted: robot"):
         ro.load(folder)
     file.write_text(f"repeatability = 5\n{text}", encoding="utf-8")
-    with pytest.raises(ro.InputError, match="key repeatability: found 5, accepted: a valid string"):
+    with pytest.raises(ro.InputError, match="key repeatability: found 5, accepted: a text in quotes or a table"):
         ro.load(folder)
     file.write_text(f"{text}\n[repeatability]\nposition_mm = 0.04\njoint_mrad = 0.02\n", encoding="utf-8")
     instance = ro.load(folder)

@@ -131,7 +131,7 @@ def _robot(content: dict[str, Any], path: Path) -> Robot:
     limits = [joint.limits or [-np.inf, np.inf] for joint in table.joint]
     for number, pair in enumerate(limits, start=1):
         if len(pair) != 2 or not pair[0] < pair[1]:
-            raise InputError(f"key joint {number}.limits", f"{pair}", "[lower, upper]")
+            raise InputError(f"key joint {number}.limits", f"no range {pair} [SI]", "[lower, upper]")
     gravity = Gravity()
     if any(joint.mass is not None for joint in table.joint):  # then others weigh nothing
         masses = tuple(joint.mass or 0.0 for joint in table.joint)
