@@ -540,7 +540,9 @@ def export(
 @command
 def compensate(
     result: Result,
-    targets: Annotated[Path, Argument(help="Joint values q1_deg, ... and/or poses x_mm, ..., qw, ...")],
+    targets: Annotated[
+        Path, Argument(help="Joint values q1_deg, ... and/or poses in the robot's base x_mm, ..., qw, ...")
+    ],
     tables: Tables = TABLES,
     orientation: Annotated[Choice, Option("--orientation/--position-only", help=ORIENTATION)] = None,
     tool: Annotated[Text, Option(help="TCP in the DH table's flange frame [mm, deg]: x,y,z,roll,pitch,yaw.")] = None,

@@ -256,7 +256,7 @@ class Acceptance:
 
     def on(self, calibration: Verdict) -> Verdict:
         """Return the verdict on a calibration, not delivered where the test rejects its robot."""
-        return Verdict(calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
+        return replace(calibration, reasons=calibration.reasons or (self.summary,) * (self.verdict == "rejected"))
 
     def sentences(self) -> list[str]:
         """Return the verdict, its reasons and its grounds, sentence by sentence."""
@@ -339,7 +339,7 @@ def accept(result: Calibration, requirement: Requirement | None = None, data: Da
     undecided = () if result.mapping is None else result.mapping.ambiguities
     lacking += [reason for reason in result.verdict.reasons if reason in undecided]
     against = [reason for reason in result.verdict.reasons if reason not in undecided]
-    caution = " ".join(filter(None, [result.caution, _standing(result)]))
+    caution = " ".join(filter(None, [result.verdict.caution, _standing(result)]))
     try:
         mapped = workspace(result, requirement, region, drawn)
     except InputError as error:

@@ -59,7 +59,7 @@ class Inspection(Tabled):
         if self.fit is None:
             return ()
         verdict = self.fit.verdict
-        return tuple(filter(None, (self.fit.caution, *verdict.reasons, *verdict.beside(self.fit.causes))))
+        return tuple(filter(None, (verdict.caution, *verdict.reasons, *verdict.beside(self.fit.causes))))
 
     @property
     def outliers(self) -> tuple[ExcludedRow, ...]:

@@ -32,7 +32,7 @@ from rpim_opt.calibration.covariance import (
 )
 from rpim_opt.calibration.diagnosis import ActiveBound, Flag, Outside, ShadowPrice
 from rpim_opt.calibration.loop import Iteration
-from rpim_opt.convex.constraints import Box, Parsed, name_of
+from rpim_opt.convex.constraints import Parsed, name_of
 from rpim_opt.convex.formulation import Formulation
 from rpim_opt.convex.program import Program
 from rpim_opt.convex.quadratic import ridge, ridge_within
@@ -113,12 +113,6 @@ class Outcome:
     def z(self) -> Array:
         """The deviations (n,) in units of their scales."""
         return self.x / self.problem.parameters.free.scale
-
-    @property
-    def caution(self) -> str:
-        """What uncertainties do not contain: signs and zeros that were estimated, constraints that are contradicted."""
-        mapped = "" if self.mapping is None else self.mapping.caution
-        return " ".join(filter(None, [mapped, self.contradiction]))
 
     @cached_property
     def contradiction(self) -> str:
@@ -583,12 +577,13 @@ class Outcome:
 
     @property
     def active_constraints(self) -> list[str]:
-        """Names of the formulation's own constraint functions that hold the solution, on which intervals rest."""
-        functions = [each for each in enumerate(self.formulation.constraints) if not isinstance(each[1], Box | Parsed)]
-        if not functions or not self.formulation.solvable:
+        """Names of the formulation's constraints that hold the solution, on which intervals rest."""
+        constraints = self.formulation.constraints
+        if not constraints or not self.formulation.solvable:
             return []
         least = ACTIVE * max(self.program.objective(self.z, self.weight), ACTIVE)
-        return [name_of(each, k) for k, each in functions if np.abs(self._multipliers[k]).max(initial=0.0) > least]
+        holds = (np.abs(multiplier).max(initial=0.0) > least for multiplier in self._multipliers)
+        return [name_of(each, k) for k, (each, held) in enumerate(zip(constraints, holds, strict=True)) if held]
 
     @cached_property
     def actively_constrained(self) -> tuple[str, ...]:

@@ -110,7 +110,7 @@ class TransmissionError(NamedTuple):
 
     As the controller counts the joint, or the model one that is ``coupled`` to several of the controller's.
     ``measured`` are the least and largest measured value [rad], ``effect`` is the RMS of what the error moves in the
-    measured lengths [m].
+    measured lengths [m], ``names`` are those of its coefficients.
     """
 
     joint: int
@@ -120,6 +120,7 @@ class TransmissionError(NamedTuple):
     standard: Array
     measured: tuple[float, float]
     effect: float
+    names: tuple[str, ...]
 
     def __str__(self) -> str:
         return f"joint {self.joint}{' of the model (coupled)' if self.coupled else ''}"
@@ -152,7 +153,8 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         at = np.vstack([at, *(ends @ part.robot.joint_map.T for ends in result.ranges.values())])
     errors = []
     for curve in part.robot.model.curves:
-        place = np.array([free.names.index(name) for name in transmission(curve).names(curve.joint)])
+        names = transmission(curve).names(curve.joint)
+        place = np.array([free.names.index(name) for name in names])
         q = curve.centre + curve.period * np.linspace(-0.5, 0.5, 4 * curve.harmonics + 1)
         columns: Array = series([curve._replace(joint=1)], q[:, None], np.ones((len(q), 1)))
         variance = np.full(len(q), np.nan)
@@ -165,7 +167,7 @@ def transmission_errors(result: Outcome) -> list[TransmissionError]:
         table = np.array([q / factor, columns @ result.x[place] / factor, np.sqrt(variance) / abs(factor)])
         q, error, standard = table[:, :: int(np.sign(factor))]
         low, high = sorted((end(at[:, curve.joint - 1]) / factor).item() for end in (np.min, np.max))
-        errors.append(TransmissionError(joint, len(own) > 1, q, error, standard, (low, high), effect))
+        errors.append(TransmissionError(joint, len(own) > 1, q, error, standard, (low, high), effect, names))
     return errors
 
 

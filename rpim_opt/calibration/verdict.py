@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import chain
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 
@@ -64,16 +64,16 @@ class Verdict:
     """Whether the robot of a calibration is delivered.
 
     Exit codes, exports, compensation and the report follow it. ``reasons`` say why it is not delivered, a sentence
-    each; empty where it is.
+    each; empty where it is. ``caution`` is the condition that it depends on and that uncertainties do not contain:
+    signs and zeros of joints that were estimated, constraints that the data contradict; empty where there is none.
 
     >>> import rpim_opt as ro
-    >>> ro.calibrate(ro.load("position").problem).verdict.delivered
-    True
     >>> print(ro.calibrate(ro.load("position").problem, "tikhonov", 1.0, max_iterations=1).verdict)
     Not delivered. Not converged: 1 iteration was not enough; allow more (max_iterations).
     """
 
     reasons: tuple[str, ...] = ()
+    caution: str = ""
 
     @property
     def delivered(self) -> bool:
@@ -81,19 +81,24 @@ class Verdict:
         return not self.reasons
 
     def __str__(self) -> str:
-        return " ".join(["Delivered." if self.delivered else "Not delivered.", *self.reasons])
+        word = "Delivered under a condition." if self.caution else "Delivered."
+        return " ".join([word if self.delivered else "Not delivered.", *self.reasons, self.caution]).rstrip()
+
+    def content(self) -> dict[str, Any]:
+        """Return it as a document."""
+        return {"delivered": self.delivered, "reasons": list(self.reasons), "caution": self.caution or None}
 
     def beside(self, causes: Sequence[str]) -> list[str]:
         """Return the likely causes that the reasons do not already mention."""
         return [text for text in causes if text not in self.reasons and not (self.reasons and text.startswith(REMARKS))]
 
     def require(self, forced: bool = False) -> str:
-        """Return the note for a robot used despite its verdict, empty if it is delivered.
+        """Return the note for a robot used despite its verdict; if it is delivered, its caution.
 
         NotDelivered with the reasons, unless ``forced``.
         """
         if self.delivered:
-            return ""
+            return self.caution
         if not forced:
             found = f"not delivered: {' '.join(self.reasons)}".rstrip(".")
             raise NotDelivered(
@@ -111,9 +116,10 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     one with a likely mistake. The limits were set on 48 tables with mistakes and 36 good ones; joint zeros are not
     limited. Where the formulation limits the fit, other reasons than held-out rows follow from that, and are not named.
     """
+    caution = " ".join(filter(None, [result.mapping and result.mapping.caution, result.contradiction]))
     limited = tuple(text for text in causes if LIMITED in text)
     if limited:
-        return Verdict((*limited, *_worse(result)))
+        return Verdict((*limited, *_worse(result)), caution)
     reasons = [] if result.converged else [result.message]
     kept = kept_rows(result)
     reasons += [*_residuals(result, kept), *_repeatability(result), *_deviations(result)]
@@ -124,7 +130,7 @@ def judge(result: Outcome, causes: Sequence[str] = ()) -> Verdict:
     if len(out) > EXCLUDED * rows:
         reasons.append(f"{len(out)} of {rows} rows are outliers, more than {EXCLUDED:.0%}.")
     reasons += [*_worse(result), *_computed(result), *causes]
-    return Verdict(tuple(dict.fromkeys(reasons)))
+    return Verdict(tuple(dict.fromkeys(reasons)), caution)
 
 
 def kept_rows(result: Outcome) -> np.ndarray:

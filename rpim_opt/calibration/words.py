@@ -97,7 +97,7 @@ def sentences(result: Outcome, verdict: Verdict) -> list[str]:
             errors = f"Identification error (mean): {means}."
             break
     reasons = [text for text in verdict.reasons if text != result.message]
-    above = [*turned_frames(result), errors, *filter(None, [result.caution]), *reasons]
+    above = [*turned_frames(result), errors, *filter(None, [verdict.caution]), *reasons]
     return [*above, *weight_lines(result), noise_sentence(result), *remarks(result, verdict)]
 
 
@@ -116,7 +116,7 @@ def weight_lines(result: Outcome) -> list[str]:
         if last.prior_inflation != 1:
             text += f", its standard deviations times {last.prior_inflation:g}"
         if last.released:
-            text += f", without {joined(last.released)}"
+            text += f", without {last.changed}"
         return [f"Formulation '{name}'.", f"{text}."]
     if result.learned is not None:
         names = result.problem.parameters.free.names
@@ -133,7 +133,7 @@ def weight_lines(result: Outcome) -> list[str]:
 def remarks(result: Outcome, verdict: Verdict) -> list[str]:
     """Return remarks on outliers, active bounds, an assumed noise and convergence; no advice beside reasons."""
     lines = _outlying(result, verdict.delivered)
-    for held in result.active_bounds[:MOST_BOUNDS]:
+    for held in [held for held in result.active_bounds if held.bound][:MOST_BOUNDS]:
         unit, si = display(result.problem.parameters.dimension_of(held.name))
         tenth = f"{0.1 * abs(held.bound) / si:.3g} {unit}"
         lines.append(
@@ -147,9 +147,9 @@ def remarks(result: Outcome, verdict: Verdict) -> list[str]:
             f"Deviations beyond the tolerance ([tolerance]): {names}. Only formulation 'bounded' enforces them."
         )
     lines += [price.sentence() for price in result.shadow_prices]
-    if result.active_constraints:
+    if result.active_constraints and not result.contradiction:  # which says it
         lines.append(
-            f"Active constraints: {joined(result.active_constraints)}. Standard deviations and intervals are "
+            f"Active constraints: {listed(result.active_constraints)}. Standard deviations and intervals are "
             "conditional on them: too small where these do not hold for the robot."
         )
     if not result.formulation.solvable:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
@@ -10,7 +11,7 @@ from typing import NamedTuple
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
-from rpim_opt.basics.text import version_of
+from rpim_opt.basics.text import joined, version_of
 from rpim_opt.data.dataset import Dataset
 
 PACKAGES = ("rpim-opt", "numpy", "scipy", "casadi", "cvxpy-base", "clarabel")
@@ -111,6 +112,12 @@ class Earlier(NamedTuple):
     prior_inflation: float = 1.0
     released: tuple[str, ...] = ()
     excluded: tuple[str, ...] = ()
+
+    @property
+    def changed(self) -> str:
+        """The released parameters as a text, coefficients of a joint's transmission error as ``transmission2_*``."""
+        names = dict.fromkeys(re.sub(r"(transmission\d+_)\w+$", r"\1*", name) for name in self.released)
+        return joined(list(names)) if names else "no detectable change"
 
 
 @dataclass(frozen=True, eq=False)

@@ -97,9 +97,11 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
     if workspace is not None and not np.isfinite(workspace.expanded).all():
         workspace = None
     warnings = [f"New measurements, {name}: {each.failure}" for name, each in new.items() if each.failure] + warnings
-    tested = ""
-    if accepted is not None:
-        tested, accepted = _least_favourable(result, accepted, new)
+    tests = {}
+    for name, each in new.items() if accepted is not None else ():
+        with contextlib.suppress(InputError):  # rows that are read in another way: a failure
+            tests[name] = accept(result, data=each.data)
+    tested, accepted = max(tests.items(), key=lambda of: FAVOURABLE.index(of[1].verdict), default=("", accepted))
     content = Content(result, accepted, tested, _errors(result, new), workspace, composition, new)
     headline = list(_headline(content))  # refuses rows without a length, before any figure is drawn
     sections = [(name, list(section(content))) for name, section in SECTIONS]
@@ -110,15 +112,6 @@ def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> st
         [*headline, ("notes", warnings)],
         [(name, blocks) for name, blocks in sections if blocks],
     )
-
-
-def _least_favourable(result: Calibration, own: Acceptance, new: Mapping[str, Validation]) -> tuple[str, Acceptance]:
-    """Return the acceptance test by new measurements, which test all that the result's own does, and their name."""
-    tests = {}
-    for name, each in new.items():
-        with contextlib.suppress(InputError):  # rows that are read in another way: a failure
-            tests[name] = accept(result, data=each.data)
-    return max(tests.items(), key=lambda test: FAVOURABLE.index(test[1].verdict), default=("", own))
 
 
 def _errors(result: Calibration, new: Mapping[str, Validation]) -> tuple[str, Array, Array]:
@@ -151,7 +144,7 @@ def _headline(content: Content) -> Iterator[Block]:
         word, _, text = (doubt or summary.delivered(result)).partition(": ")
         yield "verdict", {"kind": "inconclusive" if doubt else "accepted", "word": word, "text": text}
     yield "lead", {"text": summary.headline(result, content.errors), "alarm": not result.verdict.delivered}
-    yield "notes", [*filter(None, [result.caution]), *reasons, *result.verdict.beside(result.causes)]
+    yield "notes", [*filter(None, [result.verdict.caution]), *reasons, *result.verdict.beside(result.causes)]
     name, nominal, identified = content.errors
     before, after = statistics(nominal), statistics(identified)
     if not after["count"]:
@@ -453,7 +446,7 @@ def _provenance(content: Content) -> Iterator[Block]:
     if record.earlier:
         earlier = []
         for each in record.earlier:
-            changes = ", ".join(each.released) or "no detectable change"
+            changes = each.changed
             if each.prior_inflation != 1:
                 changes += f"; standard deviations times {each.prior_inflation:g}"
             earlier.append([each.title, each.made, str(each.rows), changes, each.digest])

@@ -8,7 +8,7 @@ from typing import Any, Literal
 import numpy as np
 
 from rpim_opt.basics.arrays import Array, statistics
-from rpim_opt.basics.text import counted, joined, listed, table
+from rpim_opt.basics.text import counted, listed, table
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import excluded_by_fit, headline_errors, of_positions, sets
@@ -146,8 +146,7 @@ def headline(result: Calibration, errors: tuple[str, Array, Array] | None = None
             )
     if result.record.earlier:
         last = result.record.earlier[-1]
-        changed = joined(last.released) if last.released else "no detectable change"
-        sentence += f" The prior is a calibration of {last.rows} rows; changed since then: {changed}."
+        sentence += f" The prior is a calibration of {last.rows} rows; changed since then: {last.changed}."
     return sentence
 
 
@@ -155,8 +154,8 @@ def delivered(result: Calibration) -> str:
     """Return the verdict on a robot without an acceptance limit as a sentence; empty if it is not delivered."""
     if not result.verdict.delivered:
         return ""
-    if result.caution:
-        return "Delivered: only for joint values as the table counts them: check the pendant (see below)."
+    if result.verdict.caution:
+        return "Delivered under a condition: check what is said below before using this robot."
     return "Delivered: the fit gives no reason against using this robot; no acceptance limit is stated."
 
 
@@ -233,7 +232,6 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         "source": record.source,
         **{key: whole[key] for key in KEYS},
         "headline": " ".join(filter(None, [verdict, headline(result)])),
-        "caution": result.caution or None,
         "errors": errors,
         "orientation": orientation_rows(result),
         "shadow_prices": [price._asdict() for price in result.shadow_prices],
@@ -253,7 +251,7 @@ def describe(result: Calibration, document: Mapping[str, Any]) -> str:
     if document["acceptance"]:
         lines += document["acceptance"]["text"]
     else:
-        lines += [*filter(None, [document["caution"]]), *document["verdict"]["reasons"]]
+        lines += [*filter(None, [document["verdict"]["caution"]]), *document["verdict"]["reasons"]]
     lines += ["", *document["remarks"]]
     if document["lack_of_fit"]:
         lines += document["lack_of_fit"]["text"]

@@ -254,7 +254,7 @@ def figures(result: Calibration) -> dict[str, Any]:
         before, validation = statistics(held_out.nominal), statistics(held_out.error)
         held_out = {"nominal": before, "identified": validation, "used": held_out.used}
     return {
-        "verdict": {"delivered": result.verdict.delivered, "reasons": list(result.verdict.reasons)},
+        "verdict": result.verdict.content(),
         "identification": statistics(result.errors()),
         "validation": validation,
         "held_out": held_out,

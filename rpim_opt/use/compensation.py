@@ -98,12 +98,6 @@ class Compensation:
     source: str = ""
     after_motion: float = np.nan
 
-    def _moved(self) -> str:
-        """Return what a common motion of all targets leaves of the uncorrected errors, where it is most of them."""
-        if not self.after_motion < rms(self.position_before) / 2:
-            return ""
-        return f" (a common motion of all targets, or another base, leaves {1e3 * self.after_motion:.4f} mm RMS)"
-
     def __str__(self) -> str:
         figures = []
         for name, values in {
@@ -118,11 +112,13 @@ class Compensation:
                 shown = (values.mean(), np.sqrt(np.mean(values**2)), values.max())
                 figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
         changes = (f"{name.replace('_', f' {value:.3f} ')}" for name, value in self._largest_corrections().items())
+        moved = f" (a common motion of all targets, or another base, leaves {1e3 * self.after_motion:.4f} mm RMS)"
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
             "Uncorrected errors refer to the identified base, in whose frame targets are "
-            f"stated{self._moved()}; nominal errors in a report refer to a refitted base and tool.",
+            f"stated{moved if self.after_motion < rms(self.position_before) / 2 else ''}; nominal errors in a report "
+            "refer to a refitted base and tool.",
         ]
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
         for status, where in {"limited": "", "near singular": "", **at_fault}.items():
@@ -282,8 +278,7 @@ def compensate(
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status,note
     """
     verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
-    note = verdict.require(despite_verdict)
-    note = " ".join(filter(None, [note, result.caution, result.no_intervals]))
+    note = " ".join(filter(None, [verdict.require(despite_verdict), result.no_intervals]))
     arm = pick(result.problem.arms, robot, "robot")
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation is not False)
     if limit is None:

@@ -275,8 +275,11 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
     courses = [(int(first), False, (when >= first).astype(float)) for first in moments]
     if count > 2:
         courses.append((0, True, when / (count - 1)))
-    free = problem.parameters.free
-    width = recalibration.prior_widths(result, problem) / free.scale
+    # a frame may have moved whether it was identified or not: else the robot's parameters are blamed for it
+    framed = problem.identifying(problem.parameters.identified | problem.parameters.of_frames)
+    free = framed.parameters.free
+    A = framed.linearize(recalibration.previous_deviations(result, framed)).A / np.sqrt(result.variance_factor)
+    width = recalibration.prior_widths(result, framed) / free.scale
     tried: list[tuple[float, Drift]] = []
     causes = recalibration.candidates(free)
     for cause, prior in zip(causes, recalibration.log_priors(causes), strict=True):
@@ -284,7 +287,7 @@ def _drift(result: Calibration, problem: CalibrationProblem, level: float) -> Dr
         scale = float(free.scale[index[0]])
         for start, steady, course in courses:
             # parameters that move while readings are taken, by a part of the whole change
-            g, G = misfit.projected(slice(misfit.m), misfit.A[:, index] * course[:, None])
+            g, G = misfit.projected(slice(misfit.m), A[:, index] * course[:, None])
             moved = None
             if len(g) == 1 and G[0, 0] > 0:
                 change, std = scale * g[0] / G[0, 0], scale / np.sqrt(G[0, 0])

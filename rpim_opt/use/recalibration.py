@@ -19,6 +19,7 @@ from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.held_out import displacement, held_out_errors, registered
 from rpim_opt.calibration.identify import calibrate
 from rpim_opt.calibration.result import Calibration
+from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.calibration.verdict import refuse_misread
 from rpim_opt.convex.constraints import matching
 from rpim_opt.convex.expressions import SQUARES
@@ -70,7 +71,7 @@ class Cause(NamedTuple):
     """A change that may explain the deviation of readings from their predictions."""
 
     name: str
-    kind: str  # joint offset, parameter, frame, reading
+    kind: str  # joint offset, parameter, frame, transmission error, reading
     members: tuple[str, ...]  # parameters, or rows
     gain: float = 0.0  # by which chi-squared falls
     p_value: float = 1.0  # of that where nothing changed
@@ -95,6 +96,21 @@ class Moved(NamedTuple):
         return {"name": self.name, "unit": unit, "change": self.change / si, "std": self.std / si}
 
 
+class Resized(NamedTuple):
+    """RMS of a joint's transmission error [rad] before and after a change of its coefficients."""
+
+    name: str
+    before: float
+    after: float
+
+    def __str__(self) -> str:
+        return f"{self.name} from {1e3 * self.before:.3g} to {1e3 * self.after:.3g} mrad RMS"
+
+    def content(self) -> dict[str, Any]:
+        """Return it as a document [mrad]."""
+        return {"name": self.name, "unit": "mrad", "before": 1e3 * self.before, "after": 1e3 * self.after}
+
+
 @dataclass(frozen=True, eq=False)
 class Update:
     """A recalibration with the previous result as prior.
@@ -102,7 +118,8 @@ class Update:
     ``result`` is the calibration, whose record has the previous one; ``before`` and ``after`` are how the ``readings``
     (their number) fit that, and with the changes. ``changes`` are parameters and frames that changed, and wrong
     readings, which were left out, in the order of their discovery; ``causes`` all that may have changed, with its
-    evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did.
+    evidence before anything was released, the most probable first; ``moved`` by how much the released parameters did,
+    of a joint's transmission error its sizes.
     ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
     previous one, where nothing was released. ``registered`` is whether the instrument or the base moved so far that the
     base was registered again; else empty.
@@ -113,7 +130,7 @@ class Update:
     after: Fit
     changes: tuple[Cause, ...]
     causes: tuple[Cause, ...]
-    moved: tuple[Moved, ...]
+    moved: tuple[Moved | Resized, ...]
     readings: int
     errors: Mapping[str, Mapping[str, Any]]
     registered: str = ""
@@ -141,7 +158,7 @@ class Update:
             "readings": self.readings,
             "errors": self.errors,
             "converged": self.result.converged,
-            "verdict": {"delivered": self.result.verdict.delivered, "reasons": list(self.result.verdict.reasons)},
+            "verdict": self.result.verdict.content(),
             "earlier": [each._asdict() for each in self.result.record.earlier],
         }
 
@@ -248,8 +265,13 @@ def update(
         else:
             released += cause.members
         start = updated.x
-    if not after.likely:
-        _require_same_robot(result, updated, data)
+    if not after.likely:  # of another robot, or read otherwise than those of the result
+        refuse_misread(result, data)
+        missed = rms(updated.errors(data))
+        if missed > STRANGE * float(np.nanmax(result.nominal_errors())):
+            same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
+            found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
+            raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
     left_out = tuple(cause.name for cause in changes if cause.kind == "reading")
     last = Earlier(
         result.record.title or _robots(result), result.record.made, result.record.digest or content(result)["digest"],
@@ -261,16 +283,6 @@ def update(
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
     return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere)
-
-
-def _require_same_robot(result: Calibration, updated: Calibration, data: Dataset) -> None:
-    """Refuse new measurements that are read otherwise than those of the result, or are of another robot."""
-    refuse_misread(result, data)
-    furthest, missed = float(np.nanmax(result.nominal_errors())), rms(updated.errors(data))
-    if missed > STRANGE * furthest:
-        same = f"those of the same robot ({_robots(result)}) in the same units and instrument's frame"
-        found = f"errors of {1e3 * missed:.3g} mm, whichever parameters change"
-        raise InputError("the new measurements", found, f"{same}, or --reset with what moved (base_*)")
 
 
 def _errors(
@@ -353,18 +365,23 @@ def _changes(result: Calibration, data: Dataset) -> tuple[tuple[Cause, ...], Fit
 
 def _moved(
     result: Calibration, updated: Calibration, released: Sequence[str], changes: Sequence[Cause]
-) -> tuple[Moved, ...]:
+) -> tuple[Moved | Resized, ...]:
     """Return by how much released parameters moved; of those that were reset, it is the difference of the results.
 
     Of those that changed, what neither result knows of them is in both, and no change.
     """
     free = updated.problem.parameters.free
-    changed = [name for cause in changes if cause.kind != "reading" for name in cause.members]
+    curves = np.array(free.names)[free.of_curves].tolist()
+    members = [name for cause in changes if cause.kind != "reading" for name in cause.members]
+    changed = [name for name in members if name not in curves]
     reset = [name for name in released if name not in changed]
     # deviations of a frame registered again refer to another orientation: values do not
     was, now = (each.problem.parameters.by_name(each.x) for each in (result, updated))
-    moved = []
-    for name in [name for name in reset if name in result.problem.parameters.free.names]:
+    moved: list[Moved | Resized] = []
+    for before, after in zip(transmission_errors(result), transmission_errors(updated), strict=True):
+        if set(before.names) & set(released):
+            moved.append(Resized(f"transmission error of {before}", before.rms, after.rms))
+    for name in [name for name in reset if name in result.problem.parameters.free.names and name not in curves]:
         i = free.names.index(name)
         std = np.sqrt(result.covariance[i, i] + updated.covariance[i, i])
         change = now[name] - was[name]
@@ -402,8 +419,9 @@ def with_data(result: Calibration, data: Dataset) -> CalibrationProblem:
 
 
 def previous_deviations(result: Calibration, problem: CalibrationProblem) -> Array:
-    """Return the result's deviations (n,) [SI], zero for sessions that it does not know."""
-    return np.append(result.x, np.zeros(len(problem.parameters.free) - len(result.x)))
+    """Return the result's deviations (n,) [SI] of a problem's parameters, zero where it does not know them."""
+    known = dict(zip(result.problem.parameters.free.names, result.x.tolist(), strict=True))
+    return np.array([known.get(name, 0.0) for name in problem.parameters.free.names])
 
 
 def posterior_as_prior(
@@ -429,13 +447,12 @@ def posterior_as_prior(
 
 
 def prior_widths(result: Calibration, problem: Source) -> Array:
-    """Return the prior standard deviations (n,) [SI] before any calibration."""
-    p = result.problem.parameters
-    scale = p.scale.copy()
-    if result.learned is not None:
-        scale[p.identified] = result.learned.stated
-    widths = default_widths(replace(p, scale=scale))[p.identified]
-    return np.append(widths, problem.parameters.free.scale[len(widths) :])
+    """Return the prior standard deviations (n,) [SI] of a problem's parameters before any calibration."""
+    free = problem.parameters.free
+    learned = result.learned
+    stated = {} if learned is None else dict(zip(result.problem.parameters.free.names, learned.stated, strict=True))
+    scale = [stated.get(name, own) for name, own in zip(free.names, free.scale, strict=True)]
+    return default_widths(replace(free, scale=np.array(scale)))
 
 
 def _recalibrated(
@@ -509,17 +526,18 @@ class Misfit:
 
 
 def candidates(free: Parameters, reset: Sequence[str] = ()) -> list[Cause]:
-    """Return the candidate changes: all parameters of the robot and all frames as a whole, without the reset ones."""
+    """Return the candidate changes: parameters of the robot, frames and transmission errors as a whole; none reset."""
     causes = []
-    frames: dict[str, list[str]] = {}
-    for name, frame in zip(free.names, free.of_frames, strict=True):
+    wholes: dict[tuple[str, str], list[str]] = {}
+    for name, frame, curve in zip(free.names, free.of_frames, free.of_curves, strict=True):
         if name in reset or of_session(name):  # an earlier session is over
             continue
-        if frame:
-            frames.setdefault(name.rpartition("_")[0], []).append(name)
+        if frame or curve:
+            kind = "frame" if frame else "transmission error"
+            wholes.setdefault((name.rpartition("_")[0], kind), []).append(name)
         else:
             causes.append(Cause(name, "joint offset" if is_joint_offset(name) else "parameter", (name,)))
-    return causes + [Cause(name, "frame", tuple(names)) for name, names in frames.items()]
+    return causes + [Cause(*whole, tuple(names)) for whole, names in wholes.items()]
 
 
 def _weighed(result: Calibration, updated: Calibration, released: Sequence[str]) -> tuple[tuple[Cause, ...], Fit]:

@@ -13,6 +13,7 @@ from rpim_opt.bayes.transmission import series
 from rpim_opt.calibration import verdict, words
 from rpim_opt.calibration.uncertainty import transmission_errors
 from rpim_opt.report import report
+from rpim_opt.report.summary import headline
 from rpim_opt.robot.terms import Curve, transmission
 from tests.simulate import ARM
 
@@ -245,6 +246,23 @@ def test_after_an_update_files_hold_the_geometry_alone(rippled, tmp_path):
     text = (tmp_path / "robot.toml").read_text()
     assert "alpha_deg" in text
     assert "_rad" not in text
+
+
+def test_a_worn_gear_is_one_change_with_its_sizes(rippled):
+    """A curve is hundreds of coefficients without individual meaning: each was a change of its own."""
+    result = rippled[0]
+    worn = measured(3 * SIZE)[1].take(np.arange(60))
+    found = ro.use.update(result, worn)
+    curves = {f"transmission{joint}" for joint in (1, 2, 3)}
+    assert {cause.name for cause in found.causes if cause.kind == "transmission error"} == curves
+    assert {cause.name for cause in found.changes} == {"transmission2", "transmission3"}
+    assert [each.name for each in found.moved] == [f"transmission error of joint {joint}" for joint in (2, 3)]
+    assert all(each.after > 1.5 * each.before for each in found.moved)
+    assert "transmission error of joint 2 from 0." in str(found)
+    said = "changed since then: transmission2_* and transmission3_*."
+    assert said in headline(found.result)
+    for text in (str(found), str(ro.use.monitor(result, worn)), *words.weight_lines(found.result)):
+        assert "transmission2_c1" not in text
 
 
 @pytest.mark.parametrize("noise", ["level", "declared"])

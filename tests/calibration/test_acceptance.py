@@ -15,7 +15,7 @@ import rpim_opt as ro
 from rpim_opt.basics.files import read_json
 from rpim_opt.calibration.acceptance import distance_quantile, reached_positions, region_of
 from rpim_opt.problem.workspace import in_base
-from rpim_opt.report.summary import headline
+from rpim_opt.report.summary import headline, summary
 from tests.simulate import simulated
 from tests.test_cli import run
 
@@ -288,6 +288,9 @@ def test_a_drawing_that_the_data_contradict_accepts_no_robot(instance) -> None:
         result = ro.calibrate(instance.problem, stated)
         assert bool(result.contradiction) == contradicted
         assert ("The data contradict constraints" in str(result)) == contradicted
+        assert ("Delivered under a condition. The data contradict" in str(result.verdict)) == contradicted
+        leading = summary(result, {})["headline"]
+        assert leading.startswith("Delivered under a condition") == contradicted, leading  # of no pendant
         found = accept(result, Requirement(5e-3), instance.validation)
         assert (found.verdict == "inconclusive") == contradicted, found
 

@@ -10,6 +10,8 @@ import pytest
 
 import rpim_opt as ro
 from rpim_opt.calibration.certificate import certified
+from rpim_opt.convex.constraints import name_of
+from rpim_opt.report.summary import describe, summary
 from tests.simulate import simulated
 
 PROBLEM = ro.load("position").problem
@@ -42,7 +44,24 @@ def test_intervals_say_on_which_own_constraints_they_rest() -> None:
 
     result = ro.calibrate(PROBLEM, stated(longer, wide, lambda z, p: p.x["a2"] == 0), 1.0)
     assert result.active_constraints == ["longer", 'p.x["a2"] == 0']
-    assert 'Active constraints: longer and p.x["a2"] == 0. ' in str(result)
+    assert str(result).count("Standard deviations and intervals are conditional on them") == 1
+
+
+def test_intervals_say_on_which_ready_constraints_they_rest_once() -> None:
+    """What is at nominal, at a limit or as a drawing says; what the data contradict is said above all instead."""
+    free = ro.calibrate(PROBLEM, ro.tikhonov, 1.0)
+    p = PROBLEM.parameters.free
+    k = p.names.index("a3")
+    a3 = 1e3 * (p.nominal[k] + free.x[k])
+    at_nominal, zero = ro.constraints.at_nominal("alpha6"), ro.constraints.at_nominal("beta2")
+    drawn, wide = ro.constraints.parse(f"a3 <= {a3 - 0.003:.4f} mm"), ro.constraints.parse("a2 <= nominal + 30 mm")
+    for constraints in ((drawn, wide), (at_nominal, drawn), (zero,)):
+        result = ro.calibrate(PROBLEM, stated(*constraints), 1.0)
+        assert result.active_constraints == [name_of(each, 0) for each in constraints if each is not wide]
+        for text in (str(result), describe(result, summary(result, {}))):
+            assert text.count("Standard deviations and intervals are conditional on them") == 1
+            assert ("Active constraints: " in text) != ("The data contradict constraints" in text)
+            assert "by 0 mm" not in text  # what is at nominal has no tolerance to be loosened
 
 
 @pytest.mark.parametrize(

@@ -124,7 +124,7 @@ def test_files_hold_the_verdict(tmp_path: Path) -> None:
     assert again.verdict == result.verdict
     assert again.causes == result.causes
     stored = json.loads((tmp_path / "result.json").read_text())
-    assert stored["verdict"] == {"delivered": False, "reasons": list(result.verdict.reasons)}
+    assert stored["verdict"] == {"delivered": False, "reasons": list(result.verdict.reasons), "caution": None}
     stored["verdict"] = {"delivered": True, "reasons": []}
     (tmp_path / "result.json").write_text(json.dumps({**stored, "digest": digest(stored)}))
     assert load_result(tmp_path).verdict == result.verdict  # which is judged anew

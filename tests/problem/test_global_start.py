@@ -116,7 +116,8 @@ def test_another_description_of_the_same_robot_is_named() -> None:
     said = (
         f"Signs or zeros of joints differ between table and robot file: {both} (these explain the data equally well, "
     )
-    assert result.caution.startswith(said)
+    assert result.verdict.caution.startswith(said)
+    assert str(result.verdict).startswith(f"Delivered under a condition. {said}")
     assert both in inspect(problem.on(replace(problem.data, blocks=(turned,)))).judgement[0]
 
 
@@ -128,7 +129,7 @@ def test_of_two_descriptions_that_the_one_with_the_stated_reflector_is_taken() -
     result = ro.calibrate(instance.problem.on(replace(instance.problem.data, blocks=(turned,))))
     assert result.mapping is not None
     assert result.mapping.sign.tolist() == [1, 1, 1, 1, 1, -1]
-    assert "joint 6 reversed (sign = -1), or zero of joint 5 +180.0 deg (these explain" in result.caution
+    assert "joint 6 reversed (sign = -1), or zero of joint 5 +180.0 deg (these explain" in result.verdict.caution
     assert result.mapping.moved < 0.08 < 2 * robot.mdh[-1, 3] < result.mapping.same[0].moved
 
 
@@ -233,7 +234,7 @@ def test_a_length_of_the_wrong_sign_is_no_matter_of_the_joints_alone(name: str) 
     parameters = replace(problem.parameters, nominal=nominal)
     wrong = ro.CalibrationProblem(replace(problem.robot, mdh=mdh), parameters, problem.data)
     result = ro.calibrate(wrong)
-    assert f"robot file: {name} of the other sign in the robot file, or " in result.caution
-    assert result.caution.endswith(f"Check the sign of {name} first.")
-    assert inspect(wrong).judgement[0] == result.caution
-    assert not ro.calibrate(problem).caution
+    assert f"robot file: {name} of the other sign in the robot file, or " in result.verdict.caution
+    assert result.verdict.caution.endswith(f"Check the sign of {name} first.")
+    assert inspect(wrong).judgement[0] == result.verdict.caution
+    assert not ro.calibrate(problem).verdict.caution

@@ -10,6 +10,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 import rpim_opt as ro
 from rpim_opt.basics.exceptions import InputError
@@ -88,6 +89,20 @@ def test_a_base_that_moved_is_no_link_that_grew(moved: tuple[float, ...], names:
     assert found.drift is not None
     assert sorted([found.drift.cause.name, *found.drift.others]) == sorted(names)
     assert "the instrument or the base moved" in str(found)
+
+
+def test_an_instrument_that_was_set_up_anew_is_no_change_of_the_arm_where_the_base_was_not_identified() -> None:
+    """The checks' frame was the robot's own: a link of 0.5 mm more, or of 0.3 m, was named."""
+    instance = ro.load("paper_arm")
+    result, data = instance.calibrate(), instance.validation
+    (block,) = data.blocks
+    for angle, shift in ((3e-4, 5e-4), (0.3, 0.3)):
+        turn = Rotation.from_rotvec([0.0, 0.0, angle]).as_matrix()
+        y = block.y @ turn.T + np.array([shift, -0.7 * shift, 0.3 * shift])
+        found = ro.use.monitor(result, replace(data, blocks=(replace(block, y=y),)))
+        assert found.mistake.startswith("Likely: the instrument or the base moved.")
+        assert found.drift is not None
+        assert found.drift.cause.name == "base"
 
 
 def test_a_joint_that_slipped_is_no_moved_base() -> None:
