@@ -175,7 +175,7 @@ def test_four_commands_from_nothing_to_a_corrected_urdf(monkeypatch, capsys, cel
     assert stated
     stated_place, stated_turn = map(float, stated.groups())
     assert run(monkeypatch, *export, "behind.urdf") == 0
-    assert "Positions of one reflector do not determine all of its pose" in capsys.readouterr().out
+    assert "Positions of one reflector determine only part of its pose" in capsys.readouterr().out
     assert run(monkeypatch, "report", "arm/results", "--data", str(cell / "later.csv")) == 0
     page = Path("arm/results/report.html").read_text(encoding="utf-8")
     assert "Validation on new measurements" in page
@@ -501,7 +501,7 @@ def test_several_files_at_once_or_none(monkeypatch, capsys, cell, made, tmp_path
     written, result = (file.read_text() for file in (tmp_path / "arm.json", made / "results" / "result.json"))
     assert np.abs(ro.read_robot(tmp_path / "arm.json").mdh - ro.load_result(made / "results").robot.mdh).max() < 1e-11
     assert f"digest {json.loads(result)['digest'][:12]}." in json.loads(written)["source"]
-    assert "without base and tool: base x" in json.loads(written)["source"]
+    assert "lacks base and tool: base x" in json.loads(written)["source"]
     (tmp_path / "ros.yaml").write_text(YAML_PLAIN)
     outs = ["--mdh", str(tmp_path / "again.json"), "--out", str(tmp_path / "both")]
     sources = ["--urdf", str(cell / "arm.urdf"), "--ur-kinematics", str(tmp_path / "ros.yaml")]
@@ -570,7 +570,7 @@ def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch,
         assert path.read_text().startswith("joint,theta_deg,d_mm,a_mm,alpha_deg,beta_deg,") == (
             convention == "standard"
         )
-        printed = re.findall(r" (?:x|y|z|rx|ry|rz) (-?[\d.]+)", said.split("without base and tool: ")[1])
+        printed = re.findall(r" (?:x|y|z|rx|ry|rz) (-?[\d.]+)", said.split("lacks base and tool: ")[1])
         numbers = np.array(printed, dtype=float).reshape(2, 6) * ([1e-3] * 3 + [np.pi / 180] * 3)
         base, tool = (numeric_frame(place) for place in numbers)
         read = read_arm(path)
@@ -580,7 +580,7 @@ def test_a_dh_table_is_exported_in_either_convention_and_says_which(monkeypatch,
         with path.open() as stream:
             rows = list(csv.DictReader(stream))
         assert all(len(row["alpha_deg"].partition(".")[2]) <= 9 or "e-" in row["alpha_deg"] for row in rows)
-        assert "without base and tool: base x" in rows[0]["note"]
+        assert "lacks base and tool: base x" in rows[0]["note"]
         assert ", digest " in rows[0]["note"]
         missed = np.linalg.norm((base @ flange @ tool - result.forward(q))[:, :3, 3], axis=1)
         turn, reach = np.radians(0.0005), np.linalg.norm(flange[:, :3, 3], axis=1)
