@@ -91,8 +91,7 @@ class Inspection(Tabled):
         count = len(np.unique(self.problem.data.configuration))
         against = "gives no reason against using the data" if self.fit.verdict.delivered else "would not be delivered"
         notes += [f"A quick fit of {count} configurations {against}.", *self.judgement]
-        if self.lack_of_fit is not None:
-            notes.append(str(self.lack_of_fit))
+        notes += [str(self.lack_of_fit)] if self.lack_of_fit else []
         if self.outliers:
             notes.append(f"Excluded outliers: {listed([str(row) for row in self.outliers], 10)}.")
         return notes

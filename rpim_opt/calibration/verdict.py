@@ -34,8 +34,7 @@ SLIGHTLY = "Slight, but significant"
 LIMITED = "the formulation, not the robot, limits the fit"
 """Beginning of the cause that loss, penalty or constraints contradict the data."""
 REMARKS = (BAD, SLIGHTLY)  # beginnings of what is said of robots that are delivered, too
-OVERSTATED = 0.05
-"""Residual RMS over the stated noise below which it is not theirs, from 20 um on; of nominal errors 1 / `NOISY`."""
+OVERSTATED = 0.05  # residual RMS over the stated noise below which it is not theirs; of nominal errors 1 / NOISY
 REPEATABILITY = {"position": ("mm", 2e-3), "orientation": ("mrad", 8e-3), "joint": ("mrad", 5e-3)}
 """Estimated repeatability that no robot exceeds [m, rad], whatever the stated noise; a service robot had 5.3 mrad."""
 MACHINED = {"alpha": ("mrad", 0.06), "beta": ("mrad", 0.06), "a": ("mm", 0.03), "d": ("mm", 0.03)}
