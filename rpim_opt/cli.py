@@ -37,6 +37,8 @@ inconclusive: acceptance, or an uncertainty above the nominal robot's error.
 
 
 OTHERS = "rpim_opt.commands"  # entry points that are commands of other packages
+VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
+"""What help calls the values of options, by their types; others are TEXT."""
 PLAIN: Any = {"rich_markup_mode": None, "pretty_exceptions_enable": False}
 
 
@@ -57,7 +59,22 @@ class Commands(TyperGroup):
             except Exception as error:  # code of somebody else may raise anything
                 _add(alone, cmd_name, _failing(f"cannot be loaded: {str(error) or type(error).__name__}"))
             self.commands[cmd_name] = typer.main.get_command(alone)
-        return super().get_command(ctx, cmd_name)
+        command = super().get_command(ctx, cmd_name)
+        if command is not None:
+            _name_values(command)
+        return command
+
+
+def _name_values(command: Any) -> None:
+    """Name arguments and the values of options in capitals, instead of Python's types."""
+    annotations = signature(command.callback).parameters
+    for param in command.params:
+        if param.param_type_name == "argument":
+            param.metavar = param.name.upper()
+            param.display_type = lambda ctx: ""  # which typer from 0.27 on prints beside it
+        elif not param.is_flag and param.name in annotations:
+            kind = str(annotations[param.name].annotation).partition(",")[0]
+            param.metavar = next((word for name, word in VALUES.items() if name in kind), "TEXT")
 
 
 def _add(to: typer.Typer, name: str, function: Callable[..., Any]) -> None:

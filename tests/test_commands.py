@@ -894,6 +894,14 @@ def test_help_states_the_exit_codes(monkeypatch, capsys) -> None:
     assert "--install-completion" in text
 
 
+@pytest.mark.parametrize("name", ["validate", "calibrate", "new", "study"])
+def test_help_names_values_and_not_pythons_types(monkeypatch, capsys, name) -> None:
+    assert run(monkeypatch, name, "--help") == 0
+    text = capsys.readouterr().out
+    assert re.search(r"--\w+ (?:TEXT|PATH|NUMBER|INTEGER)\b", text)
+    assert not re.search(r"<\w+|list\[", text)
+
+
 def test_where_the_base_of_a_urdf_with_a_mount_is_gets_printed(monkeypatch, capsys, cell, tmp_path) -> None:
     text = (cell / "arm.urdf").read_text()
     root = re.search(r'<parent link="([^"]+)"', text)[1]

@@ -28,7 +28,6 @@ MEMBERS = {
 ATTRIBUTES = (("calibration", "Calibration"), ("calibration", "Prediction"), ("calibration", "Uncertainty"),
               ("calibration", "Verdict"), ("calibration", "Acceptance"))  # fmt: skip
 """Classes whose attributes are listed with those that they inherit."""
-VALUES = {"Path": "PATH", "int": "INTEGER", "float": "NUMBER"}
 
 
 def write(folder: Path) -> None:
@@ -141,32 +140,26 @@ def commands() -> str:
 
     from rpim_opt.cli import app
 
-    functions = [each.callback for each in app.registered_commands if each.callback]
-    callbacks = {each.__name__: each for each in functions}
     group: Any = typer.main.get_command(app)
     text = "# Commands\n\n" + inspect.cleandoc(group.help)
-    for name, command in sorted(group.commands.items()):
+    for name in sorted(group.commands):
+        command = group.get_command(None, name)
         arguments = [each for each in command.params if each.param_type_name == "argument"]
-        usage = " ".join(["rpim-opt", name, *(_metavar(each) for each in arguments), "[OPTIONS]"])
+        usage = " ".join(
+            ["rpim-opt", name, *(each.metavar + "..." * (each.nargs == -1) for each in arguments), "[OPTIONS]"]
+        )
         rows = [("argument or option", "what", "default")]
         own = [each for each in command.params if each.name != "help"]
-        rows += [(_spelled(each, callbacks[name]), each.help or "", _default(each)) for each in own]
+        rows += [(_spelled(each), each.help or "", _default(each)) for each in own]
         text += f"\n\n## {name}\n\n{inspect.cleandoc(command.help)}\n\n```text\n{usage}\n```\n\n{_table(*rows)}"
     return text + "\n"
 
 
-def _metavar(argument: Any) -> str:
-    name = argument.name.upper()
-    return f"{name}..." if argument.nargs == -1 else name
-
-
-def _spelled(param: Any, callback: Any) -> str:
-    if param.param_type_name == "argument":
-        return f"`{_metavar(param)}`"
-    annotation = str(inspect.signature(callback).parameters[param.name].annotation)
-    value = next((word for kind, word in VALUES.items() if kind in annotation), "TEXT")
+def _spelled(param: Any) -> str:
     flags = " / ".join([*param.opts, *param.secondary_opts])
-    return f"`{flags}`" if param.is_flag else f"`{flags} {value}`"
+    if param.param_type_name == "argument":
+        return f"`{param.metavar}`"
+    return f"`{flags}`" if param.is_flag else f"`{flags} {param.metavar}`"
 
 
 def _default(param: Any) -> str:
