@@ -18,7 +18,7 @@ from rpim_opt.bayes.model_selection import SESSIONS, SPEAK, WARMTH, Candidate, C
 from rpim_opt.bayes.outliers import by_block
 from rpim_opt.bayes.prior import kind_of
 from rpim_opt.calibration.outcome import Outcome
-from rpim_opt.calibration.verdict import against_gravity
+from rpim_opt.calibration.verdict import against_gravity, upward_sentence
 from rpim_opt.problem.noise import UNITS, Repeatability, in_unit
 from rpim_opt.problem.problem import CalibrationProblem
 from rpim_opt.problem.row_functions import about_means, measured_torques, repeated
@@ -150,13 +150,8 @@ class LackOfFit:
                 f'ratio statistic {self.gain:.0f}): add {joined(self.parameters)} to `identify`, or model = "auto".'
             )
         if self.upward:
-            joints = f"Compliance of joint {self.upward[0]} is"
-            if len(self.upward) > 1:
-                joints = f"Compliances of joints {joined([str(joint) for joint in self.upward])} are"
-            lines.append(
-                f"{joints} negative, which gravity cannot cause: check `mounting`, the payload, sag compensation, "
-                "hoses, springs and counterweights. Do not use this fit outside the measured joint ranges."
-            )
+            said = upward_sentence(self.upward)
+            lines.append(f"C{said[1:]} Do not use this fit outside the measured joint ranges.")
         lines += filter(None, [_limit(self)])
         if self.repeated is not None:
             beyond = ": residuals are no larger."

@@ -54,7 +54,7 @@ HOPELESS = 20.0  # residuals over the stated noise from which something is said 
 SCALES = 10.0  # scales by which a parameter of the robot may deviate
 LARGEST_CURVE = 0.01  # standard deviation of transmission errors [rad] beyond any gear: real ones are below 1 mrad
 LARGEST = {"length": 0.02, "angle": 0.05}  # a machined and assembled robot deviates by less than this [m, rad]
-BENDS = ("compliance", "bend")  # beginnings of the names of parameters with which gravity bends an arm
+ARM = ("compliance", "bend", "ecc", "transmission")  # beginnings of extension parameters that are the arm's own
 NOTHING = "None of the tested input mistakes explains it. Check the nominal parameters and the arm: is it compliant?"
 
 
@@ -378,8 +378,7 @@ def likely_causes(result: Outcome) -> list[str]:
     else:
         causes, remarks = _beside_a_good_fit(result, problem, ordered, together, noticed)
         shared += remarks
-    if noticed:
-        causes += _upward(result, problem)
+    causes += _upward(result, problem)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []
@@ -411,11 +410,16 @@ def _beside_a_good_fit(
     if limits:
         return [], [*(f"{BAD}: residuals; {text}" for text in limits), *together]
     alone, x = _without_outliers(result, ordered, again=noticed)
-    causes = list(diagnosis.shown_by_residuals(alone, x)) if noticed else []
+    error = rms(problem.errors(result.x)[kept])
+    causes = first(
+        diagnosis.shown_by_residuals(alone, x) if noticed else (),
+        diagnosis.roundings(problem, error, (1 - diagnosis.MOVED) ** -0.5) if noticed else (),
+        _in_place_of_extensions(result, alone),
+    )
     if causes:
         return causes, together
-    slight = diagnosis.roundings(problem, rms(problem.errors(result.x)[kept]), (1 - SLIGHT) ** -0.5)
-    effects = first(slight, diagnosis.shown_by_residuals(alone, x, slight=True))
+    slight = diagnosis.roundings(problem, error, (1 - SLIGHT) ** -0.5)
+    effects = first(slight, diagnosis.shown_by_residuals(alone, x, most=SLIGHT))
     return [], [*(f"{SLIGHTLY}: {text}" for text in effects), *together]
 
 
@@ -509,20 +513,26 @@ def against_gravity(names: Sequence[str], x: Array, sd: Array, moves: Array) -> 
     return tuple(k for i, k in joints.items() if x[i] < -UPWARD * sd[i] and moves[i] > NOTABLE * largest)
 
 
+def upward_sentence(joints: Sequence[int]) -> str:
+    """Say that joints turn against gravity: the mounting is another one, or a force is not gravity's."""
+    numbers = joined([str(joint) for joint in joints])
+    of = f"compliances of joints {numbers} are" if len(joints) > 1 else f"compliance of joint {numbers} is"
+    return (
+        f"{of} negative, which gravity cannot cause: check `mounting`, the payload, sag compensation, hoses, springs "
+        "and counterweights."
+    )
+
+
 def _upward(result: Outcome, problem: CalibrationProblem) -> list[str]:
-    """Say which joints turn against gravity: the mounting is another one, or a force is not gravity's."""
-    free, x, C = problem.parameters.free, result.x, result.known_covariance
-    bends = any(name.startswith("compliance") for name in free.names)
-    if not bends or C is None or measured_torques(problem.data):
+    """Say which joints turn against gravity."""
+    free, x = problem.parameters.free, result.x
+    bends = any(name.startswith("compliance") for name in free.names) and not measured_torques(problem.data)
+    C = result.known_covariance if bends else None
+    if C is None:
         return []
     moves = np.linalg.norm(problem.linearize(x).A * (x / free.scale), axis=0)
     joints = against_gravity(free.names, x, np.sqrt(np.diag(C)), moves)
-    if not joints:
-        return []
-    return [
-        f"negative compliance of joint{'s' * (len(joints) > 1)} {joined([str(joint) for joint in joints])}, which "
-        "gravity cannot cause: check `mounting`, the payload, sag compensation, hoses, springs and counterweights."
-    ]
+    return [upward_sentence(joints)] if joints else []
 
 
 def _explanations(result: Outcome, problem: CalibrationProblem, ordered: CalibrationProblem) -> list[str]:
@@ -567,13 +577,21 @@ def _shown_without_outliers(result: Outcome, ordered: CalibrationProblem) -> Ite
             "noise. They bias a squared loss: use formulation 'robust', or leave them out ([exclude])."
         )
         return
-    added = () if result.learned is None else result.learned.added
-    curves = [name for name in added if not name.startswith(BENDS)]
-    if curves:  # they take up ratios and scales of all kinds
-        p = result.problem.parameters
-        alone = alone.identifying(p.identified & ~np.isin(p.names, curves))
-        x = ridge_deviations(alone)
-    yield from diagnosis.shown_by_residuals(alone, x)
+    yield from first(diagnosis.shown_by_residuals(alone, x), _in_place_of_extensions(result, alone))
+
+
+def _in_place_of_extensions(result: Outcome, alone: CalibrationProblem) -> Iterator[str]:
+    """Say what single change explains the rows better than the extensions of the model, which may take it up.
+
+    -2 ln L, whose fall by them is known, falls by m ln(1 / part) with a change that leaves a part of m squares.
+    """
+    learned = result.learned
+    if learned is None or not learned.added or not all(name.startswith(ARM) for name in learned.added):
+        return
+    bare = cast(CalibrationProblem, result.stated).on(alone.data)
+    plain = min((trial.value for trial in learned.trials if not trial.extensions), default=np.inf)
+    most = np.exp((min(trial.value for trial in learned.trials) - plain) / result.program.model.equations)
+    yield from diagnosis.shown_by_residuals(bare, ridge_deviations(bare), most=min(diagnosis.MOVED, float(most)))
 
 
 def better_fitting(result: Outcome, data: Dataset) -> Better | None:

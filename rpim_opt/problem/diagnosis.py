@@ -71,8 +71,8 @@ TOGETHER, CHANCE_RUNS = 4, 0.05
 """Excluded rows that follow each other, from which on something moved, if chance makes fewer such runs than that."""
 JUMPING = 0.5  # mean square step of every joint over that of rows in random order, above which rows have no order
 COURSES = 6  # half waves that a slow motion has over all rows at most
-PLACES, SPANS = 40, 12
-"""Rows from which on something may have moved, and those between which it may have moved and moved back."""
+PLACES, PRECISE, SPANS = 40, 120, 12
+"""Rows and joint values from which on something may have moved, and those between which it did and moved back."""
 MOST_EQUATIONS = 3000  # equations up to which a change is looked for
 
 
@@ -242,8 +242,7 @@ def filled_rows(data: Dataset) -> Iterator[str]:
 
 def left_out_together(labels: Sequence[str], left_out: Collection[str]) -> Iterator[str]:
     """Report excluded rows that are consecutive, if the labels are in numerical order."""
-    numbers = {label: [int(part) for part in re.findall(r"\d+", label)] for label in (*labels, *left_out)}
-    ordered = sorted(numbers, key=lambda label: numbers[label])
+    ordered = sorted(dict.fromkeys([*labels, *left_out]), key=_natural)
     if [label for label in ordered if label not in left_out] != list(labels):
         return
     at = np.array([i for i, label in enumerate(ordered) if label in left_out], dtype=int)
@@ -661,6 +660,10 @@ def _places(count: int, most: int = PLACES) -> list[int]:
 # What residuals say
 
 
+Shares = dict[str, Array]
+"""When something changes, and what part equations (m,) or (m, s) have in it."""
+
+
 class Addition(NamedTuple):
     """Columns (m, c) that a linear model lacks, and what coefficients (c,) mean: what happened, and what to do."""
 
@@ -678,17 +681,16 @@ def _explained(
     once in a million (F test, all additions counted): None where none does.
     """
     taken = _freedom(model)
-    r = model.b - model.A @ (x / model.parameters.scale)
-    whole = float(r @ r)
     without = _without_parameters(model)
-    rest = without(r[:, None])[:, 0]
+    rest = without((model.b - model.A @ (x / model.parameters.scale))[:, None])[:, 0]
+    whole = float(rest @ rest)
     tried: list[tuple[float, float, Addition, Array]] = []  # by the variance that is left: of many columns against few
     for addition in additions:
         G = without(addition.columns)
         step = np.asarray(np.linalg.lstsq(G, rest, rcond=1e-9)[0], dtype=float)
-        gain = float(rest @ rest - np.sum((rest - G @ step) ** 2))
+        gain = whole - float(np.sum((rest - G @ step) ** 2))
         spare = max(len(model.A) - taken - len(step), 1)
-        tried.append(((float(rest @ rest) - gain) / spare, gain, addition, step))
+        tried.append(((whole - gain) / spare, gain, addition, step))
     if not tried or not whole:
         return None
     _, gain, addition, step = min(tried, key=lambda each: each[0])
@@ -718,28 +720,33 @@ def _without_parameters(model: LinearModel) -> Callable[[Array], Array]:
     return without
 
 
-def shown_by_residuals(problem: CalibrationProblem, x: Array, *, slight: bool = False) -> Iterator[str]:
+def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | None = None) -> Iterator[str]:
     """Report what one addition to the linearization at x (n,) explains best: what moved, lags or is scaled.
 
-    Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few;
-    the slope of a joint's zero times the value of a joint, all of these times the way from the row before, and the
-    slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too. Else backlash
-    and rows of two kinds are looked for. Nothing is reported where gravity and eccentric gears explain more, which are
-    not in the model: a lack of fit, and no mistake. Of ``slight`` residuals, no larger than they may be, the addition
-    is reported if errors would be a sixth smaller without it, and nothing else is looked for.
+    Added are the columns of a base, fixture, reflector or joint zero for the rows from one on, or between two of a few,
+    of a joint zero from a value of the joint on as well, and of a reflector by the direction of gravity at the flange;
+    the slope of a joint's zero times the value of a joint, all of these times the way from the row
+    before, and the slopes of the scale or offset of lengths, of positions by the scales and skews of their axes, too.
+    Else backlash, rows of two kinds and noise of one column are looked for. Nothing is reported where gravity and
+    eccentric gears explain more, which are not in the model: a lack of fit, and no mistake. With ``most`` the addition
+    is reported if it leaves at most that part of the squares, and nothing else is looked for.
     """
     if len(problem.owners) > MOST_EQUATIONS:
         return
+    single = most is not None
+    if not single:  # a noise that was learned takes up what is looked for
+        problem = problem.with_repeatability(None)
     model = problem.linearize(x)
     acceptable = _acceptable_part(problem, x)
-    most = min(SLIGHT if slight else MOVED, acceptable**2)
-    best = _explained(model, x, chain(_moves(problem, x), _gears(problem, model), _scales(problem, x, model)), most)
-    if slight:
+    most = min(MOVED if most is None else most, acceptable**2)
+    moves = _moves(problem, x, steps=most <= MOVED)
+    best = _explained(model, x, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
+    if single:
         yield from _said_of_addition(best)
         return
     # zeros of all joints fit two gross errors, whatever these are, but no more
     what, cause = "set of joint zeros", "did several joints slip, or were they remastered"
-    changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, least=3)
+    changes = _changes(problem, x, model.A, _zeros(problem.robot), what, cause, _shares(problem))
     several = _explained(model, x, changes, most)
     left = np.inf if best is None else best[0]
     if several is not None and several[0] < SEVERAL * left:
@@ -753,7 +760,8 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, slight: bool = 
     else:
         part = min(TWO_KINDS, acceptable, np.inf if kinds is None else kinds.left / MOVED)
         said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
-        yield from first(two_positions(problem, x, part), said)
+        noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
+        yield from first(two_positions(problem, x, part), said, noise)
 
 
 def _acceptable_part(problem: CalibrationProblem, x: Array) -> float:
@@ -775,8 +783,11 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
         yield f"{what} (that leaves {100 * best[0]:.0f} % of the residuals): {remedy}."
 
 
-def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
-    """Yield a base, fixture, reflector, joint zero or payload that changed, where something places the robot."""
+def _moves(problem: CalibrationProblem, x: Array, steps: bool) -> Iterator[Addition]:
+    """Yield a base, fixture, reflector, joint zero or payload that changed, where something places the robot.
+
+    Joint zeros change at a value of the joint, too, if ``steps``: as slight ones gears may have.
+    """
     p, blocks = problem.parameters, problem.data.blocks
     placed = {"base": ([f"base_{c}" for c in FRAME], "did the instrument or the robot's base move")}
     for block in blocks:
@@ -789,8 +800,6 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     markers = dict.fromkeys(marker for block in blocks for marker in block.markers)
     parts = dict(placed)
     parts["reflector"] = ([tool_prefix(m) + c for m in markers for c in FRAME], "was the reflector exchanged")
-    for i, name in enumerate(_zeros(problem.robot), start=1):
-        parts[f"zero of joint {i}"] = ([name], "did the joint slip, or was it remastered")
     every = np.array(p.names)
     bends, eccentric = np.char.startswith(every, "compliance"), np.char.startswith(every, "ecc_")
     parts["payload"] = (every[bends].tolist(), "did the load at the flange change")
@@ -798,8 +807,19 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
     there = np.zeros(len(whole.parameters.free))
     there[p.identified[whole.parameters.identified]] = x
     A = whole.linearize(there).A
+    shares = _shares(problem)
     for what, (changed, cause) in parts.items():
-        yield from _changes(whole, there, A, changed, what, cause)
+        yield from _changes(whole, there, A, changed, what, cause, shares)
+    for i, name in enumerate(_zeros(problem.robot)):
+        cause = "did the joint slip or fall back under its load, or was it remastered"
+        by = shares | (_shares(problem, i) if steps else {})
+        yield from _changes(whole, there, A, [name], f"zero of joint {i + 1}", cause, by)
+    flange = forward_kinematics(replace(problem.robot, joint_map=np.eye(len(problem.robot.mdh))), problem.joint_values)
+    down = {
+        "with the direction of gravity at the flange": problem.robot.gravity.direction @ flange[problem.owners, :3, :3]
+    }
+    cause = "is it loose in its nest, or its holder soft"
+    yield from _changes(whole, there, A, [tool_prefix(m) + c for m in markers for c in "xyz"], "reflector", cause, down)
     free = whole.parameters.free
     lacking = np.isin(free.names, every[(bends | eccentric) & ~p.identified])
     if lacking.any():
@@ -824,16 +844,9 @@ def _moves(problem: CalibrationProblem, x: Array) -> Iterator[Addition]:
 
 
 def _changes(
-    problem: CalibrationProblem,
-    x: Array,
-    A: Array,
-    names: Collection[str],
-    what: str,
-    cause: str,
-    *,
-    least: int = 0,
+    problem: CalibrationProblem, x: Array, A: Array, names: Collection[str], what: str, cause: str, by: Shares
 ) -> Iterator[Addition]:
-    """Yield that parameters changed at a row, between two rows or steadily; of ``least`` equations a parameter."""
+    """Yield that parameters changed in proportion to shares (m,) or (m, s), of three equations a parameter."""
     free = problem.parameters.free
     some = np.flatnonzero(np.isin(free.names, list(names)))
     if not len(some):
@@ -841,34 +854,47 @@ def _changes(
     equations = Equations.of(problem.data)
 
     def say(when: str, share: Array, coefficients: Array) -> tuple[str, str]:
-        rows = equations.length & (share > 0)
-        change = problem.jacobian(x)[np.ix_(rows, some)] @ (free.scale[some] * coefficients) * share[rows]
+        rows = equations.length & share.any(axis=1)
+        by_share = problem.jacobian(x)[np.ix_(rows, some)] * free.scale[some] @ coefficients.reshape(len(some), -1)
+        change = np.sum(by_share * share[rows], axis=1)
         far = 1e3 * float(np.sqrt(change @ change / max(len(np.unique(equations.row[rows])), 1)))
         moved = f"the points are {three_digits(far)} mm off the fit to the others"
         if not rows.any():  # nothing but angles was measured
             moved = "the measurements contradict the others"
-        moved = f"{moved}, consistent with a changed {what}"
-        session = ", or name them in a column `session`" if what == "base" else ""
-        return f"{when} {moved}", f"{cause}? Calibrate the two parts separately{session}"
+        remedy = "Calibrate the two parts separately" + ", or name them in a column `session`" * (what == "base")
+        if share.shape[1] > 1:  # motions of all points alike would be in the figure
+            moved, remedy = "the points move to and fro", "Fix it, and measure again"
+        return f"{when} {moved}, consistent with a changed {what}", f"{cause}? {remedy}"
 
-    for when, share in _shares(problem).items():
-        if np.count_nonzero(share) >= least * len(some):
-            yield Addition(A[:, some] * share[:, None], partial(say, when, share))
+    for when, part in by.items():
+        share = part.reshape(len(A), -1)
+        if np.count_nonzero(share.any(axis=1)) >= 3 * len(some):
+            columns = A[:, some, None] * share[:, None]
+            yield Addition(columns.reshape(len(A), -1), partial(say, when, share))
 
 
-def _shares(problem: CalibrationProblem) -> dict[str, Array]:
-    """Return what part equations (m,) have in a change that came at a row, between two rows or steadily, and when."""
+def _shares(problem: CalibrationProblem, joint: int | None = None) -> Shares:
+    """Return what part equations (m,) have in a change, and when: from a row on, between two rows or steadily.
+
+    Of a ``joint`` its values take the place of the rows' order.
+    """
     data, owners = problem.data, problem.owners
-    if len(data) < 2 * FEWEST:
+    at, places = np.arange(len(data)), [f"row {label}" for label in data.label]
+    shares = {"more and more from row to row": owners / max(len(data) - 1, 1)}
+    if joint is not None:
+        unit, si = display("angle" if problem.robot.joint_types[joint] == "revolute" else "length")
+        side = signs(problem.robot.joint_map)[joint]
+        values, at = np.unique(side * problem.joint_values[:, joint], return_inverse=True)
+        shares, places = {}, [f"q{joint + 1} = {value / si:.4g} {unit}" for value in values]
+    if len(places) < 2 * FEWEST:
         return {}
-    shares = {"more and more from row to row": owners / (len(data) - 1)}
-    for start, end in [*((k, len(data)) for k in _places(len(data))), *combinations(_places(len(data), SPANS), 2)]:
+    ends, most = len(places), PLACES if joint is None else PRECISE
+    for start, end in [*((k, ends) for k in _places(ends, most)), *combinations(_places(ends, SPANS), 2)]:
+        inside = (at >= start) & (at < end)
         # rows of one configuration share what the model lacks of the arm, and are one piece of evidence
-        outside = np.delete(data.configuration, np.s_[start:end])
-        if min(len(np.unique(data.configuration[start:end])), len(np.unique(outside))) < FEWEST:
-            continue
-        until = "on" if end == len(data) else f"to row {data.label[end - 1]}"
-        shares[f"from row {data.label[start]} {until}"] = ((owners >= start) & (owners < end)).astype(float)
+        if min(len(np.unique(data.configuration[part])) for part in (inside, ~inside)) >= FEWEST:
+            until = "on" if end == ends else f"to {places[end - 1]}"
+            shares[f"from {places[start]} {until}"] = inside[owners].astype(float)
     return shares
 
 
@@ -918,6 +944,33 @@ def _two_kinds(problem: CalibrationProblem, x: Array, most: float) -> Kinds | No
     if left >= most or len(rows) < FEWEST:
         return None
     return Kinds(rows, bool(np.ptp(rows) == len(rows) - 1), left)
+
+
+def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
+    """Report a column of measured values whose residuals at x (n,) are far larger than those of the others.
+
+    Standard deviations s of all columns, over the stated noise, are estimated in turn with the fit of weights 1 / s^2,
+    as otherwise the noise of one is in the residuals of all: s^2 = sum r^2 / sum (1 - h), residuals r, leverages h.
+    """
+    model = problem.linearize(x)
+    columns = {tuple(block.measurement.components) for block in problem.data.blocks}
+    which = Equations.of(problem.data).component
+    if len(columns) > 1 or not which.any():
+        return
+    size = freedom = np.ones(which.max() + 1)
+    for _ in range(MOST_ROUNDS):
+        A, b = model.A / size[which][:, None], model.b / size[which]
+        own = np.linalg.qr(np.vstack([A, np.eye(A.shape[1])]))[0][: len(b)]
+        freedom = np.maximum(np.bincount(which, 1 - np.sum(own**2, axis=1)), 1.0)
+        size = np.maximum(size * np.sqrt(np.bincount(which, (b - own @ (own.T @ b)) ** 2) / freedom), EXACT)
+    *_, second, worst = np.argsort(size)
+    times = float(size[worst] / size[second])
+    if times > NOISY and len(size) * fdtrc(freedom[worst], freedom[second], times**2) < RARE:
+        name = columns.pop()[worst]
+        yield (
+            f"values of column {name} scatter {three_digits(times)} times as much as those of the others, which they "
+            f"are weighed like: check what measured it, or state its noise (column sigma_{name}_mm, ...)."
+        )
 
 
 def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:

@@ -308,10 +308,8 @@ def growing(count: int) -> np.ndarray:
     [
         (values(lambda y: y + 2e-4 * growing(len(y)) * [0.4, -0.5, 0.77]), "drifted slowly|more and more from row"),
         (values(lambda y: y * [1, 1, 1.0002]), r"column z is \+0.0\d* % too long"),
-        (values(lambda y: np.hstack([(2e3 * y[:, :1]).round() / 2e3, y[:, 1:]])), r"are rounded to 0.5 mm \(x\)"),
-        (of_joint(4, tenths), r"are rounded to 0.1 deg \(q5\)"),
     ],
-    ids=["a drift", "a scale", "a rounded column", "a rounded joint"],
+    ids=["a drift", "a scale"],
 )
 @pytest.mark.usefixtures("undrawn")
 def test_what_hides_in_the_noise_is_named_beside_a_delivered_robot(monkeypatch, capsys, tmp_path, wrong, said) -> None:
@@ -324,8 +322,46 @@ def test_what_hides_in_the_noise_is_named_beside_a_delivered_robot(monkeypatch, 
 
 def test_joint_values_that_were_logged_as_16_bit_floats_are_named() -> None:
     coarse = joints(lambda q: np.radians(np.degrees(q).astype(np.float16).astype(float)))
-    causes = likely_causes(ro.calibrate(coarse(simulated_arm("ur5e", count=80))))
-    assert any("joint values are rounded to up to 0.125 deg" in text for text in causes), causes
+    result = ro.calibrate(coarse(simulated_arm("ur5e", count=80)))
+    assert any("joint values are rounded to up to 0.125 deg" in text for text in result.verdict.reasons), result.causes
+
+
+def loose_reflector(problem: ro.CalibrationProblem) -> ro.CalibrationProblem:
+    """Let the reflector slip in its nest by 1 mm across the flange's axis, to whichever side is down."""
+    (block,) = problem.data.blocks
+    base = numeric_frame(problem.parameters.nominal[[problem.parameters.names.index(f"base_{c}") for c in FRAME]])
+    turn = ro.robot.forward_kinematics(problem.robot, block.q[:, 0])[:, :3, :3]
+    down = [0.0, 0.0, -1.0] @ turn * [1, 1, 0]
+    slip = 1e-3 * down / np.linalg.norm(down, axis=1, keepdims=True)
+    return values(lambda y: y + (base[:3, :3] @ turn @ slip[:, :, None])[:, :, 0])(problem)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        (
+            values(lambda y: y + 1e-3 * np.random.default_rng(8).normal(size=y.shape) * [0, 1, 0]),
+            r"column y scatter \d",
+        ),
+        (loose_reflector, "gravity at the flange the points move to and fro, consistent with a changed reflector"),
+        (values(lambda y: np.hstack([(2e3 * y[:, :1]).round() / 2e3, y[:, 1:]])), r"are rounded to 0.5 mm \(x\)"),
+        (of_joint(4, tenths), r"are rounded to 0.1 deg \(q5\)"),
+        (of_joint(2, lambda q: q + 0.009 * (q > 0.6)), r"from q3 = 3\d(\.\d+)? deg on .* a changed zero of joint 3"),
+    ],
+    ids=["noise in a column", "a loose nest", "a rounded column", "a rounded joint", "a joint that falls back"],
+)
+def test_what_a_learned_noise_or_gears_would_take_up_is_named(wrong, said: str) -> None:
+    """Each was calibrated into a robot that is 1.5 to 25 times worse than from clean data, and delivered."""
+    result = ro.calibrate(wrong(simulated_arm("ur5e", count=80)))
+    assert any(re.search(said, text) for text in result.verdict.reasons), result.causes
+
+
+def test_gears_that_err_once_and_twice_a_turn_are_no_mistake() -> None:
+    """A joint that errs by a smooth curve of its angle is described by the model; no value is where it slips."""
+    wavy = of_joint(2, lambda q: q + 1e-3 * np.sin(q) + 4e-4 * np.cos(2 * q))
+    result = ro.calibrate(of_joint(1, lambda q: q + 8e-4 * np.cos(q + 1))(wavy(simulated_arm("ur5e", count=80))))
+    assert result.verdict.delivered
+    assert not result.causes
 
 
 def made(monkeypatch, folder, problem, *options: str, robot: str = "ur5e") -> None:
