@@ -739,7 +739,7 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     model = problem.linearize(x)
     acceptable = _acceptable_part(problem, x)
     most = min(MOVED if most is None else most, acceptable**2)
-    moves = _moves(problem, x, steps=most <= MOVED)
+    moves = _moves(problem, x, along_joints=most <= MOVED)
     best = _explained(model, x, chain(moves, _gears(problem, model), _scales(problem, x, model)), most)
     if single:
         yield from _said_of_addition(best)
@@ -783,10 +783,10 @@ def _said_of_addition(best: tuple[float, Addition, Array] | None) -> Iterator[st
         yield f"{what} (that leaves {100 * best[0]:.0f} % of the residuals): {remedy}."
 
 
-def _moves(problem: CalibrationProblem, x: Array, steps: bool) -> Iterator[Addition]:
+def _moves(problem: CalibrationProblem, x: Array, along_joints: bool) -> Iterator[Addition]:
     """Yield a base, fixture, reflector, joint zero or payload that changed, where something places the robot.
 
-    Joint zeros change at a value of the joint, too, if ``steps``: as slight ones gears may have.
+    Joint zeros change at a value of the joint, too, if ``along_joints``: gears have slight steps.
     """
     p, blocks = problem.parameters, problem.data.blocks
     placed = {"base": ([f"base_{c}" for c in FRAME], "did the instrument or the robot's base move")}
@@ -812,7 +812,7 @@ def _moves(problem: CalibrationProblem, x: Array, steps: bool) -> Iterator[Addit
         yield from _changes(whole, there, A, changed, what, cause, shares)
     for i, name in enumerate(_zeros(problem.robot)):
         cause = "did the joint slip or fall back under its load, or was it remastered"
-        by = shares | (_shares(problem, i) if steps else {})
+        by = shares | (_shares(problem, i) if along_joints else {})
         yield from _changes(whole, there, A, [name], f"zero of joint {i + 1}", cause, by)
     flange = forward_kinematics(replace(problem.robot, joint_map=np.eye(len(problem.robot.mdh))), problem.joint_values)
     down = {

@@ -454,7 +454,7 @@ def test_inspect_and_calibrate_name_the_same_causes_in_one_order(monkeypatch, ca
     before = json.loads(capsys.readouterr().out)
     run(monkeypatch, "calibrate", str(tmp_path / "cell"), "--json")
     after = json.loads(capsys.readouterr().out)
-    found = before["judgement"], [text for text in (after["caution"], *after["verdict"]["reasons"]) if text]
+    found = before["judgement"], [text for text in (after["verdict"]["caution"], *after["verdict"]["reasons"]) if text]
     for texts in found:
         assert any(said in text for text in texts), texts
     causes = [[text for text in texts if text.startswith(("Likely: ", "Signs or zeros"))] for texts in found]
