@@ -876,7 +876,7 @@ def _changes(
 def _shares(problem: CalibrationProblem, joint: int | None = None) -> Shares:
     """Return what part equations (m,) have in a change, and when: from a row on, between two rows or steadily.
 
-    Of a ``joint`` its values take the place of the rows' order.
+    Of a ``joint`` its values take the place of the rows' order: from one on, as gears' ripple is a change between two.
     """
     data, owners = problem.data, problem.owners
     at, places = np.arange(len(data)), [f"row {label}" for label in data.label]
@@ -888,8 +888,11 @@ def _shares(problem: CalibrationProblem, joint: int | None = None) -> Shares:
         shares, places = {}, [f"q{joint + 1} = {value / si:.4g} {unit}" for value in values]
     if len(places) < 2 * FEWEST:
         return {}
-    ends, most = len(places), PLACES if joint is None else PRECISE
-    for start, end in [*((k, ends) for k in _places(ends, most)), *combinations(_places(ends, SPANS), 2)]:
+    ends = len(places)
+    spans = [(k, ends) for k in _places(ends, PLACES if joint is None else PRECISE)]
+    if joint is None:
+        spans += combinations(_places(ends, SPANS), 2)
+    for start, end in spans:
         inside = (at >= start) & (at < end)
         # rows of one configuration share what the model lacks of the arm, and are one piece of evidence
         if min(len(np.unique(data.configuration[part])) for part in (inside, ~inside)) >= FEWEST:
