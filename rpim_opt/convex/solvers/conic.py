@@ -287,15 +287,10 @@ class Clarabel:
         self.cones, self.attempts = cones, attempts
         self.renew()
 
-    def attempt(self, attempts: Sequence[Attempt]) -> None:
-        """Set what is tried in turn."""
-        if attempts != self.attempts:
-            self.attempts = attempts
-            self.renew()
-
     def renew(self) -> None:
         """Discard the solver: the next program has another sparsity pattern."""
         self._solver: Any = None
+        self._first: Attempt = ()
         self._numbers: dict[str, Array] = {}
 
     def solve(self, P: Any, q: Array, A: Any, b: Array) -> Any:
@@ -303,7 +298,8 @@ class Clarabel:
 
         P (its upper triangle) and A are `csc_matrix` with entries at the same places every time.
         """
-        solver, solution = self._solver, SimpleNamespace(status="")
+        solver = self._solver if self._first == self.attempts[0] else None
+        solution = SimpleNamespace(status="")
         numbers = {"P": P.data.copy(), "q": q, "A": A.data.copy(), "b": b}
         for k, attempt in enumerate(self.attempts):
             if k == 0 and solver is not None:
@@ -313,7 +309,7 @@ class Clarabel:
             else:
                 solver = self._made(P, q, A, b, attempt)
             if k == 0 and solver.is_data_update_allowed():
-                self._solver, self._numbers = solver, numbers
+                self._solver, self._numbers, self._first = solver, numbers, attempt
             solution = solver.solve()
             if str(solution.status) in SOLVED:
                 return solution
@@ -531,14 +527,11 @@ class ReducedProgram:
         _, s, V = np.linalg.svd(np.linalg.qr(every, mode="r"))
         M = V.T / np.maximum(np.pad(s, (0, len(z0) - len(s))), 1 / far)
         changed = p.changes(near, M / far, far)
-        program = self._changed
-        if program is None:
-            program = self._changed = ReducedProgram(changed, self.rows, self.loss, self.counts)
-        else:
-            program.canonical = changed
-            program.data.renumber(changed)
+        self._changed = program = self._changed or ReducedProgram(changed, self.rows, self.loss, self.counts)
+        program.canonical = changed
+        program.data.renumber(changed)
         attempts = ATTEMPTS[1:] if self._walks(weight) else ATTEMPTS  # the first one hardly ever reaches far
-        program.data.clarabel.attempt([(*REFINED, *other) for other in attempts])
+        program.data.clarabel.attempts = [(*REFINED, *other) for other in attempts]
         squares = ReducedSquares(squares.R @ M, squares.y - squares.R @ z0, M.T @ squares.g)
         if A is not None and b is not None:
             A, b = A @ M, b - A @ z0
