@@ -597,7 +597,7 @@ def test_a_universal_robots_files(monkeypatch, capsys, tmp_path) -> None:
     ro.store.save_result(result, tmp_path / "result.json")
     assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", str(tmp_path / "calibration.conf"),
                "--out", str(tmp_path / "new.conf")) == 0  # fmt: skip
-    assert "alpha1 and a1" in capsys.readouterr().out
+    assert "tilt and offset of axis 1" in capsys.readouterr().out
     assert run(monkeypatch, "export", str(tmp_path), "--ur-calibration", "none.conf", "--out", "new.conf") == 2
     assert "copied from its controller" in capsys.readouterr().err
     read, q = (

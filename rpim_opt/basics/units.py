@@ -30,7 +30,7 @@ _BY_DIMENSION = {
     "torque": {"Nm": 1.0},
     "mass": {"kg": 1.0},
     "ratio": {"ppm": 1e-6},
-    "compliance": {"rad_per_Nm": 1.0, "mrad_per_Nm": 1e-3},
+    "compliance": {"rad_per_Nm": 1.0, "mrad_per_Nm": 1e-3, "urad_per_Nm": 1e-6},
     "temperature": {"K": 1.0, "degC": 1.0},
     "ratio per temperature": {"ppm_per_K": 1e-6},
     "length per temperature": {"m_per_K": 1.0, "mm_per_K": 1e-3, "um_per_K": 1e-6},
@@ -86,7 +86,9 @@ def split_unit(name: str) -> tuple[str, Unit | None]:
     if name == CELSIUS:  # elsewhere a letter C is a name
         return "temperature", UNITS["degC"]
     match = WITH_UNIT.search(name)
-    return (name[: match.start()], UNITS[match[1]]) if match else (name, None)
+    if match is None or name[: match.start()].endswith("_per"):  # a unit that is none of these
+        return name, None
+    return name[: match.start()], UNITS[match[1]]
 
 
 def with_unit(stem: str, *dimensions: str, count: int = 9) -> list[str]:

@@ -138,10 +138,13 @@ class Workspace:
     @property
     def summary(self) -> str:
         """Maximum and median in words."""
+        name = self.requirement.marker
+        reflector = f"reflector '{name}'" if name else "the reflector"
         return (
-            f"Expanded uncertainty of the position reached (U, {percent(self.requirement.confidence)}): at most "
-            f"{1e3 * self.largest:.3f} mm (largest of {self.count} configurations, refined by a search), median "
-            f"{1e3 * self.median:.3f} mm"
+            f"Expanded uncertainty of the position that {reflector} reaches (U, "
+            f"{percent(self.requirement.confidence)}): at most {1e3 * self.largest:.3f} mm (largest of {self.count} "
+            f"configurations, refined by a search), median {1e3 * self.median:.3f} mm; `compensate --tool` states that "
+            "of another point"
         )
 
 
@@ -270,9 +273,7 @@ class Acceptance:
         ]
         workspace = self.workspace
         if workspace is not None and np.isfinite(workspace.largest):
-            reflector = f"reflector '{requirement.marker}'" if requirement.marker else "the reflector"
-            another = f"U is that of {reflector}; `compensate --tool` states that of another point."
-            lines += [f"{workspace.summary}.", another]
+            lines.append(f"{workspace.summary}.")
         if self.held_out is not None:
             lines.append(self.held_out["sentence"])
         return lines

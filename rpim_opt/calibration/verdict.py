@@ -378,7 +378,8 @@ def likely_causes(result: Outcome) -> list[str]:
     else:
         causes, remarks = _beside_a_good_fit(result, problem, ordered, together, noticed)
         shared += remarks
-    causes += _upward(result, problem)
+    if noticed:
+        causes += _upward(result, problem)
     if causes or shared:
         return [*head, *(f"Likely: {cause}" for cause in causes), *shared]
     return [*head, NOTHING] if max(ratio for _, ratio in residuals.values()) > HOPELESS else []

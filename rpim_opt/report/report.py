@@ -134,7 +134,8 @@ def _headline(content: Content) -> Iterator[Block]:
         if first:
             text = f"{text} {first}"
         elif accepted.bound is not None:
-            U = f"expanded uncertainty of the position reached (U, {percent(accepted.requirement.confidence)})"
+            share = percent(accepted.requirement.confidence)
+            U = f"expanded uncertainty of the position that the reflector reaches (U, {share})"
             text = f"{U} at most {1e3 * accepted.bound:.3f} mm, {text}"
         if _beyond_geometry(result):
             text += " It holds for the whole model, as `compensate` uses it; files with geometry alone have another U."

@@ -31,7 +31,7 @@ from rpim_opt.problem.registration.closed_forms import register, transformed
 from rpim_opt.problem.row_functions import Loads, loads_on, measured_torques, require_same_torques
 from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
-from rpim_opt.robot.kinematics import FRAME, call_rows, chain, numeric_frame, product
+from rpim_opt.robot.kinematics import FRAME, call_rows, chain, forward_kinematics, numeric_frame, product
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
 from rpim_opt.use.reading import Targets
@@ -44,6 +44,7 @@ LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's ab
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
 FIRST = np.array([1, 1, 1, 1e-2, 1e-2, 1e-2])  # weights [m/rad] of an error with which the position comes first
+STILL = 1e-7  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
 POSITION = np.array([1.0, 1, 1, 0, 0, 0])  # remaining error where orientations are not corrected
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which starts of a pose without one are sought; how many it tries
@@ -113,11 +114,13 @@ class Compensation:
                 figures.append([name, *(f"{1e3 * value:.4f}" for value in shown)])
         changes = (f"{name.replace('_', f' {value:.3f} ')}" for name, value in self._largest_corrections().items())
         moved = f" (a common motion of all targets, or another base, leaves {1e3 * self.after_motion:.4f} mm RMS)"
+        flange = 1e3 * forward_kinematics(self.robot, np.zeros((1, self.robot.dof)))[0, :3, 3]
         lines = [
             table([f"{len(self.q)} targets, error", "mean", "RMS", "max"], figures),
             f"Largest corrections: {', '.join(changes)}.",
-            "Uncorrected errors refer to the identified base, in whose frame targets are "
-            f"stated{moved if self.after_motion < rms(self.position_before) / 2 else ''}; nominal errors in a report "
+            "Targets are stated in the robot's base frame, in which the nominal flange at zero joint values is at x "
+            f"{flange[0]:z.3f} y {flange[1]:z.3f} z {flange[2]:z.3f} mm. Uncorrected errors refer to the identified "
+            f"base{moved if self.after_motion < rms(self.position_before) / 2 else ''}; nominal errors in a report "
             "refer to a refitted base and tool.",
         ]
         at_fault = {UNREACHABLE: " in the robot's base frame", ABOVE: f" of {1e3 * self.limit:g} mm"}
@@ -253,7 +256,8 @@ def compensate(
     the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: where the
     standard uncertainty of w is larger (RMS of all rows), as where positions of one reflector hardly determine it, w
     is instead the turn by which the correction changes the orientation, and |w|^2 counts 1e-4 m^2: position comes
-    first. ``orientation=True`` corrects them all the same, with ``False`` those of targets are ignored.
+    first, and |D|^2 counts 1e-7 m^2 rad^-2. ``orientation=True`` corrects them all the same, with ``False`` those of
+    targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
     frame, x, y, z [m], roll, pitch, yaw [rad], the controller's TCP, or by default the reflector of the calibration
@@ -328,11 +332,12 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     if orientation is None and cell.kind is pose:
         turns = [(cell.norms(each.before)[1], cell.uncertainty(each.commands, each.targets)[1]) for each in parts]
         turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
-        if turn < of_turn < np.inf:
-            why = (
-                f" Orientation is not corrected: its correction, {turn:.2f} mrad, would be smaller than its standard "
-                f"uncertainty, {of_turn:.2f} mrad (RMS); --orientation corrects it anyway."
-            )
+        if turn < of_turn < np.inf or np.isnan(of_turn):
+            known = "its uncertainty is unknown"
+            if np.isfinite(of_turn):
+                known = f"its correction, {turn:.2f} mrad, would be smaller than its standard uncertainty, "
+                known += f"{of_turn:.2f} mrad (RMS)"
+            why = f" Orientation is not corrected: {known}; --orientation corrects it anyway."
     ended = on_all_cores(lambda part: cell.ended(part, largest, turning=not why), parts)
     fields: dict[str, Any] = {name: np.concatenate([each[name] for each in ended]) for name in ended[0]}
     there = np.concatenate([part.reached[:, :3] for part in parts])
@@ -545,12 +550,15 @@ class _Cell(NamedTuple):
         if not turning:
             wanted, due, W = np.hstack([target[:, :3], pose_before[:, 3:]]), POSITION * due, counts * FIRST
         P = correction_weights(W @ J, times(W, due), largest)
+        if not turning:
+            P = P + STILL * np.eye(P.shape[1])
         lowest, highest = self.robot.limits.T
         inside = np.clip(commands, lowest, highest)
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        cases = {"ok": self._reached(left, counts), "limited": at_limit, UNREACHABLE: ~reached}
+        met = self._reached(left if turning else POSITION * left, counts)
+        cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
         fields["position_before"], fields["orientation_before"] = self.norms(before)

@@ -206,13 +206,14 @@ def _judged(whole: Calibration, alone: Calibration, despite_verdict: bool) -> tu
     stays = np.linalg.norm(alone.forward(found.q, found.region.marker)[:, :3, 3] - found.position, axis=1)
     bound, required = float((found.expanded + stays).max()), found.requirement
     of_geometry = (
-        f"Expanded uncertainty of the position reached with this geometry (U, {percent(required.confidence)}): at "
-        f"most {1e3 * bound:.3f} mm, of the reflector; region: {required.where}. It includes what geometry alone "
-        f"misses, at most {1e3 * stays.max():.3f} mm there."
+        "Expanded uncertainty of the position that the reflector reaches with this geometry (U, "
+        f"{percent(required.confidence)}): at most {1e3 * bound:.3f} mm; region: {required.where}. It includes what "
+        f"geometry alone misses, at most {1e3 * stays.max():.3f} mm there."
     )
     if accepted and bound > required.limit:
         undecided = True
-        of_geometry += f" It is above the limit of {1e3 * required.limit:g} mm; only the whole model's is within it."
+        of_geometry += f" It is above the limit of {1e3 * required.limit:g} mm"
+        of_geometry += "; only the whole model's is within it." if accepted.verdict == "accepted" else "."
     remarks.append("Other points and the flange's orientation may be less certain: `compensate --tool` says how much.")
     return note, [of_geometry], remarks, undecided
 
@@ -398,6 +399,7 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
 def _write_ur_kinematics(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
     arm = identified(result, marker, robot).robot
     arm, notes = _on_base(arm, result.problem.arms[robot], read_ur_kinematics(source).robot, target)
+    notes.append("The ROS driver reads these origins; the controller keeps its own kinematics, and the hash stays.")
     return notes + write_ur_kinematics(source, arm, target)
 
 
@@ -417,7 +419,9 @@ def _write_ur_calibration(result: Calibration, robot: str, source: Path, target:
             "the file. Keep the original."
         )
     if not np.array_equal(mdh, arm.mdh):
-        notes.append("alpha1 and a1 place axis 1 and are no part of calibration.conf: its Base is on axis 1.")
+        notes.append(
+            "The tilt and offset of axis 1 (alpha1, a1) are left out: the Base of calibration.conf is on axis 1."
+        )
     return notes
 
 

@@ -46,9 +46,8 @@ def test_an_acceptance_says_what_it_rests_on() -> None:
         LIMIT, "accepted", (), expanded(500, 9e-5, 5e-5), 2e-5, {"rows": 4, "sentence": "Held out: 4 rows."}
     )
     assert whole.sentences()[2:] == [
-        "Expanded uncertainty of the position reached (U, 95 %): at most 0.090 mm (largest of 500 configurations, "
-        "refined by a search), median 0.050 mm.",
-        "U is that of the reflector; `compensate --tool` states that of another point.",
+        "Expanded uncertainty of the position that the reflector reaches (U, 95 %): at most 0.090 mm (largest of 500 "
+        "configurations, refined by a search), median 0.050 mm; `compensate --tool` states that of another point.",
         "Held out: 4 rows.",
     ]
     assert whole.content()["checked"] == {"rows": 4}

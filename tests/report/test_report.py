@@ -292,7 +292,7 @@ def test_the_verdict_is_the_first_thing_on_the_page(limit: float, verdict: str) 
     words = " ".join(read.words.split())
     said = "limit 0.07 mm with 95 % confidence at every configuration of the region. Missing: more measurements. The"
     if verdict == "Accepted":
-        said = "expanded uncertainty of the position reached (U, 95 %) at most"
+        said = "expanded uncertainty of the position that the reflector reaches (U, 95 %) at most"
     assert 0 <= words.index(f"{verdict}: {said}") < words.index("Mean error, nominal")
     assert words.count("Missing: more measurements.") == (verdict != "Accepted")
     assert "A. <b>Person</b>" in words

@@ -466,6 +466,7 @@ def test_a_problem_file_identifies_and_scales_what_a_script_adds(tmp_path: Path)
     ("make", "sentence"),
     [
         (lambda: ro.robot.Term(lambda j, s: s, {"play": 1.0}), "no unit of the right dimension"),
+        (lambda: ro.robot.Term(lambda j, s: s, {"play_mm_per_m": 1.0}), "no unit of the right dimension"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": 0.0}), "greater than zero"),
         (lambda: ro.robot.Term(lambda j, s: s, {"play_mrad": "much"}), "a finite number"),
         (lambda: ro.robot.Term(lambda j, s: s, {"tool_play_mrad": 1.0}), "a name that parameters cannot have"),
