@@ -297,7 +297,10 @@ def new(
 
 @command
 def inspect(problem: Problem, variant: Variant = None) -> Answer:
-    """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability."""
+    """Check the input before calibrating: joint ranges, repeated rows, likely causes of errors, identifiability.
+
+    Exit code 1 if the robot of a quick fit would not be delivered.
+    """
     with console.progress() as say:
         say("reading the problem")
         instance = ro.load(problem, variant)
@@ -315,7 +318,8 @@ def inspect(problem: Problem, variant: Variant = None) -> Answer:
         text += f"\n\nRobot {name}\n\n{part}" if name else f"\n\n{part}"
     if together is not None:
         text += f"\n\nAll robots together: {together}"
-    return Answer(text, document)
+    refused = any(part.fit is not None and not part.fit.verdict.delivered for part in parts.values())
+    return Answer(text, document, int(refused))
 
 
 @command
