@@ -367,6 +367,11 @@ class Outcome:
         return inliers(program.model, self.z)[0] if source.keeps_rows else source.linearize(self.x, inliers)
 
     @cached_property
+    def moves(self) -> Array | None:
+        """An orthonormal basis (n, k) of the steps of z that active constraints leave; None where none is active."""
+        return self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
+
+    @cached_property
     def spread(self) -> Spread:
         """The basis of the uncertainty: the equations that the fit keeps, and its penalty.
 
@@ -375,9 +380,8 @@ class Outcome:
         if not self.program.linear_penalty:
             raise self.no_covariance("`forward` and monte_carlo work with any")
         form = ridge(self.squares, self.program.penalty_form)
-        moves = self.program.tangent(self.z, self.penalty_weight) if self.formulation.solvable else None
-        if moves is not None:  # conditional on the active constraints
-            form = ridge_within(self.squares, self.program.penalty_form, moves, self.z)
+        if self.moves is not None:  # conditional on the active constraints
+            form = ridge_within(self.squares, self.program.penalty_form, self.moves, self.z)
         level, drift = (None, None) if self.learned is None else (1.0, self.learned.drift)
         return Spread(self.squares, form, self.penalty_weight, self.z, level, drift)
 
@@ -575,15 +579,15 @@ class Outcome:
         """Multipliers of the formulation's constraints."""
         return self.program.beginning(self.z).solve(self.weight).duals
 
-    @property
-    def active_constraints(self) -> list[str]:
+    @cached_property
+    def active_constraints(self) -> tuple[str, ...]:
         """Names of the formulation's constraints that hold the solution, on which intervals rest."""
         constraints = self.formulation.constraints
         if not constraints or not self.formulation.solvable:
-            return []
+            return ()
         least = ACTIVE * max(self.program.objective(self.z, self.weight), ACTIVE)
         holds = (np.abs(multiplier).max(initial=0.0) > least for multiplier in self._multipliers)
-        return [name_of(each, k) for k, (each, held) in enumerate(zip(constraints, holds, strict=True)) if held]
+        return tuple(name_of(each, k) for k, (each, held) in enumerate(zip(constraints, holds, strict=True)) if held)
 
     @cached_property
     def actively_constrained(self) -> tuple[str, ...]:

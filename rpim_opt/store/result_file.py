@@ -49,7 +49,8 @@ FORMAT = "rpim-opt result"
 VERSION = 3
 Models = Model | Mapping[str, Model]
 SHARED = ("x", "weight", "selection", "converged", "message", "history", "certificate", "learned", "mapping")
-DERIVED = ("active_bounds", "shadow_prices", "record", "causes")
+CONSTRAINED = ("active_bounds", "active_constraints", "moves", "shadow_prices")
+DERIVED = (*CONSTRAINED, "record", "causes")
 """What a calibration and its file hold under the same name, and what a calibration derives of what it holds."""
 RELATIVE = 1e-4  # standard deviations of hardly identifiable directions differ by that much between processors
 ABSOLUTE = 1e-6  # Largest difference of a small figure [mm, deg] and the one that follows from the data.
@@ -205,6 +206,8 @@ class Stored:
     record: Record  # Title, source, files and excluded rows.
     causes: tuple[str, ...]  # Likely mistakes in the data.
     rows: dict[str, list[RowErrors]]  # Errors of every row [mm], nominal and identified.
+    active_constraints: tuple[str, ...] = ()  # Constraints on which standard deviations are conditional.
+    moves: Array | None = None  # Basis of the steps [prior scales] that active constraints leave.
     mapping: JointMapping | None = None  # Signs and offsets of joints that the global start found.
     digest: str = ""  # SHA-256 of the content.
 
@@ -414,7 +417,7 @@ def _known(file: Stored, program: Program) -> dict[str, Any]:
     known: dict[str, Any] = {"causes": file.causes}
     if program.formulation.solvable:
         return known
-    known |= {name: getattr(file, name) for name in ("active_bounds", "shadow_prices", "inliers")}
+    known |= {name: getattr(file, name) for name in (*CONSTRAINED, "inliers")}
     if file.inliers is not None:
         keep = np.ones(len(program.model.b), dtype=bool)
         keep[file.inliers.left_out] = False

@@ -43,7 +43,7 @@ def test_intervals_say_on_which_own_constraints_they_rest() -> None:
         return cp.norm(z) <= 1e3
 
     result = ro.calibrate(PROBLEM, stated(longer, wide, lambda z, p: p.x["a2"] == 0), 1.0)
-    assert result.active_constraints == ["longer", 'p.x["a2"] == 0']
+    assert result.active_constraints == ("longer", 'p.x["a2"] == 0')
     assert str(result).count("Standard deviations and intervals are conditional on them") == 1
 
 
@@ -57,7 +57,7 @@ def test_intervals_say_on_which_ready_constraints_they_rest_once() -> None:
     drawn, wide = ro.constraints.parse(f"a3 <= {a3 - 0.003:.4f} mm"), ro.constraints.parse("a2 <= nominal + 30 mm")
     for constraints in ((drawn, wide), (at_nominal, drawn), (zero,)):
         result = ro.calibrate(PROBLEM, stated(*constraints), 1.0)
-        assert result.active_constraints == [name_of(each, 0) for each in constraints if each is not wide]
+        assert result.active_constraints == tuple(name_of(each, 0) for each in constraints if each is not wide)
         for text in (str(result), describe(result, summary(result, {}))):
             assert text.count("Standard deviations and intervals are conditional on them") == 1
             assert ("Active constraints: " in text) != ("The data contradict constraints" in text)

@@ -48,7 +48,7 @@ def flagged(count: int, squared_loss: bool = False) -> list[str]:
     flags = tuple(Flag(f"r{k}", 10.4 + k, 1.234e-3, "length") for k in range(count))
     held = tuple(ActiveBound("a2", 0.0005, 1.0, 0.05) for _ in range(count))
     stand_in: Any = SimpleNamespace(
-        active_constraints=[],
+        active_constraints=(),
         flagged=flags,
         clustered=(),
         active_bounds=held,
@@ -92,7 +92,7 @@ def test_points_beyond_a_table_are_counted_with_the_largest_of_their_errors() ->
 
 def test_what_a_file_could_not_hold_is_said() -> None:
     stand_in: Any = SimpleNamespace(
-        active_constraints=[],
+        active_constraints=(),
         flagged=(),
         active_bounds=(),
         shadow_prices=(),

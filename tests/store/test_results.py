@@ -6,6 +6,7 @@ import json
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cvxpy as cp
 import numpy as np
@@ -121,13 +122,30 @@ def test_functions_of_a_script_are_missing_and_nothing_else(tmp_path: Path) -> N
     )
     assert again.flagged == result.flagged
     assert again.certificate == result.certificate
-    assert "cannot be solved again" in str(again)
-    assert "cannot be solved again" not in str(result)
+    assert "cannot store functions of a script" in str(again)
+    assert "cannot store functions of a script" not in str(result)
     with pytest.raises(ro.InputError, match="formulation 'mine': found functions that a result file cannot hold"):
         ro.calibrate(again.problem, again.formulation, 1.0)
     twice = saved(tmp_path, again)
     assert str(twice) == str(again)
     assert np.array_equal(twice.covariance, again.covariance)
+
+
+def test_intervals_stay_conditional_on_a_scripts_constraints(tmp_path: Path) -> None:
+    instance = ro.load("position")
+    q = instance.problem.data.q[:3]
+    place = ro.calibrate(instance.problem, ro.tikhonov, 1.0).predict(q).position + 1e-4
+
+    def held(z: Any, p: Any) -> Any:
+        return p.positions(q)[:1, 2] == place[:1, 2]
+
+    mine = ro.Formulation("mine", penalty=cp.sum_squares, constraints=(held,))
+    result = ro.calibrate(instance.problem, mine, 1.0)
+    again = saved(tmp_path, result, instance.record)
+    assert again.active_constraints == result.active_constraints == ("held",)
+    assert again.predict(q, of="mean").standard == pytest.approx(result.predict(q, of="mean").standard, rel=1e-9)
+    assert again.predict(q, of="mean").standard[0, 2] < 1e-8
+    assert str(again).count("Active constraints: held") == 1
 
 
 def test_a_measurement_of_a_script_is_passed_again(tmp_path: Path) -> None:

@@ -50,7 +50,7 @@ def test_what_has_no_figures_is_named_and_nothing_is_summed_up() -> None:
 def test_replicates_that_are_not_delivered_are_counted() -> None:
     found = compared({"a": even(1.0), "b": even(0.5)}, status=UNDELIVERED, reason="")
     notes = found.summary().notes
-    assert "b: not delivered, 6 of 6 replicates. Their figures count; the column reason says why." in notes
+    assert "b: not delivered, 6 of 6 replicates. Their figures are included; the column `reason` states why." in notes
 
 
 def test_a_fit_that_no_robot_has_is_not_delivered() -> None:
