@@ -43,8 +43,9 @@ EXPANDED = 2.0  # coverage factor of the expanded uncertainty that is compared w
 LESS_KNOWN = 3.0  # ratio of the stated tool's uncertainty to the reflector's above which the reason is reported
 BESIDE = 0.05  # distance [m] of a stated position from the joint values beside it that is named
 UNREACHABLE, ABOVE = "unreachable", "above the limit"
-FIRST = np.array([1, 1, 1, 1e-2, 1e-2, 1e-2])  # weights [m/rad] of an error with which the position comes first
-STILL = 1e-7  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
+FIRST = np.array([1, 1, 1, 1e-3, 1e-3, 1e-3])  # weights [m/rad] of an error with which the position comes first
+STILL = 1e-9  # weight [m^2/rad^2] of the joints' motion there: no singular wrist swings to keep an orientation
+KEPT = np.array([1, 1, 1, 1e-4, 1e-4, 1e-4])  # `REACHED` is 1e-7 m, and 1 mrad where orientations are kept
 POSITION = np.array([1.0, 1, 1, 0, 0, 0])  # remaining error where orientations are not corrected
 NO_NOISE = 1e-18  # variance [m^2, rad^2] of orientations where none were measured: a reading has a covariance
 BANK, TRIALS = 2000, 12  # configurations among which starts of a pose without one are sought; how many it tries
@@ -255,8 +256,8 @@ def compensate(
     without ``q`` every pose is looked for from several configurations within the limits that come near. ``label`` names
     the rows, ``robot`` is which of several. Orientations are corrected where known better than nominally: where the
     standard uncertainty of w is larger (RMS of all rows), as where positions of one reflector hardly determine it, w
-    is instead the turn by which the correction changes the orientation, and |w|^2 counts 1e-4 m^2: position comes
-    first, and |D|^2 counts 1e-7 m^2 rad^-2. ``orientation=True`` corrects them all the same, with ``False`` those of
+    is instead the turn by which the correction changes the orientation, and |w|^2 counts 1e-6 m^2: position comes
+    first, and |D|^2 counts 1e-9 m^2 rad^-2. ``orientation=True`` corrects them all the same, with ``False`` those of
     targets are ignored.
 
     **Tool.** Both robots have the same tool, so that no difference of tools is compensated: ``tool`` (6,) in the flange
@@ -557,7 +558,7 @@ class _Cell(NamedTuple):
         limits = np.maximum(lowest, inside - largest), np.minimum(highest, inside + largest)
         corrected, left, active = nearest(self.identified, load, wanted, commands, limits, W, P)
         at_limit = (active & ((corrected <= lowest) | (corrected >= highest))).any(axis=1)
-        met = self._reached(left if turning else POSITION * left, counts)
+        met = self._reached(left if turning else KEPT * left, counts)
         cases = {"ok": met, "limited": at_limit, UNREACHABLE: ~reached}
         status = np.select(list(cases.values()), list(cases), "near singular")
         fields = {"nominal": commands, "q": corrected, "beside": beside, "status": status}
