@@ -481,9 +481,7 @@ class ReducedProgram:
                     raise
             missed = p.missed(found[0].x)
             if (missed > ACCEPTED or np.abs(found[0].x - near).max() > FAR) and not len(p.shared):
-                refined = self._nearby(found[0].x, squares, weight, A, b, missed)
-                if refined is not None and p.missed(refined[0].x) <= max(missed, FEASIBLE / 2):
-                    found = refined
+                found = self._nearby(found[0].x, squares, weight, A, b, missed) or found
         point, slack = found
         self.far = weight if np.abs(point.x - near).max() > FAR and not len(p.shared) else -1.0
         self.near = point.x
