@@ -457,25 +457,22 @@ class ReducedProgram:
         """Return Clarabel's minimum, and the slacks of the penalty's rows.
 
         Its tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
-        of the squares of all equations with some weight on |z|^2. A minimum that is far from there, misses constraints,
-        or is not found, is refined.
+        of the squares with some weight on |z|^2. A minimum that is far from there, misses constraints, or is not found
+        is refined, the last one from the least squares of the loss's rows.
         """
-        p, n = self.canonical, len(self.canonical.at)
+        p = self.canonical
         near = np.zeros(p.size)
         near[p.at] = self.near[p.at]
-        if not near.any():
-            rows = np.column_stack([squares.R, squares.y])
-            if A is not None and b is not None:
-                rows = np.vstack([rows, np.column_stack([A, b])])
-            ridge = np.sqrt(weight + CENTRED * np.sum(rows[:, :n] ** 2)) * np.eye(n, n + 1)
-            T = reduced_rows(np.vstack([rows, ridge]))
-            near[p.at] = np.linalg.lstsq(T[:, :n], T[:, n], rcond=None)[0]
+        if self.rows and not near.any():
+            near[p.at] = _centre(np.column_stack([squares.R, squares.y]), weight)
         walks = self._walks(weight)
         found = self._nearby(near, squares, weight, A, b) if walks else None
         if found is None:
             try:
                 found = self._about(near, squares, weight, A, b)
             except Unsolved:
+                if A is not None and b is not None and not near.any():
+                    near[p.at] = _centre(np.column_stack([A, b]), weight)
                 found = None if walks else self._nearby(near, squares, weight, A, b)
                 if found is None:
                     raise
@@ -565,6 +562,14 @@ class ReducedProgram:
         x[: p.size] += near
         own = slice(k, k + len(p.b))
         return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :]), s[own]
+
+
+def _centre(rows: Array, weight: float) -> Array:
+    """Return the least squares (n,) of equations [A b], (m, n + 1), with some weight on |z|^2."""
+    n = rows.shape[1] - 1
+    ridge = np.sqrt(weight + CENTRED * np.sum(rows[:, :n] ** 2)) * np.eye(n, n + 1)
+    T = reduced_rows(np.vstack([rows, ridge]))
+    return np.asarray(np.linalg.lstsq(T[:, :n], T[:, n], rcond=None)[0], dtype=float)
 
 
 class _ConicData:
