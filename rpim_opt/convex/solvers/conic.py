@@ -17,7 +17,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.convex.constraints import box_sides
 from rpim_opt.convex.expressions import cp, norms, substituted
 from rpim_opt.convex.quadratic import Quadratic
-from rpim_opt.problem.linear import RANK_TOLERANCE, reduced_rows
+from rpim_opt.problem.linear import RANK_TOLERANCE
 
 FEASIBLE = 1e-7
 """By how much a solution may miss its constraints: in scales, relative to its largest component where that is more."""
@@ -457,25 +457,17 @@ class ReducedProgram:
         """Return Clarabel's minimum, and the slacks of the penalty's rows.
 
         Its tolerances are relative to the size of the unknowns: those are changes of a near point, the last one or that
-        of the squares with some weight on |z|^2. A minimum that is far from there, misses constraints, or is not found
-        is refined, the last one from the least squares of the loss's rows.
+        of the squares with some weight on |z|^2. A minimum that is far from there, or misses constraints, is refined.
         """
-        p = self.canonical
+        p, n = self.canonical, len(self.canonical.at)
         near = np.zeros(p.size)
         near[p.at] = self.near[p.at]
         if self.rows and not near.any():
-            near[p.at] = _centre(np.column_stack([squares.R, squares.y]), weight)
-        walks = self._walks(weight)
-        found = self._nearby(near, squares, weight, A, b) if walks else None
+            rows = np.vstack([squares.R, np.sqrt(weight + CENTRED * np.sum(squares.R**2)) * np.eye(n)])
+            near[p.at] = np.linalg.lstsq(rows, np.concatenate([squares.y, np.zeros(n)]), rcond=None)[0]
+        found = self._nearby(near, squares, weight, A, b) if self._walks(weight) else None
         if found is None:
-            try:
-                found = self._about(near, squares, weight, A, b)
-            except Unsolved:
-                if A is not None and b is not None and not near.any():
-                    near[p.at] = _centre(np.column_stack([A, b]), weight)
-                found = None if walks else self._nearby(near, squares, weight, A, b)
-                if found is None:
-                    raise
+            found = self._about(near, squares, weight, A, b)
             missed = p.missed(found[0].x)
             if (missed > ACCEPTED or np.abs(found[0].x - near).max() > FAR) and not len(p.shared):
                 found = self._nearby(found[0].x, squares, weight, A, b, missed) or found
@@ -562,14 +554,6 @@ class ReducedProgram:
         x[: p.size] += near
         own = slice(k, k + len(p.b))
         return Point(x[: p.size], z[own], int(solution.iterations), x[p.size + k :]), s[own]
-
-
-def _centre(rows: Array, weight: float) -> Array:
-    """Return the least squares (n,) of equations [A b], (m, n + 1), with some weight on |z|^2."""
-    n = rows.shape[1] - 1
-    ridge = np.sqrt(weight + CENTRED * np.sum(rows[:, :n] ** 2)) * np.eye(n, n + 1)
-    T = reduced_rows(np.vstack([rows, ridge]))
-    return np.asarray(np.linalg.lstsq(T[:, :n], T[:, n], rcond=None)[0], dtype=float)
 
 
 class _ConicData:
