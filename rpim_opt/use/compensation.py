@@ -333,7 +333,7 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     if orientation is None and cell.kind is pose:
         turns = [(cell.norms(each.before)[1], cell.uncertainty(each.commands, each.targets)[1]) for each in parts]
         turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
-        if turn < of_turn < np.inf or np.isnan(of_turn):
+        if turn < of_turn < np.inf or cell.covariance is None:
             known = "its uncertainty is unknown"
             if np.isfinite(of_turn):
                 known = f"its correction, {turn:.2f} mrad, would be smaller than its standard uncertainty, "
