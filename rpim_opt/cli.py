@@ -445,8 +445,10 @@ def accept(
         read = ro.use.read_measurements(*options) if data else None
         say("searching for the maximum uncertainty")
         requirement = console.requirement_of(limit, box, loaded.record.requirement)
-        acceptance = ro.calibration.accept(loaded, requirement, read and read.data)
-    return Answer(acceptance, acceptance.content(), CODES[acceptance.verdict], read=read)
+        placed = ro.use.in_session(loaded)
+        acceptance = ro.calibration.accept(placed, requirement, read and read.data)
+    text = "\n".join([str(acceptance), *ro.use.session_notes(placed)])
+    return Answer(text, acceptance.content(), CODES[acceptance.verdict], read=read)
 
 
 @command

@@ -58,6 +58,7 @@ class RobotModel(Tabled):
     parameters: Parameters
     frozen_functions: Kept | None = field(default=None, repr=False, kw_only=True)
     repeatability: Repeatability | None = field(default=None, kw_only=True)
+    session: str = field(default="", kw_only=True)  # in whose frame `measuring` measures; their mean by default
 
     def sample(self) -> CalibrationProblem:
         """Return rows that suffice to register frames: all of them, or the first of several blocks."""
@@ -270,6 +271,7 @@ class CalibrationProblem(RobotModel):
             approach=None if all(block.approach is None for block in self.data.blocks) else approach,
             payload=None if payload is None else np.broadcast_to(np.asarray(payload, dtype=float), N),
             columns={name: np.broadcast_to(values, N) for name, values in stated.items()},
+            session=[self.session] * N if self.session else (),
         )  # fmt: skip
         first = self.data.blocks[0]
         own = first.markers[:1] if marker is None else (str(marker),)

@@ -37,6 +37,7 @@ from rpim_opt.report.summary import mm
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import definition
 from rpim_opt.use.export import beyond_geometry
+from rpim_opt.use.sessions import in_session, session_notes
 from rpim_opt.use.validation import Validation
 
 MOST_FLAGGED = 200  # flagged rows that are named, the worst first
@@ -85,6 +86,7 @@ class Content(NamedTuple):
 def page(result: Calibration, new: Mapping[str, Validation] | None = None) -> str:
     """Return the report as HTML."""
     new = new or {}
+    result = in_session(result)
     heading = result.record.title or " and ".join(robot.name for robot in result.problem.arms.values())
     lacking = judged(result)
     composition = [] if lacking is None else lacking.sentences()
@@ -247,7 +249,8 @@ def _uncertainty(map_: Workspace, result: Calibration) -> Iterator[Block]:
     ]
     required = result.record.requirement is not None
     limit = 1e3 * map_.requirement.limit if required else None
-    yield "text", notes if required else [f"{map_.summary}; region: {map_.requirement.where}.", *notes]
+    stated = [] if required else [f"{map_.summary}; region: {map_.requirement.where}."]
+    yield "text", [*stated, *notes, *session_notes(result)]
     box = None if map_.region.box is None else 1e3 * map_.region.box
     at = 1e3 * in_base(map_.region.problem, map_.q, map_.region.marker)
     frame = "" if box is None else " The frame is the box of the requirement."

@@ -19,6 +19,7 @@ from rpim_opt.data.measurements.contact import known_distance, known_parallel, k
 from rpim_opt.problem.linear import RANK_TOLERANCE
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import figures
+from rpim_opt.use.sessions import in_session, session_notes
 
 KEYS = ("verdict", "weight", "selector", "corner", "formulation", "converged", "iterations", "flagged", "parameters")
 COLUMNS = ("rows", "mean", "RMS", "95th percentile", "max")
@@ -206,6 +207,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
 
     ``published`` are mean errors [mm] that the source prints, by set and method.
     """
+    result = in_session(result)
     record = result.record
     errors = error_rows(result)
     for name, methods in published.items():
@@ -222,6 +224,7 @@ def summary(result: Calibration, published: Mapping[str, Mapping[str, float]]) -
         identifiability(result),
         words.noise_sentence(result),
         *words.turned_frames(result),
+        *session_notes(result),
         nominal_note(result),
         *warnings(result),
         *([result.message] if result.converged else []),

@@ -12,5 +12,7 @@ from .reading import read_measurements as read_measurements
 from .reading import read_targets as read_targets
 from .recalibration import Update as Update
 from .recalibration import update as update
+from .sessions import in_session as in_session
+from .sessions import session_notes as session_notes
 from .validation import Validation as Validation
 from .validation import validate as validate

@@ -35,6 +35,7 @@ from rpim_opt.robot.kinematics import FRAME, call_rows, chain, forward_kinematic
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
 from rpim_opt.use.reading import Targets
+from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
 SMALLEST = 1e-12  # correction [rad or m] below which nothing is corrected
 BLOCK = 8192  # rows that are worked on together, so that what they need stays in the processor's cache
@@ -282,9 +283,12 @@ def compensate(
     >>> print(found.csv().splitlines()[0])
     label,q1_deg,q2_deg,q3_deg,q4_deg,q5_deg,q6_deg,position_error_mm,orientation_error_mrad,std_mm,orientation_std_mrad,status,note
     """
-    verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
-    note = " ".join(filter(None, [verdict.require(despite_verdict), result.no_intervals]))
     arm = pick(result.problem.arms, robot, "robot")
+    result = in_session(result, robot)
+    verdict = accept(result).on(result.verdict) if result.record.requirement else result.verdict
+    note = " ".join(
+        filter(None, [verdict.require(despite_verdict), result.no_intervals, *session_notes(result, robot)])
+    )
     targets = _checked(arm, Targets(tuple(label), q, poses, torque), orientation is not False)
     if limit is None:
         limit = result.record.requirement.limit if result.record.requirement else np.inf
@@ -495,13 +499,14 @@ class _Cell(NamedTuple):
         p, x, covariance, marker, point = _tooled(result, which, tool, marker)
         values = p.values(x)
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
-        stated, located = (numeric_frame([of[f"base_{c}"] for c in FRAME]) for of in (nominal, identified))
-        moved = np.linalg.inv(stated) @ located if base else np.eye(4)
+        stated = numeric_frame([nominal[f"base_{c}"] for c in FRAME])
+        moved = np.linalg.inv(stated) @ base_frame(result, which) if base else np.eye(4)
         measured = result.problem.sample().alone(which)
         repeatability = measured.repeatability
         if repeatability is not None and tool is not None:
             repeatability = replace(repeatability, at=values)
-        problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability)
+        session = result.problem.session
+        problem = CalibrationProblem(robot, p, measured.data, repeatability=repeatability, session=session)
         noise = np.eye(len(kind.components)) * NO_NOISE
         noise[:3, :3] += position_noise(measured)
         require_same_torques(robot, p, measured_torques(problem.data), torques)

@@ -38,6 +38,7 @@ from rpim_opt.robot.library import robots
 from rpim_opt.robot.mdh import Robot
 from rpim_opt.robot.parameters import frame_of, of_joint, of_term, own_name, reflectors, tool_prefix
 from rpim_opt.use.compensation import tool_uncertainty
+from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
 OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
 ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
@@ -73,6 +74,7 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
     (array([ 1.8 , -0.7 ,  0.35,  0.02, -0.04,  1.9 ]), array([18.8, -3.7, 61. ]))
     """
     arm = pick(result.robots, robot, "robot")
+    result = in_session(result, robot)
     whole = result.problem.parameters
     p = whole.of_robot(robot)
     of = dict(zip(p.names, whole.values_at(result.x)[whole.places_of(robot)], strict=True))
@@ -86,8 +88,8 @@ def identified(result: Calibration, marker: str | None = None, robot: str = "") 
     prefix = tool_prefix(reflectors(p.names)[0] if marker is None else marker)
     if prefix + "x" not in of:
         raise InputError("marker", f"'{marker}'", "a reflector of the calibration")
-    base, tool = (np.array([of[frame + c] for c in FRAME]) for frame in ("base_", prefix))
-    return RobotSetup(replace(arm, joint_map=joint_map), base, tool)
+    tool = np.array([of[prefix + c] for c in FRAME])
+    return RobotSetup(replace(arm, joint_map=joint_map), frame_numbers(base_frame(result, robot)), tool)
 
 
 def beyond_geometry(result: Calibration, robot: str) -> dict[str, float]:
@@ -142,10 +144,10 @@ def export_files(
     requirement of its record, unless ``despite_verdict``, noted in every file; InputError where there is nothing
     to write, or a file cannot hold what was identified.
     """
-    whole = result
+    whole = in_session(result, robot)
     result, lost = geometry_alone(whole)
     note, of_geometry, remarks, undecided = _judged(whole, result, despite_verdict)
-    of_geometry += lost
+    of_geometry += [*lost, *session_notes(result, robot)]
     others = (urdf, ur_kinematics, ur_calibration, camera_info, mdh, robodk)
     if corrections and any(others) and not transmission_errors(whole):
         without = f"Not written: {Path(corrections).name}, since the calibration has no curves of transmission errors."

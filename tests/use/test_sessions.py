@@ -1,0 +1,108 @@
+"""A robot measured from two places of the instrument: U and base are of one of them, not of their mean (simulated)."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.basics.arrays import Array
+from rpim_opt.basics.tables import csv_text
+from rpim_opt.calibration.acceptance import measured_workspace
+from rpim_opt.robot.kinematics import numeric_frame
+from rpim_opt.robot.parameters import model_parameters
+from rpim_opt.study.arms import BASE, KINDS, SCALES, TOOL
+from tests.test_cli import run
+
+NOISE = 3e-5
+FAR = numeric_frame([0.4, -0.9, 0.1, 0.02, -0.03, 0.5])  # from the instrument's first place to its second
+
+
+def from_far(points: Array) -> Array:
+    """Return points (N, 3) [m] as the instrument reads them from its second place."""
+    return points @ FAR[:3, :3].T + FAR[:3, 3]
+
+
+@pytest.fixture(scope="module")
+def arm() -> ro.study.SimulatedArm:
+    return ro.study.simulated_arm(1, 40)
+
+
+@pytest.fixture(scope="module")
+def result(arm: ro.study.SimulatedArm) -> ro.Calibration:
+    rows = arm.problem.data.blocks[0]
+    names = [("near", "far")[i % 2] for i in range(len(rows.y))]
+    y = np.where(np.array(names)[:, None] == "far", from_far(rows.y), rows.y)
+    data = ro.Dataset.of(arm.problem.data.q, y, NOISE, session=names)
+    table = model_parameters(arm.problem.robot, list(BASE), {"": list(TOOL)}, sessions=("near", "far"))
+    table = table.scaled({**SCALES, "session_mm": 1000.0, "session_mrad": 1000.0})
+    own = KINDS[list(KINDS)[1]]
+    table = table.identify(["alpha?", "a?", "d?", "theta?", *own, "base_*", "tool_[xyz]", "session_*"])
+    return ro.calibrate(ro.CalibrationProblem(arm.problem.robot, table, data))
+
+
+def test_uncertainty_is_that_in_one_place_of_the_instrument_and_covers(
+    arm: ro.study.SimulatedArm, result: ro.Calibration
+) -> None:
+    view = ro.use.in_session(result)
+    mean, own = (measured_workspace(each) for each in (result, view))
+    assert mean is not None
+    assert own is not None
+    assert mean.largest > 0.05  # the scatter of places a metre apart, none of the robot's
+    assert own.largest < 5 * np.sqrt(3) * NOISE * 2
+    true = arm.true.blocks[0].y
+    there = {"near": true, "far": from_far(true)}[view.problem.session]
+    predicted = view.predict(arm.true.q, of="reached")
+    error = np.linalg.norm(predicted.position - there, axis=1)
+    # U = 2 u of a vector covers 0.97 where u of three axes is known; 200 rows share one set of errors of parameters
+    assert np.mean(error < 2 * np.linalg.norm(predicted.standard, axis=1)) > 0.9
+    assert ro.use.in_session(view) is view
+
+
+def test_exported_base_and_table_are_of_that_session_and_others_are_relative_to_it(
+    arm: ro.study.SimulatedArm, result: ro.Calibration, tmp_path: Path
+) -> None:
+    found = ro.use.export_files(result, mdh=tmp_path / "arm.toml")
+    text = (tmp_path / "arm.toml").read_text()
+    named = ro.use.in_session(result).problem.session
+    assert f"in the instrument's frame of session '{named}'" in text
+    assert "U, k = 2, relative to" in text
+    assert not found.inconclusive
+    exported = ro.use.identified(result)
+    true = arm.true.blocks[0].y
+    there = {"near": true, "far": from_far(true)}[named]
+    ends = numeric_frame(exported.base), numeric_frame(exported.tool)
+    reached = (ends[0] @ ro.robot.forward_kinematics(exported.robot, arm.true.q) @ ends[1])[:, :3, 3]
+    assert np.linalg.norm(reached - there, axis=1).max() < 10 * NOISE
+    # the motion between both places, at the base, within twice its U (k = 2), and neither zero nor the robot's size
+    number = r"(-?[\d.]+)"
+    poses = re.findall(rf"'(near|far)' x {number} y {number} z {number} rx {number} ry {number} rz {number} mm", text)
+    base = {name: numeric_frame([*np.array(six[:3], float) * 1e-3, *np.radians(np.array(six[3:], float))])
+            for name, *six in poses}  # fmt: skip
+    moved = FAR @ base["near"] if named == "far" else np.linalg.inv(FAR) @ base["far"]
+    stated = re.search(rf"relative to '{named}': {number} mm, {number} mrad", text)
+    assert stated is not None
+    shift, turn = float(stated[1]), float(stated[2])
+    assert 1e3 * np.linalg.norm(moved[:3, 3] - base[named][:3, 3]) < 2 * shift < 1.0
+    off = Rotation.from_matrix(moved[:3, :3] @ base[named][:3, :3].T).magnitude()
+    assert 1e3 * off < 2 * turn < 2.0
+
+
+def test_the_commands_that_judge_a_robot_judge_it_in_one_session(
+    monkeypatch, capsys, arm: ro.study.SimulatedArm, result: ro.Calibration, tmp_path: Path
+) -> None:
+    ro.store.save_result(result, tmp_path)
+    rows = arm.read.blocks[0]
+    header = [*(f"q{i}_rad" for i in range(1, 7)), "x_m", "y_m", "z_m", "session"]
+    cells = [[*map(repr, map(float, [*q, *y])), "near"] for q, y in zip(arm.read.q, rows.y, strict=True)]
+    (tmp_path / "new.csv").write_text(csv_text(header, cells))
+    new = ("--data", str(tmp_path / "new.csv"))
+    assert run(monkeypatch, "accept", str(tmp_path), "--limit", "0.5", *new) == 0
+    assert "Base in the frame of sessions: " in capsys.readouterr().out
+    assert run(monkeypatch, "report", str(tmp_path), *new) == 0
+    assert "in the instrument&#39;s frame of session" in (tmp_path / "report.html").read_text()
+    assert run(monkeypatch, "validate", str(tmp_path), new[1]) == 0
