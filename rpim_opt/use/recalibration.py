@@ -122,7 +122,8 @@ class Update:
     of a joint's transmission error its sizes.
     ``errors`` [mm] are those of both calibrations on the readings that were not left out, and on rows held out of the
     previous one, where nothing was released. ``registered`` is whether the instrument or the base moved so far that the
-    base was registered again; else empty.
+    base was registered again; else empty. ``undetermined`` are the frames that were released, or are new, and that the
+    new rows determine worse than their prior does.
     """
 
     result: Calibration
@@ -134,6 +135,7 @@ class Update:
     readings: int
     errors: Mapping[str, Mapping[str, Any]]
     registered: str = ""
+    undetermined: tuple[str, ...] = ()
 
     @property
     def changed(self) -> bool:
@@ -156,6 +158,7 @@ class Update:
             "moved": [each.content() for each in self.moved],
             "causes": [cause._asdict() for cause in self.causes],
             "readings": self.readings,
+            "undetermined": self.undetermined,
             "errors": self.errors,
             "converged": self.result.converged,
             "verdict": self.result.verdict.content(),
@@ -186,6 +189,12 @@ class Update:
             lines.append(f"These readings do not distinguish this from a change of {joined(rivals)}: measure more.")
         if self.changes:
             lines.append(f"After these changes: {self.after}.")
+        if self.undetermined:
+            lines.append(
+                f"The new rows do not determine the pose of {joined(self.undetermined)}: measure at least three "
+                "configurations with the reflector's positions not on a line, or, where instrument and base stand as "
+                "before, update without --reset. Until then only the robot's own parameters are of use."
+            )
         for name, of in self.errors.items():
             was, now = (f"{of[when]['rms_mm']:.4f} mm" for when in ("before", "after"))
             rows = counted(of["after"]["count"], f"{name} row")
@@ -282,7 +291,20 @@ def update(
     figures = _errors(result, updated, held_out)
     updated = replace(updated, record=_carried_on(result.record, last, source))
     moved = _moved(result, updated, released, changes)
-    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere)
+    vague = _undetermined(result, updated, released)
+    return Update(updated, first[1], after, tuple(changes), first[0], moved, len(data), figures, elsewhere, vague)
+
+
+def _undetermined(result: Calibration, updated: Calibration, released: Sequence[str]) -> tuple[str, ...]:
+    """Return frames, released or new, with a direction in which the new rows know less than the prior's scale."""
+    free = updated.problem.parameters.free
+    known = set(result.problem.parameters.free.names).difference(released)
+    frames: dict[str, list[int]] = {}
+    for i in np.flatnonzero(free.of_frames):
+        if free.names[i] not in known:
+            frames.setdefault(free.names[i].rpartition("_")[0], []).append(int(i))
+    A = updated.program.model.A  # in standard deviations of the noise, by deviations in units of the scales
+    return tuple(name for name, index in frames.items() if np.linalg.matrix_rank(A[:, index], tol=1.0) < len(index))
 
 
 def _errors(

@@ -162,6 +162,20 @@ def test_an_instrument_that_was_set_up_anew(crashed: Robot) -> None:
     assert rms(found.result, robot.now) < 4 * SIGMA * 1e3
 
 
+@pytest.mark.parametrize(("rows", "undetermined"), [(2, ("base",)), (3, ())])
+def test_a_base_that_the_new_rows_do_not_determine_is_named(
+    monkeypatch, capsys, tmp_path, crashed: Robot, first, rows, undetermined
+) -> None:
+    """Six numbers of a base: two positions leave the rotation about their line free, whatever the noise."""
+    few = crashed.after.take(np.arange(rows))
+    assert ro.use.update(first, few, reset=("base_*",)).undetermined == undetermined
+    ro.store.save_result(first, tmp_path)
+    (tmp_path / "few.csv").write_text(table(few))
+    run(monkeypatch, "update", str(tmp_path), str(tmp_path / "few.csv"), "--reset", "base_*")
+    said = "do not determine the pose of base: measure at least three configurations" in capsys.readouterr().out
+    assert said == bool(undetermined)
+
+
 def test_gear_ratios_can_be_reset() -> None:
     """Their unit is ppm: no dimension needs a unit of SI in its names."""
     problem = ro.load("joints").problem
