@@ -13,6 +13,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError, pick
@@ -155,7 +156,7 @@ def export_files(
     corrected: list[tuple[str | Path | None, Callable[[Path, Path], Any]]] = [
         (urdf, partial(_write_urdf, result, marker, robot, **frames)),
         (ur_kinematics, partial(_write_ur_kinematics, result, robot, marker)),
-        (ur_calibration, partial(_write_ur_calibration, result, robot)),
+        (ur_calibration, partial(_write_ur_calibration, result, robot, marker)),
         (camera_info, partial(_write_camera, result)),
     ]
     made: list[tuple[str | Path | None, Callable[[Path], Any]]] = [
@@ -399,32 +400,49 @@ def _write_tree(result: Calibration, of: Mapping[str, float], source: str | Path
 
 
 def _write_ur_kinematics(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
-    arm = identified(result, marker, robot).robot
-    arm, notes = _on_base(arm, result.problem.arms[robot], read_ur_kinematics(source).robot, target)
+    nominal = result.problem.arms[robot]
+    arm, notes = _on_base(identified(result, marker, robot), nominal, read_ur_kinematics(source).robot, target)
     notes.append("The ROS driver reads these origins; the controller keeps its own kinematics, and the hash stays.")
-    return notes + write_ur_kinematics(source, arm, target)
+    return [*notes, _of_controller(arm), *write_ur_kinematics(source, arm.robot, target)]
 
 
-def _write_ur_calibration(result: Calibration, robot: str, source: Path, target: Path) -> list[str]:
+def _write_ur_calibration(result: Calibration, robot: str, marker: str | None, source: Path, target: Path) -> list[str]:
     """Write a ``calibration.conf``, without alpha1 and a1, which locate the controller's Base."""
     nominal = result.problem.arms[robot]
     if np.abs(nominal.mdh[0, :2]).max() > 0:
         raise InputError("robot", "alpha1 or a1 that are not zero", "a ready robot of Universal Robots")
     catalogued = _catalogued(nominal)
-    arm, notes = _on_base(identified(result, robot=robot).robot, nominal, catalogued, target)
-    mdh = arm.mdh.copy()
+    arm, notes = _on_base(identified(result, marker, robot), nominal, catalogued, target)
+    mdh = arm.robot.mdh.copy()
+    axis = numeric_link(*mdh[0, :2])
     mdh[0, :2] = 0.0
-    notes += write_ur_calibration(source, replace(arm, mdh=mdh), catalogued, target)
+    notes += write_ur_calibration(source, replace(arm.robot, mdh=mdh), catalogued, target)
     if b"joint_checksum" in read_bytes(source):
         notes.append(
             "joint_checksum is copied from the source: its algorithm is not published, so a controller may refuse "
             "the file. Keep the original."
         )
-    if not np.array_equal(mdh, arm.mdh):
+    if not np.array_equal(mdh, arm.robot.mdh):
         notes.append(
             "The tilt and offset of axis 1 (alpha1, a1) are left out: the Base of calibration.conf is on axis 1."
         )
-    return notes
+    return [*notes, _of_controller(replace(arm, base=frame_numbers(numeric_frame(arm.base) @ axis)))]
+
+
+def _of_controller(arm: RobotSetup) -> str:
+    """Return the TCP and the Base that belong to a robot in files of Universal Robots, as PolyScope states poses."""
+    half = np.pi if (arm.robot.mdh[2:4, 1] > 0).all() else 0.0  # from ROS's base_link to Base
+    poses = numeric_frame(arm.tool), numeric_frame(arm.base) @ numeric_link(theta=half)
+    texts = []
+    for T in poses:
+        lengths = (f"{name} {1e3 * value:z.3f}" for name, value in zip("XYZ", T[:3, 3], strict=True))
+        vector = Rotation.from_matrix(T[:3, :3]).as_rotvec()
+        angles = (f"{name} {value:z.5f}" for name, value in zip(("RX", "RY", "RZ"), vector, strict=True))
+        texts.append(f"{' '.join(lengths)} mm, {' '.join(angles)} rad")
+    return (
+        f"TCP to enter in PolyScope for the reflector (rotation vector, from the tool flange): {texts[0]}. "
+        f"The controller's Base in the instrument's frame (rotation vector): {texts[1]}."
+    )
 
 
 def _catalogued(robot: Robot) -> Robot:
@@ -440,7 +458,7 @@ def _catalogued(robot: Robot) -> Robot:
     return ready[int(np.argmin(apart))]
 
 
-def _on_base(arm: Robot, nominal: Robot, of_file: Robot, file: Path) -> tuple[Robot, list[str]]:
+def _on_base(arm: RobotSetup, nominal: Robot, of_file: Robot, file: Path) -> tuple[RobotSetup, list[str]]:
     """Return an identified robot with its base where a file has it on axis 1, and a sentence if that was elsewhere.
 
     A URDF may begin with the table that the robot stands on: theta1 and d1 of the nominal robot count from there.
@@ -449,10 +467,13 @@ def _on_base(arm: Robot, nominal: Robot, of_file: Robot, file: Path) -> tuple[Ro
     theta, d = np.where(np.abs(away) > ANOTHER_MODEL, away, 0.0)
     if not (theta or d):
         return arm, []
-    mdh = arm.mdh.copy()
+    mdh = arm.robot.mdh.copy()
+    axis = numeric_link(*mdh[0, :2])
+    base = numeric_frame(arm.base) @ axis @ numeric_link(theta=theta, d=d) @ np.linalg.inv(axis)
     mdh[0, 2:4] -= theta, d
     apart = f"{1e3 * d:z.3f} mm along axis 1 and {np.degrees(theta):z.5f} deg about it"
-    return replace(arm, mdh=mdh), [f"{file.name}: its base is {apart} from the base of the calibration's DH table."]
+    moved = replace(arm, robot=replace(arm.robot, mdh=mdh), base=frame_numbers(base))
+    return moved, [f"{file.name}: its base is {apart} from the base of the calibration's DH table."]
 
 
 def _write_camera(result: Calibration, source: Path, target: Path) -> None:

@@ -1,0 +1,60 @@
+"""What belongs to an exported robot besides its file: tool and base, as the one who enters them has them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import rpim_opt as ro
+from rpim_opt.basics.arrays import Array
+from tests.robot.test_exchange import CONF, UR10, YAML_PLAIN, configurations, reach, yaml_kinematics
+from tests.simulate import simulated
+
+
+def poses(text: str) -> list[Array]:
+    """Return the frames (4, 4) that a text states as PolyScope does: mm, and a rotation vector in rad."""
+    number = r"(-?[\d.]+)"
+    frames = []
+    for six in re.findall(rf"X {number} Y {number} Z {number} mm, RX {number} RY {number} RZ {number} rad", text):
+        T = np.eye(4)
+        T[:3, 3] = 1e-3 * np.array(six[:3], dtype=float)
+        T[:3, :3] = Rotation.from_rotvec(np.array(six[3:], dtype=float)).as_matrix()
+        frames.append(T)
+    return frames
+
+
+@pytest.mark.parametrize("ros", [False, True])
+@pytest.mark.parametrize("file", ["calibration.conf", "kinematics.yaml"])
+def test_files_of_universal_robots_state_the_tcp_and_the_base_that_belong_to_them(
+    tmp_path: Path, file: str, ros: bool
+) -> None:
+    """File, TCP and Base together are the calibrated robot, whichever base and table frame it was calibrated with."""
+    path, target = tmp_path / file, tmp_path / f"new_{file}"
+    path.write_text(CONF if file.endswith("conf") else YAML_PLAIN)
+    nominal = UR10 if file.endswith("conf") else ro.robot.read_ur_kinematics(path).robot
+    standing = nominal.mdh.copy()
+    if ros:  # base_link, half a turn from the controller's Base
+        standing *= [-1.0, -1.0, 1.0, 1.0, -1.0]
+        standing[-1, 2] += np.pi
+    else:  # on a table
+        standing[0, 2:4] += 0.3, 0.77
+    own = ("alpha[1456]", "a1", "d4", "a[34]", "theta[2-6]", "base_*", "tool_*")
+    problem, truth = simulated(own, robot=replace(nominal, mdh=standing), configurations=40, noise=1e-5)
+    result = replace(ro.calibrate(problem, "tikhonov", 1.0), x=truth)
+    options = {"ur_calibration" if file.endswith("conf") else "ur_kinematics": path}
+    ro.use.export_files(result, target, **options, despite_verdict=True)
+    q = configurations(6)
+    if file.endswith("conf"):
+        flange = reach(ro.robot.read_ur_calibration(target, UR10), q)
+    else:
+        flange = yaml_kinematics(target.read_text(), q)
+    tcp, base = poses(target.read_text())
+    wanted = result.forward(q)
+    missed = base @ flange @ tcp - wanted
+    assert np.abs(missed[:, :3, 3]).max() < 4e-5  # a rotation of 1e-5 rad, as is printed, 2 m away, and micrometres
+    assert np.abs(missed[:, :3, :3]).max() < 4e-5
