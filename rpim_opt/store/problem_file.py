@@ -346,6 +346,10 @@ def read_problem(
     kinds = {**MEASUREMENTS, **{m.name: m for m in measurements}}
     content = read_toml(path)
     table, placed = _checked(content, kinds, path)  # the file itself must be right, whichever variant is requested
+    for where, overlays in {"variant": table.variant, "chain": table.chain}.items():
+        for key, over in overlays.items():
+            if not any(map(is_own, _kinds_in(over))):  # whose code runs where it is requested
+                _checked(_overlay(content, over), kinds, path, f"{where}.{key}")
     if variant is not None:
         content = _overlay(content, pick(table.variant, variant, "variant", path))
         table, placed = _checked(content, kinds, path)
@@ -378,16 +382,22 @@ def read_problem(
     return file
 
 
-def _checked(content: dict[str, Any], kinds: dict[str, Measurement], path: Path) -> tuple[ProblemTable, dict[str, Any]]:
-    """Return the checked table, and apart from it those that place fixtures; types of Python files are added."""
+def _kinds_in(content: Mapping[str, Any]) -> list[Any]:
+    """Return what a table and its observations name as measurement types."""
     observations = content.get("observation", [])
-    for each in (content, *(observations if isinstance(observations, list) else [])):
-        kind = each.get("measurement") if isinstance(each, dict) else None
-        if is_own(kind):
-            kinds[kind] = replace(own_object(kind, Measurement, "key measurement", path), name=kind)
+    tables = (content, *(observations if isinstance(observations, list) else []))
+    return [each.get("measurement") for each in tables if isinstance(each, dict)]
+
+
+def _checked(
+    content: dict[str, Any], kinds: dict[str, Measurement], path: Path, where: str = ""
+) -> tuple[ProblemTable, dict[str, Any]]:
+    """Return the checked table, and apart from it those that place fixtures; types of Python files are added."""
+    for kind in filter(is_own, _kinds_in(content)):
+        kinds[kind] = replace(own_object(kind, Measurement, "key measurement", path), name=kind)
     fixtures = {name.partition("_")[0] for kind in kinds.values() for name in kind.parameters}
     placed = {key: value for key, value in content.items() if key in fixtures and isinstance(value, dict)}
-    return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path), placed
+    return validate(ProblemTable, {k: v for k, v in content.items() if k not in placed}, path, where), placed
 
 
 def _arm(table: ProblemTable, path: Path, model: KinematicModel | None) -> RobotSetup:

@@ -224,7 +224,11 @@ def run_study(
 
 
 def _run(path: Path, case: Mapping[str, Any]) -> Row:
-    return load_study(path).run(**case)
+    row = load_study(path).run(**case)
+    if not isinstance(row, dict):
+        accepted = 'a dict of figures by name, as in return {"error_mm": 0.03}; further rows are further cases'
+        raise InputError("run of the study", type(row).__name__, accepted, path)
+    return row
 
 
 def write(folder: Path, question: str, report: Report, made: str, replicates: Mapping[str, bytes]) -> None:

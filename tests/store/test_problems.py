@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import os
 import platform
+import re
 import shutil
 import subprocess
 import sys
@@ -341,3 +342,17 @@ def test_what_is_no_problem_is_refused() -> None:
     data: Any = ro.load("position").problem.data
     with pytest.raises(ro.InputError, match="problem: found a Dataset, accepted: a problem, what `load` returns, or"):
         ro.calibrate(data)
+
+
+@pytest.mark.parametrize(
+    ("stated", "key", "nearest"),
+    [('formulaton = "bounded"', "key variant.mine: found unknown key 'formulaton'", "formulation"),
+     ("[variant.mine.prior]\ntail = 4.0", "key variant.mine.prior: found unknown key 'tail'", "tails")],
+)  # fmt: skip
+def test_a_misspelt_key_of_a_variant_is_refused_before_anybody_requests_it(tmp_path, stated, key, nearest) -> None:
+    folder = Path(shutil.copytree(problems_folder() / "paper_arm", tmp_path / "arm"))
+    file = folder / "problem.toml"
+    file.write_text(f"{file.read_text()}\n[variant.mine]\n{stated}\n")
+    with pytest.raises(ro.InputError, match=re.escape(f"problem.toml, {key}")) as refused:
+        ro.load(folder)
+    assert f"did you mean {nearest}" in str(refused.value)

@@ -193,6 +193,18 @@ def test_peers_study_adds_errors_to_so_many_rows_as_it_says(tmp_path: Path):
     np.testing.assert_array_equal(points["blunders52"][:, 3:], points["clean52"][:, 3:])
 
 
+def test_a_run_that_returns_no_figures_by_name_is_refused_at_its_first_case(toy, tmp_path: Path) -> None:
+    """It ended in a traceback after the last one."""
+    file = toy() / "toy.py"
+    file.write_text(
+        file.read_text().replace('return {"value": float(', "return [float(").replace("uniform())}", "uniform())]")
+    )
+    studies.load_study.cache_clear()
+    with pytest.raises(ro.InputError, match=r"toy.py, run of the study: found list, accepted: a dict of figures"):
+        run_study("toy", quick=True, out=tmp_path / "out")
+    assert (tmp_path / "log.txt").read_text().splitlines() == ["0"]
+
+
 def test_a_study_prepares_once_before_its_cases(toy, tmp_path: Path):
     folder = toy()
     path = folder / "toy.py"
