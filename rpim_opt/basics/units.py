@@ -75,6 +75,11 @@ def display(dimension: str) -> tuple[str, float]:
     return name, UNITS[name].si if name else 1.0
 
 
+def printed(unit: str) -> str:
+    """Return a unit as texts show it, ``mrad/(N m)`` for ``mrad_per_Nm`` of keys and columns."""
+    return unit.replace("_per_Nm", "/(N m)").replace("_per_", "/")
+
+
 def joint_columns(dimensions: Iterable[str]) -> dict[str, float]:
     """Return the columns for writing joint values, and the size of their units in SI."""
     units = (display(dimension) for dimension in dimensions)

@@ -17,7 +17,7 @@ from rpim_opt.basics.arrays import Array, statistics
 from rpim_opt.basics.exceptions import InputError, NoSolutionFound
 from rpim_opt.basics.files import write_text
 from rpim_opt.basics.text import percent
-from rpim_opt.basics.units import joint_columns
+from rpim_opt.basics.units import joint_columns, printed
 from rpim_opt.calibration import words
 from rpim_opt.calibration.acceptance import Acceptance, Workspace, accept, inconclusive, measured_workspace
 from rpim_opt.calibration.held_out import coverage_text, headline_errors, held_out_errors, rows_used
@@ -34,9 +34,10 @@ from rpim_opt.problem.workspace import in_base
 from rpim_opt.report import plot, summary
 from rpim_opt.report.page import Block, Figure, Table, figure, render
 from rpim_opt.report.summary import mm
+from rpim_opt.robot.parameters import own_name
 from rpim_opt.store.problem_file import FIELDS
 from rpim_opt.store.result_file import definition
-from rpim_opt.use.export import beyond_geometry
+from rpim_opt.use.export import FLANGE, beyond_geometry
 from rpim_opt.use.sessions import in_session, session_notes
 from rpim_opt.use.validation import Validation
 
@@ -308,10 +309,12 @@ def _parameters(content: Content) -> Iterator[Block]:
         edge = ", at its bound" if bound["parameter"] in at_bound else ""
         expanded = "" if bound["U"] is None else f"±{bound['U']:.4f}"
         allowed = "" if bound["tolerance"] is None else f"±{bound['tolerance']:.4g}"
-        rows.append([f"{name} [{unit}]{edge}", *figures, expanded, allowed][:columns])
+        rows.append([f"{name} [{printed(unit)}]{edge}", *figures, expanded, allowed][:columns])
     yield "text", words.weight_lines(result)
     files = "Exported files hold the geometry of a separate fit without model extensions, with other values than these."
-    yield "text", [note, *words.turned_frames(result), *([files] if _beyond_geometry(result) else [])]
+    tool = f"tool_x ... tool_rz: pose of the reflector in {FLANGE}."
+    tools = [tool] * any(own_name(name).startswith("tool_") for name in free.names)
+    yield "text", [note, *tools, *words.turned_frames(result), *([files] if _beyond_geometry(result) else [])]
     count = Counter(np.array(own.dimensions)[~own.of_frames].tolist())
     drawn = []
     for dimension in ("length", "angle"):

@@ -43,6 +43,7 @@ from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
 OF_BYTES = "surrogateescape"  # files of other tools keep their encoding
 ANOTHER_MODEL = 0.01  # lengths of a robot that are off its model's by more [m] are another model's, d1 another base's
+FLANGE = "the flange frame (after the last joint; alpha and a in the last row of a DH sheet come behind it)"
 CONVENTION = {  # what is said of a table in a convention
     "modified": "modified DH (Craig), Rot(x, alpha) Trans(x, a) Rot(z, theta) Trans(z, d) Rot(y, beta). For the "
     "standard convention (Paul) write a .csv with --dh standard",
@@ -282,7 +283,7 @@ def _write_table(arm: RobotSetup, dh: str, target: Path) -> list[str]:
     if convention == "standard" and (alpha or a):
         base = frame_numbers(numeric_frame(base) @ numeric_link(alpha, a))
         inside = f" Its base contains alpha1 = {1e3 * alpha:.4g} mrad and a1 = {1e3 * a:.4g} mm, which place axis 1."
-    ends = f"base {placed(base)} in the instrument's frame, reflector {placed(arm.tool)} in the flange frame"
+    ends = f"base {placed(base)} in the instrument's frame, reflector {placed(arm.tool)} in {FLANGE}"
     return [f"{target.name}: {CONVENTION[convention]}.{inside}", f"{target.name} lacks base and tool: {ends}."]
 
 

@@ -13,7 +13,7 @@ from scipy.special import fdtrc, logsumexp
 from rpim_opt.basics.arrays import Array, rms, statistics
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.basics.text import counted, joined, table, three_digits
-from rpim_opt.basics.units import display
+from rpim_opt.basics.units import display, printed
 from rpim_opt.bayes.prior import Prior
 from rpim_opt.bayes.prior_terms import default_widths
 from rpim_opt.calibration.held_out import displacement, held_out_errors, registered
@@ -88,7 +88,9 @@ class Moved(NamedTuple):
 
     def __str__(self) -> str:
         figures = self.content()
-        return f"{self.name} {figures['change']:+.4g} {figures['unit']} (standard deviation {figures['std']:.2g})"
+        return (
+            f"{self.name} {figures['change']:+.4g} {printed(figures['unit'])} (standard deviation {figures['std']:.2g})"
+        )
 
     def content(self) -> dict[str, Any]:
         """Return it as a document [mm, deg]."""

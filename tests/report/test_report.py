@@ -119,6 +119,22 @@ def test_fewer_equations_than_parameters_stand_in_the_headline() -> None:
     assert "equations" not in headline(ro.calibrate(problem))
 
 
+def test_sections_stand_in_the_order_of_who_signs(arm_page) -> None:
+    names = ["Accuracy and uncertainty", "Parameters", "Diagnostics", "Provenance", "Appendix: regularization"]
+    page = Reader(arm_page).words
+    places = [page.rindex(f"\n{name}\n") if f"\n{name}\n" in page else page.rindex(name) for name in names]
+    assert places == sorted(places)
+
+
+def test_parameters_state_their_flange_frame_and_units_as_they_are_written() -> None:
+    own = ("theta[2-6]", "compliance[23]", "tool_[xyz]")
+    problem, _ = simulated(own, 30, 5e-5, 2)
+    words = Reader(page(ro.calibrate(problem, ro.tikhonov, 1.0))).words
+    assert "compliance2 [mrad/(N m)]" in words
+    assert "mrad_per_Nm" not in words
+    assert words.count("alpha and a in the last row of a DH sheet come behind it") == 1
+
+
 def test_one_file_that_loads_nothing(arm_page) -> None:
     assert len(arm_page) < 1_500_000
     read = Reader(arm_page)
