@@ -18,7 +18,7 @@ from rpim_opt.basics.text import joined, listed, table
 from rpim_opt.basics.threads import on_all_cores, one_blas_thread
 from rpim_opt.basics.units import display, joint_columns
 from rpim_opt.calibration.acceptance import accept
-from rpim_opt.calibration.covariance import noise_covariances, position_noise
+from rpim_opt.calibration.covariance import Spread, noise_covariances, position_noise
 from rpim_opt.calibration.diagnosis import Outside
 from rpim_opt.calibration.result import Calibration
 from rpim_opt.data.dataset import Dataset
@@ -33,7 +33,7 @@ from rpim_opt.robot import kinematics
 from rpim_opt.robot.chain import placed
 from rpim_opt.robot.kinematics import FRAME, call_rows, chain, forward_kinematics, numeric_frame, product
 from rpim_opt.robot.mdh import Robot
-from rpim_opt.robot.parameters import Parameters, reflectors, tool_prefix
+from rpim_opt.robot.parameters import reflectors, tool_prefix
 from rpim_opt.use.reading import Targets
 from rpim_opt.use.sessions import base_frame, in_session, session_notes
 
@@ -337,7 +337,7 @@ def _corrected(cell: _Cell, targets: Targets, largest: float, orientation: bool 
     if orientation is None and cell.kind is pose:
         turns = [(cell.norms(each.before)[1], cell.uncertainty(each.commands, each.targets)[1]) for each in parts]
         turn, of_turn = (1e3 * np.sqrt(np.mean(np.concatenate(each) ** 2)) for each in zip(*turns, strict=True))
-        if turn < of_turn < np.inf or cell.covariance is None:
+        if turn < of_turn < np.inf or cell.spread is None:
             known = "its uncertainty is unknown"
             if np.isfinite(of_turn):
                 known = f"its correction, {turn:.2f} mrad, would be smaller than its standard uncertainty, "
@@ -414,45 +414,6 @@ def _rows(name: str, stated: Array | None, N: int, columns: tuple[int, ...]) -> 
 # --- the controller's robot beside the identified one ------------------------------------------------------
 
 
-def _tooled(
-    result: Calibration, robot: str, tool: Sequence[float] | Array | None, marker: str
-) -> tuple[Parameters, Array, Array | None, str, str]:
-    """Return a robot's parameters with the tool, deviations (p,), their covariance, reflector, and the point moved."""
-    whole = result.problem.parameters
-    places = whole.places_of(robot)
-    p = whole.of_robot(robot)
-    every = np.zeros(len(whole))
-    every[whole.identified] = result.x
-    x = every[places]
-    known = reflectors(p.names)
-    if tool is not None:
-        marker = known[0]
-    elif marker not in known:
-        found = f"'{marker}'" if marker else "none"
-        named = choices(marker, [m or "no marker" for m in known])
-        raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
-    at = [p.names.index(tool_prefix(marker) + c) for c in FRAME]
-    identified = p.identified.copy()
-    nominal = p.nominal.copy()
-    if tool is None:
-        nominal[at] = p.values(x)[at]
-        where = f"{'as identified, ' if identified[at].any() else ''}at {placed(nominal[at])} in the flange frame"
-        point = f"Target point: the reflector, {where}; for the controller's TCP state --tool."
-    else:
-        frame = np.asarray(tool, dtype=float)
-        if frame.shape != (6,) or not np.isfinite(frame).all():
-            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
-        nominal[at] = frame
-        identified[at] = False
-        point = f"Target point: the stated tool, at {placed(frame)} in the flange frame."
-    x[at] = 0.0
-    C = result.known_covariance
-    if C is not None:
-        own = whole.free.places_of(robot)[identified[p.identified]]
-        C = C[np.ix_(own, own)]
-    return replace(p, nominal=nominal, identified=identified), x, C, marker, point
-
-
 class _Begun(NamedTuple):
     """Commands of the controller for some targets before they are corrected, and where they bring both robots."""
 
@@ -477,7 +438,8 @@ class _Cell(NamedTuple):
     loads: Loads
     problem: CalibrationProblem  # with the robot's data
     x: Array  # deviations (n,) of its identified parameters
-    covariance: Array | None  # of x
+    own: np.ndarray  # (n,) their places among all identified ones
+    spread: Spread | None  # what is known of these
     marker: str
     noise: Array  # covariance (k, k) [SI] of a reading
     level: float  # the noise's variance over that
@@ -496,7 +458,32 @@ class _Cell(NamedTuple):
         torques: bool,
     ) -> _Cell:
         """Set up both robots with their tool; the second moved by the base's deviation if that counts."""
-        p, x, covariance, marker, point = _tooled(result, which, tool, marker)
+        whole = result.problem.parameters
+        p = whole.of_robot(which)
+        every = np.zeros(len(whole))
+        every[whole.identified] = result.x
+        x = every[whole.places_of(which)]
+        known = reflectors(p.names)
+        if tool is not None:
+            marker = known[0]
+        elif marker not in known:
+            found = f"'{marker}'" if marker else "none"
+            named = choices(marker, [m or "no marker" for m in known])
+            raise InputError("--marker", found, f"{named}, or a controller's TCP by --tool")
+        prefix = tool_prefix(marker)
+        at = [p.names.index(prefix + c) for c in FRAME]
+        place = p.values(x)[at] if tool is None else np.asarray(tool, dtype=float)
+        if place.shape != (6,) or not np.isfinite(place).all():
+            raise InputError("tool", f"{tool}", "x, y, z [m], roll, pitch, yaw [rad]")
+        point = f"Target point: the stated tool, at {placed(place)} in the flange frame."
+        if tool is None:
+            how = "as identified, " if p.identified[at].any() else ""
+            point = f"Target point: the reflector, {how}at {placed(place)} in the flange frame"
+            point += "; for the controller's TCP state --tool."
+        p = replace(p, nominal=p.nominal.copy(), identified=p.identified.copy())
+        p.nominal[at], x[at] = place, 0.0
+        p.identified[at] &= tool is None
+        own = whole.free.places_of(which)[p.identified[whole.identified[whole.places_of(which)]]]
         values = p.values(x)
         nominal, identified = (dict(zip(p.names, of.tolist(), strict=True)) for of in (p.nominal, values))
         stated = numeric_frame([nominal[f"base_{c}"] for c in FRAME])
@@ -511,11 +498,10 @@ class _Cell(NamedTuple):
         noise[:3, :3] += position_noise(measured)
         require_same_torques(robot, p, measured_torques(problem.data), torques)
         loads = loads_on(robot, p, problem.data, torques)
-        prefix = tool_prefix(marker)
         return cls(
             robot, kind, Arm.of(robot, nominal, nominal, prefix, np.eye(4), kind, loads),
             Arm.of(robot, identified, nominal, prefix, moved, kind, loads), loads, problem, x[p.identified],
-            covariance, marker, noise, result.variance_factor, point,
+            own, None if result.no_intervals else result.spread, marker, noise, result.variance_factor, point,
         )  # fmt: skip
 
     def payloads(self, stated: float | Array | None, count: int, weighed: bool) -> Array | None:
@@ -575,18 +561,17 @@ class _Cell(NamedTuple):
 
     def uncertainty(self, q: Array, targets: Targets) -> tuple[Array, Array]:
         """Return sqrt(tr (J C J' + R)) (N,) of position [m] and orientation [rad] reached at q, under their loads."""
-        k = len(self.kind.components)
-        if self.covariance is None:
-            return self.norms(np.full((len(q), k), np.inf))
+        N, k = len(q), len(self.kind.components)
+        if self.spread is None:
+            return self.norms(np.full((N, k), np.inf))
         loads = targets.torque, targets.payload
         problem = self.problem.measuring(q, self.kind, self.marker, *loads, covariance=self.noise)
-        J = problem.jacobian(self.x)
-        known = np.isfinite(np.diag(self.covariance))
-        C = np.where(np.outer(known, known), self.covariance, 0.0)
-        variance = np.sum((J @ C) * J, axis=1).reshape(len(q), k)
+        J = np.zeros((N, k, len(self.spread.z)))
+        J[:, :, self.own] = problem.jacobian(self.x).reshape(N, k, -1)
+        position_and_turn = (self.spread.of_positions(J[:, i : i + 3]) for i in range(0, k, 3))
+        variance = np.hstack([np.einsum("nkk->nk", C) for C in position_and_turn])
         variance += np.einsum("nkk->nk", noise_covariances(problem, self.level).robot[0])
-        variance[(np.abs(J[:, ~known]) > 0).any(axis=1).reshape(len(q), k)] = np.inf
-        return self.norms(np.sqrt(np.maximum(variance, 0.0)))
+        return self.norms(np.sqrt(variance))
 
     def _commands(self, poses: Array, q: Array | None, load: Array) -> Array:
         """Return joint values (N, dof) of the controller's robot for poses: near q, or near a known configuration."""
