@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 import rpim_opt as ro
-from rpim_opt.data.measurements.cable import anchor_start
-from rpim_opt.data.measurements.plane import plane_start
-from rpim_opt.data.measurements.sphere import sphere_start
+from rpim_opt.data.measurements.distance import anchor_start, plane_start, sphere_start
 from rpim_opt.robot.kinematics import numeric_frame
 
 POINTS = np.random.default_rng(3).normal([1.0, -2.0, 0.5], 0.3, size=(12, 3))

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 import rpim_opt as ro
 from rpim_opt.data.measurements.camera import on_board
 from rpim_opt.data.measurements.contact import KnownAngle, KnownDistance, touches
-from rpim_opt.data.measurements.plane import plane
+from rpim_opt.data.measurements.distance import plane
 from rpim_opt.data.measurements.pose import pose
 from rpim_opt.data.measurements.position import position
 from rpim_opt.data.tables.reading import declared_noise

@@ -1,1 +1,1 @@
-"""Measurement types: one self-contained module per type, found by `registry`."""
+"""Measurement types: self-contained modules, found by `registry`."""

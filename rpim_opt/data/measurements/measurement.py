@@ -1,6 +1,6 @@
 """Measurement types: columns and units, symbolic model, start values, noise, and wording.
 
-Every other module of this folder is one type, which `registry` finds by its ``TYPES``.
+Every other module of this folder has one or several that are alike, which `registry` finds by its ``TYPES``.
 """
 
 from __future__ import annotations
@@ -11,8 +11,6 @@ from dataclasses import dataclass, field
 from importlib import import_module
 from types import MappingProxyType
 from typing import Any, NamedTuple
-
-import numpy as np
 
 from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
@@ -150,11 +148,3 @@ def of_fixture(parameter: str, fixture: str) -> str:
 def origin(T: Any) -> Any:
     """Return the position (3, 1) of a transform (4, 4)."""
     return T[:3, 3]
-
-
-def solve(A: Array, b: Array, what: str) -> Array:
-    """Return the least-squares solution of start values; refuse a degenerate system."""
-    x, _, rank, s = np.linalg.lstsq(A, b, rcond=None)
-    if rank < A.shape[1] or s[-1] < 1e-7 * s[0]:
-        raise InputError("data", f"{len(A)} points that do not determine {what}", "more, or better spread, points")
-    return np.asarray(x, dtype=float)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -25,6 +25,7 @@ from rpim_opt.robot.mdh import Robot
 
 TIME = re.compile(r"(?i)[%#]?(?:.*[._/ ])?(time ?stamp|date ?time|time|stamp|(uhr)?zeit|zeitstempel|date|datum|t)"
                   r"(\W*(utc|gmt|local)\W*)?")  # fmt: skip
+NUMBERED = re.compile(r"(\D*)0*(\d+)\W?")
 GERMAN = re.compile(r"(\d\d)\.(\d\d)\.(\d{4})[ T]*")
 UNIT = re.compile(r"(.+?)[\s_]*[\[(/]?\s*\b(s|sec|secs|seconds|ms|us|µs|ns|nsec|nsecs)\b\s*[\])]?", re.IGNORECASE)
 SECONDS = {"s": 1.0, "sec": 1.0, "secs": 1.0, "seconds": 1.0, "ms": 1e-3, "us": 1e-6, "μs": 1e-6, "ns": 1e-9,
@@ -164,7 +165,7 @@ def _by_key(joints: Understood, values: Understood, key: str) -> Match:
 
 def _key(joints: Understood, values: Understood, key: str) -> Key:
     """Return the key as stated, else the label, the only column that both have, or columns of the same values."""
-    pairs = _pairs(joints, values, key, _keyed)
+    pairs = _pairs(joints, values, key)
     telling = [pair for pair in pairs if not counts_rows(pair.left)]
     pair = _only(telling or pairs)
     if key == "row":
@@ -175,7 +176,7 @@ def _key(joints: Understood, values: Understood, key: str) -> Key:
     if not chosen and stated in common:
         chosen = _keyed(f"column '{stated}'", (stated,), _normal(joints.raw[stated]), _normal(values.raw[stated]))
     if not chosen and not pairs:  # names that differ, with the same numbers
-        pair = _only(_pairs(joints, values, key, _by_numbers))
+        pair = _only(_pairs(joints, values, key, numbers=True))
     if chosen or pair:
         return chosen or pair
     found = f"{', '.join(common) or 'no column'} in both {joints.file} and {values.file}"
@@ -201,12 +202,10 @@ def _labels(joints: Understood, values: Understood, others_tell: bool) -> Key | 
     return next((each for each in keys if {*labels} & {*each.right}), None)
 
 
-def _pairs(
-    joints: Understood, values: Understood, key: str, keyed: Callable[[str, tuple[str, ...], list[str], list[str]], Key]
-) -> list[Key]:
-    """Return the keys that two columns make whose values are nearly the same."""
+def _pairs(joints: Understood, values: Understood, key: str, numbers: bool = False) -> list[Key]:
+    """Return the keys that two columns make whose values, or the ``numbers`` in these, are nearly the same."""
     keys = (
-        keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others)
+        _keyed(f"{name} = {other}", (name.lower(), other.lower()), own, others, numbers)
         for (name, own), (other, others) in product(_naming(joints).items(), _naming(values).items())
         if key in ("", "row") or key.lower() in (name.lower(), other.lower())
     )
@@ -214,32 +213,24 @@ def _pairs(
     return [each for each, own, others in sides if len(own & others) >= max(SAME * min(len(own), len(others)), 1)]
 
 
-def _by_numbers(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
-    """Return a key of names that are one word and a number on both sides, ``XP1`` and ``P1``, or a number alone."""
-    sides = [[re.fullmatch(r"(\D*)(\d+)\W?", name) for name in names] for names in (left, right)]
-    if not all(all(matches) and len({match[1] for match in matches if match}) == 1 for matches in sides):
-        return Key(how, columns, [], [])
-    own, others = ([str(int(match[2])) for match in matches if match] for matches in sides)
-    example = next(iter(right), "")
-    named = dict(zip(own, left, strict=True))
-    named = [named.get(number, name) for number, name in zip(others, right, strict=True)]
-    return Key(f"{how} ('{example}' as '{next(iter(named), '')}')", columns, left, named)
+def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str], numbers: bool = False) -> Key:
+    """Return a key; measured names that differ by case and leading zeros alone are spelled as those with joints.
 
+    Of ``numbers`` names may differ that are one word and a number on both sides, ``XP1`` and ``P1``, or a number alone.
+    """
 
-def _keyed(how: str, columns: tuple[str, ...], left: list[str], right: list[str]) -> Key:
-    """Return a key; measured names that differ by case and leading zeros alone are spelled as those with joints."""
-    if not all(any(map(str.isalpha, "".join(names[:1]))) for names in (left, right)):
-        return Key(how, columns, left, right)  # numbers and dates
-    spelling = {_bare(name): name for name in left}
-    if len(spelling) < len({*left}) or len({*map(_bare, right)}) < len({*right}):
-        return Key(how, columns, left, right)
-    named = [spelling.get(_bare(name), name) for name in right]
+    def bare(name: str) -> str:
+        return NUMBERED.sub(r"\2", name) if numbers else re.sub(r"(?<![\d.,])0+(?=\d)", "", name.casefold())
+
+    for names in (left, right):
+        words = {NUMBERED.sub(r"\1", name) if NUMBERED.fullmatch(name) else None for name in names}
+        spelled = len(words) == 1 and None not in words if numbers else any(map(str.isalpha, "".join(names[:1])))
+        if not spelled or len({*map(bare, names)}) < len({*names}):  # other numbers and dates
+            return Key(how, columns, left, right)
+    spelling = {bare(name): name for name in left}
+    named = [spelling.get(bare(name), name) for name in right]
     examples = (f" ('{old}' as '{new}')" for old, new in zip(right, named, strict=True) if old != new)
     return Key(how + next(examples, ""), columns, left, named)
-
-
-def _bare(name: str) -> str:
-    return re.sub(r"(?<![\d.,])0+(?=\d)", "", name.casefold())
 
 
 def _naming(table: Understood) -> dict[str, list[str]]:
