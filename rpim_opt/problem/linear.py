@@ -69,8 +69,19 @@ class LinearModel(Brief):
 
     @cached_property
     def triangle(self) -> Array:
-        """QR factor R (n+1, n+1) of [A b], upper triangular: |A z - b| = |R [z; -1]| for every z."""
-        return triangle_of(self.A, self.b)
+        """QR factor R (n+1, n+1) of [A b], upper triangular: |A z - b| = |R [z; -1]| for every z.
+
+        It is reduced by blocks of rows, which depend on the shape of A alone.
+        """
+        columns = self.A.shape[1] + 1
+        most = max(8 * columns, BLOCK // columns)
+
+        def block(start: int) -> Array:
+            part = slice(start, start + most)
+            return reduced_rows(np.column_stack([self.A[part], self.b[part]]))
+
+        blocks = on_all_cores(block, range(0, max(len(self.b), 1), most))
+        return reduce(lambda R, other: reduced_rows(other, R), blocks)
 
     @cached_property
     def members(self) -> tuple[np.ndarray, np.ndarray]:
@@ -126,18 +137,6 @@ def reduced_rows(rows: Array, R: Array | None = None) -> Array:
     stacked[len(above) : len(above) + len(rows)] = rows
     factor: Array = GEQRT(min(n, WIDE if n >= MANY else NARROW), stacked, overwrite_a=True)[0][:n]
     return np.triu(factor)
-
-
-def triangle_of(A: Array, b: Array) -> Array:
-    """Return the QR factor R (n+1, n+1) of [A b] by blocks of rows, which depend on the shape of A alone."""
-    columns = A.shape[1] + 1
-    most = max(8 * columns, BLOCK // columns)
-
-    def block(start: int) -> Array:
-        part = slice(start, start + most)
-        return reduced_rows(np.column_stack([A[part], b[part]]))
-
-    return reduce(lambda R, other: reduced_rows(other, R), on_all_cores(block, range(0, max(len(b), 1), most)))
 
 
 def reduced_models(models: Iterable[LinearModel]) -> LinearModel:

@@ -137,45 +137,39 @@ def _readings(points: Points) -> list[Misreading]:
 
 def _of_joints(robot: Robot) -> Iterator[Misreading]:
     """Yield readings with other joint values: units, signs, orders, couplings; zeros are fitted."""
-
-    def of(what: str, remedy: str, M: Array) -> Misreading:
-        return Misreading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
-
     turning = np.array(robot.joint_dimensions) == "angle"
     eye = np.eye(robot.dof)
-    remedy = "accumulate them row by row"
-    yield Misreading(
-        "joint values read as absolute, not as increments", remedy, lambda of: replace(of, q=np.cumsum(of.q, axis=0))
-    )
+    what = "joint values read as absolute, not as increments"
+    yield Misreading(what, "accumulate them row by row", lambda of: replace(of, q=np.cumsum(of.q, axis=0)))
     for factor, (unit, remedy) in ANGLES.items():
-        yield of(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
+        yield _joints(f"joint values read {unit}", remedy, np.diag(np.where(turning, factor, 1)))
     for (factor, (unit, _)), (i, j) in product(list(ANGLES.items())[:2], combinations(range(robot.dof + 1), 2)):
         if turning[i:j].all() and j - i < robot.dof:  # one joint, or several next to each other
             number, several = [str(k + 1) for k in range(i, j)], "s" * (j - i > 1)
             remedy = f"multiply column{several} {joined([f'q{k}' for k in number])} by {factor:.6g} or name the unit"
             what = f"joint{several} {joined(number)} read {unit}"
-            yield of(what, remedy, eye + (factor - 1) * np.diag(eye[i:j].sum(axis=0)))
+            yield _joints(what, remedy, eye + (factor - 1) * np.diag(eye[i:j].sum(axis=0)))
     if not turning.all():
         for factor, (unit, _) in LENGTHS.items():
             remedy = f"multiply the columns of the linear joints by {factor:g} or name their unit"
-            yield of(f"values of linear joints {unit}", remedy, np.diag(np.where(turning, 1, factor)))
+            yield _joints(f"values of linear joints {unit}", remedy, np.diag(np.where(turning, 1, factor)))
     for i in range(robot.dof):
         flipped = eye - 2 * np.outer(eye[i], eye[i])
         sign = -int(signs(robot.joint_map)[i])
-        yield of(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
+        yield _joints(f"joint {i + 1} reversed", f"write sign = {sign} for joint {i + 1} in robot.toml", flipped)
         remedy = f"check its brake and column q{i + 1}"
-        yield of(f"joint {i + 1} standing still in all rows", remedy, eye - np.outer(eye[i], eye[i]))
+        yield _joints(f"joint {i + 1} standing still in all rows", remedy, eye - np.outer(eye[i], eye[i]))
     for i in range(1, robot.dof - 1):
         remedy = f"put it on the last link, or describe the robot up to joint {i}"
         before = np.diag(np.arange(robot.dof) < i).astype(float)
-        yield of(f"the reflector on the link of joint {i} (later joints do not move it)", remedy, before)
+        yield _joints(f"the reflector on the link of joint {i} (later joints do not move it)", remedy, before)
     for i, j in combinations(range(robot.dof), 2):
         exchanged = eye.copy()
         exchanged[[i, j]] = eye[[j, i]]
         if turning[i] != turning[j]:  # degrees were read as millimetres, and these as degrees
             exchanged *= np.where(turning, DEGREES_PER_MM, 1 / DEGREES_PER_MM)[:, None] ** (eye[i] + eye[j])[:, None]
         remedy = f"exchange the names of the columns q{i + 1} and q{j + 1}"
-        yield of(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
+        yield _joints(f"joints {i + 1} and {j + 1} exchanged", remedy, exchanged)
     for i, j in permutations(np.flatnonzero(turning), 2):
         for factor in COUPLINGS[bool(abs(i - j) == 1)]:
             M = eye.copy()
@@ -183,7 +177,7 @@ def _of_joints(robot: Robot) -> Iterator[Misreading]:
             size = "" if abs(factor) == 1 else f"{abs(factor):g} "
             sum_of = f"q{i + 1} {'plus' if factor > 0 else 'minus'} {size}q{j + 1}"
             what = f"joint {i + 1} coupled to joint {j + 1} ({sum_of})"
-            yield of(what, coupling(robot.joint_map @ M), M)
+            yield _joints(what, coupling(robot.joint_map @ M), M)
 
 
 def signs(joint_map: Array) -> Array:
@@ -198,6 +192,10 @@ def coupling(joint_map: Array) -> str:
     matrix = signs(joint_map)[:, None] * joint_map + 0.0
     rows = ", ".join("[" + ", ".join(f"{v:.6g}" for v in row) + "]" for row in matrix)
     return f"write coupling = [{rows}] in robot.toml"
+
+
+def _joints(what: str, remedy: str, M: Array) -> Misreading:
+    return Misreading(what, remedy, lambda points: replace(points, q=points.q @ M.T))
 
 
 def _of_positions() -> Iterator[Misreading]:
@@ -302,15 +300,15 @@ def _of_poses() -> Iterator[Misreading]:
         yield Misreading(what, f"move their columns one row {back}", partial(_slipped, None, by))
 
 
-def _slipped(joint: int | None, by: int, points: Points) -> Points:
-    """Return points with the values of a joint, or the orientations, of the row that is so many rows later."""
+def _slipped(joints: int | slice | None, by: int, points: Points) -> Points:
+    """Return points with the values of a joint or all, or the orientations, of the row that is so many rows later."""
     q, turns = points.q.copy(), points.turns
-    if joint is not None:
-        q[..., joint] = np.roll(q[..., joint], -by, axis=0)
+    if joints is not None:
+        q[..., joints] = np.roll(q[..., joints], -by, axis=0)
     elif turns is not None:
         turns = np.roll(turns, -by, axis=0)
     rows = np.arange(len(q))
-    return replace(points, q=q, turns=turns).take(rows[:-1] if by > 0 else rows[1:])
+    return replace(points, q=q, turns=turns).take(rows[:-by] if by > 0 else rows[-by:])
 
 
 def _in_one_frame(points: Points) -> Points:
@@ -335,24 +333,26 @@ def _inverted(points: Points) -> Points:
 
 def _of_rows(count: int, dof: int) -> Iterator[Misreading]:
     """Yield readings with joint values of other rows: shifted, one column or all, reversed, in the order of texts."""
-
-    def of(what: str, remedy: str, joints: np.ndarray, values: np.ndarray) -> Misreading:
-        return Misreading(what, remedy, lambda points: replace(points.take(values), q=points.q[joints]))
-
-    rows = np.arange(count)
-    for k in range(1, min(3, count - 6) + 1):
-        by = f"{k} row{'s' * (k > 1)}"
-        remedy = f"move the measured values {by} {{}}, against the joint values"
-        yield of(f"measured values {by} too low in the table", remedy.format("up"), rows[:-k], rows[k:])
-        yield of(f"measured values {by} too high in the table", remedy.format("down"), rows[k:], rows[:-k])
+    for k, (by, low, back) in product(range(1, min(3, count - 6) + 1), SLIPPED):
+        rows = f"{k} row{'s' * (k > 1)}"
+        what = f"measured values {rows} too {low} in the table"
+        remedy = f"move the measured values {rows} {back}, against the joint values"
+        yield Misreading(what, remedy, partial(_slipped, slice(None), -k * by))
     for i, (by, low, back) in product(range(dof), SLIPPED):
         what = f"column q{i + 1} one row too {low} in the table"
         yield Misreading(what, f"move column q{i + 1} one row {back}", partial(_slipped, i, by))
-    yield of("the rows of joint values in the reverse order", "reverse the order of one of the two", rows[::-1], rows)
-    by_text = np.array(sorted(rows, key=lambda i: str(i + 1)))
+    by_text = np.array(sorted(range(count), key=lambda i: str(i + 1)))
     remedy = "join by a column that both have (rpim-opt new --data --data --key)"
-    yield of("measured values sorted as text (1, 10, 11, 2)", remedy, by_text, rows)
-    yield of("joint values sorted as text (1, 10, 11, 2)", remedy, np.argsort(by_text), rows)
+    for what, how, order in (
+        (
+            "the rows of joint values in the reverse order",
+            "reverse the order of one of the two",
+            np.arange(count)[::-1],
+        ),
+        ("measured values sorted as text (1, 10, 11, 2)", remedy, by_text),
+        ("joint values sorted as text (1, 10, 11, 2)", remedy, np.argsort(by_text)),
+    ):
+        yield Misreading(what, how, lambda points, order=order: replace(points, q=points.q[order]))
 
 
 def _factors(points: Points) -> Iterator[Misreading]:
@@ -397,12 +397,8 @@ def _orders(points: Points) -> Iterator[Misreading]:
         moved = (tuple(np.insert(np.delete(joints, i), place, i).tolist()) for i, place in permutations(joints, 2))
         orders = (tuple(joints[::-1]), *moved)
     for columns in orders:  # the columns that hold joints 1, 2, ...
-        names = ", ".join(f"q{columns.index(i) + 1}" for i in range(robot.dof))
-
-        def change(points: Points, columns: tuple[int, ...] = columns) -> Points:
-            return replace(points, q=points.q[..., columns])
-
-        yield Misreading(f"joints in the order {names}", f"name the columns {names}", change)
+        names = ", ".join(f"q{columns.index(i) + 1}" for i in joints)
+        yield _joints(f"joints in the order {names}", f"name the columns {names}", np.eye(robot.dof)[list(columns)])
 
 
 def _other_robots(points: Points) -> Iterator[Misreading]:
@@ -429,12 +425,11 @@ def _other_robots(points: Points) -> Iterator[Misreading]:
         what = f"column {column} one row too {low} in the DH table"
         tables.append((what, f"move column {column} one row {back} in the DH table", slipped))
     others = [(what, remedy, replace(robot, mdh=table)) for what, remedy, table in tables]
-    for name in robots():
-        ready = read_robot(READY / f"{name}.toml")
-        if (ready.joint_types, ready.dof) == (robot.joint_types, robot.dof):
-            others.append((f"the ready robot {name}", f'write robot = "{name}" in problem.toml', ready))
+    ready = {name: read_robot(READY / f"{name}.toml") for name in robots()}
+    others += [(f"the ready robot {name}", f'write robot = "{name}" in problem.toml', of) for name, of in ready.items()]
     for what, remedy, other in others:
-        yield Misreading(what, remedy, lambda points, other=other: replace(points, robot=other))
+        if (other.joint_types, other.dof) == (robot.joint_types, robot.dof):
+            yield Misreading(what, remedy, lambda points, other=other: replace(points, robot=other))
 
 
 # Which of these fits

@@ -84,13 +84,9 @@ class Stack:
 
 def equation_numbers(data: Dataset) -> list[np.ndarray]:
     """Return the numbers (N, k) of the equations of every block's rows."""
-    numbers = []
-    start = 0
-    for block in data.blocks:
-        k = len(block.measurement.components)
-        numbers.append(start + np.arange(k * len(block.row)).reshape(-1, k))
-        start += numbers[-1].size
-    return numbers
+    shapes = [(len(block.row), len(block.measurement.components)) for block in data.blocks]
+    first = np.cumsum([0, *(rows * k for rows, k in shapes)])
+    return [start + np.arange(rows * k).reshape(rows, k) for start, (rows, k) in zip(first, shapes, strict=False)]
 
 
 class Equations(NamedTuple):

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from typing import NamedTuple
 
 import numpy as np
 import scipy
@@ -215,16 +214,8 @@ def rotation_constraints(count: int) -> Array:
     return (C + C.swapaxes(1, 2)) / 2
 
 
-class Moments(NamedTuple):
-    """The relaxation of `relax`: its moment matrix is x x' where rotations are its solution."""
-
-    matrix: Array  # (n, n)
-    multipliers: Array  # (20 k,)
-    rank_ratio: float  # second eigenvalue of the matrix over the first: zero where it is of rank one
-
-
-def relax(Q: Array) -> Moments:
-    """Return the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k), with 20 k + 1 unknowns.
+def relax(Q: Array) -> tuple[Array, Array]:
+    """Return moments (n, n) and multipliers (20 k,) of the relaxation of min x'Q x over x = (1, vec R_1, ..., vec R_k).
 
     ::
 
@@ -233,10 +224,9 @@ def relax(Q: Array) -> Moments:
 
     For rotations the left side of the constraint times x x' is x'Q x - bound >= 0: no rotation has a smaller value. The
     constraint's own multiplier is the moment matrix, which minimizes <Q, M> over all positive semidefinite M with
-    M_00 = 1 and <C_j, M> = 0.
+    M_00 = 1 and <C_j, M> = 0: x x' where rotations are its solution.
     """
     clarabel = import_module("clarabel")
-
     n = len(Q)
     first = np.zeros((1, n, n))
     first[0, 0, 0] = 1.0
@@ -257,8 +247,7 @@ def relax(Q: Array) -> Moments:
     solution = clarabel.DefaultSolver(P, q, A, b, [clarabel.PSDTriangleConeT(n)], settings).solve()
     M = np.zeros((n, n))
     M[rows, columns] = M[columns, rows] = np.array(solution.z) / root
-    eigenvalues = np.linalg.eigvalsh(M)
-    return Moments(M, size * np.array(solution.x)[1:], float(abs(eigenvalues[-2]) / eigenvalues[-1]))
+    return M, size * np.array(solution.x)[1:]
 
 
 @dataclass(frozen=True, eq=False)
@@ -268,7 +257,7 @@ class Smallest:
     rotations: Array
     value: float
     bound: float  # no rotations have less, up to rounding
-    rank_ratio: float  # of the moment matrix
+    rank_ratio: float  # second eigenvalue of the moment matrix over the first: zero where it is of rank one
     information: Array  # (3k, 3k) half the Hessian by turns [1/rad^2]
     steepness: float  # c: every x has at least bound + c |x_other|^2, x_other being what is not along the best
 
@@ -302,10 +291,11 @@ def smallest(L: Array) -> Smallest:
     their value. The bound then does not depend on the solver's accuracy: mu is the smallest eigenvalue.
     """
     Q = L.T @ L
-    moments = relax(Q)
-    lifts = [moments.matrix[:, 0]]  # the mean of the rotations that the moments stand for
-    if moments.rank_ratio > SPREAD:  # and some that are drawn from them
-        eigenvalues, vectors = np.linalg.eigh(moments.matrix)
+    moments, multipliers = relax(Q)
+    eigenvalues, vectors = np.linalg.eigh(moments)
+    rank_ratio = float(abs(eigenvalues[-2]) / eigenvalues[-1])
+    lifts = [moments[:, 0]]  # the mean of the rotations that the moments stand for
+    if rank_ratio > SPREAD:  # and some that are drawn from them
         normal = np.random.default_rng(0).normal(size=(20, len(eigenvalues)))
         lifts += [*(normal * np.sqrt(np.maximum(eigenvalues, 0.0)) @ vectors.T)]
     rounded = [_refined(L, proper(np.copysign(1.0, lift[0]) * lift[1:].reshape(-1, 3, 3))) for lift in lifts]
@@ -313,13 +303,13 @@ def smallest(L: Array) -> Smallest:
     value = _value(L, best)
     x = lifted(best)
     C = rotation_constraints(len(best))
-    S = Q - np.tensordot(moments.multipliers, C, axes=1)
+    S = Q - np.tensordot(multipliers, C, axes=1)
     S[0, 0] -= value
     moves = np.linalg.lstsq((C @ x).T, S @ x, rcond=1e-12)[0]
     eigenvalues = np.linalg.eigvalsh(S - np.tensordot(moves, C, axes=1))
     bound = value + min(0.0, float(eigenvalues[0])) * float(x @ x)
     steepness = max(0.0, float(eigenvalues[1]))
-    return Smallest(best, value, bound, moments.rank_ratio, _derivatives(L, best)[1] / 2, steepness)
+    return Smallest(best, value, bound, rank_ratio, _derivatives(L, best)[1] / 2, steepness)
 
 
 def lifted(rotations: Array) -> Array:

@@ -259,21 +259,8 @@ def starting_parameters(
         # a board or a camera that is turned otherwise is not visible
         tools = {**tools, **{block.markers[0]: located[block.markers[0]] for block in camera_blocks(data)}}
         places = {marker: [*located[marker][:3], *tools[marker][3:]] for marker in tools}
-    values, fixtures = _own_values(robot, data, base, places, own)
-    if temperature is None and len(data.temperatures):
-        temperature = float(data.temperatures.mean())
-    named = sorted({*data.sessions, *sessions})
-    frames = dict.fromkeys(of_fixture(f"{name}_", b.fixture) for b in data.blocks for name in b.measurement.frames)
-    parameters = model_parameters(robot, base, tools, values, tuple(frames), named, temperature)
-    return _with_fitted(robot, data, parameters, fixtures) if fixtures else parameters
-
-
-def _own_values(
-    robot: Robot, data: Dataset, base: Place, places: Mapping[str, Place], own: Mapping[str, float]
-) -> tuple[dict[str, tuple[str, float]], set[str]]:
-    """Return dimension and value [SI] of the measurements' own parameters, and which the nominal robot locates."""
-    values: dict[str, tuple[str, float]] = {}
-    fixtures: set[str] = set()
+    values: dict[str, tuple[str, float]] = {}  # dimensions and values [SI] of the measurements' own parameters
+    fixtures: set[str] = set()  # of these what the nominal robot locates
     for block in data.blocks:
         kind = block.measurement
         names = {name: of_fixture(name, block.fixture) for name in kind.parameters}
@@ -284,7 +271,12 @@ def _own_values(
             start = kind.start(T[:, :3, 3], block.y)
             fixtures |= {names[name] for name in start}
         values |= {full: (kind.parameters[name], float(start.get(name, 0.0))) for name, full in names.items()}
-    return values, fixtures
+    if temperature is None and len(data.temperatures):
+        temperature = float(data.temperatures.mean())
+    named = sorted({*data.sessions, *sessions})
+    frames = dict.fromkeys(of_fixture(f"{name}_", b.fixture) for b in data.blocks for name in b.measurement.frames)
+    parameters = model_parameters(robot, base, tools, values, tuple(frames), named, temperature)
+    return _with_fitted(robot, data, parameters, fixtures) if fixtures else parameters
 
 
 def _with_fitted(robot: Robot, data: Dataset, parameters: Parameters, fixtures: Collection[str]) -> Parameters:

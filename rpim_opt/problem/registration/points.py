@@ -411,15 +411,11 @@ def _flange(robot: Robot, q: Array) -> tuple[Array, Array, Array, Array]:
         p = p + a * x
         axes[j] = z
         origins[j] = p
-        angle = np.full((B, N), theta)
-        shift = np.full((B, N), d)
-        if robot.joint_types[j] == "revolute":
-            angle = angle + q[:, :, j]
-        else:
-            shift = shift + q[:, :, j]
+        turning = robot.joint_types[j] == "revolute"
+        angle = theta + turning * q[:, :, j]
         c, s = np.cos(angle), np.sin(angle)
         x, y = c * x + s * y, c * y - s * x
-        p = p + shift * z
+        p = p + (d + (not turning) * q[:, :, j]) * z
         if beta:
             c, s = np.cos(beta), np.sin(beta)
             x, z = c * x - s * z, c * z + s * x
