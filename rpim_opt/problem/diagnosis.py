@@ -111,8 +111,9 @@ def all_q(data: Dataset) -> Array:
     return np.concatenate([block.q.reshape(-1, block.q.shape[2]) for block in data.blocks])
 
 
-def _rows(labels: Sequence[str], of_one: str, of_several: str) -> str:
+def _rows(data: Dataset, rows: np.ndarray, of_one: str, of_several: str) -> str:
     """Name rows before their verb."""
+    labels = [data.label[i] for i in rows]
     if len(labels) == 1:
         return f"row {labels[0]} {of_one}"
     return f"rows {listed(labels)} {of_several}"
@@ -141,18 +142,19 @@ def rows_without_values(data: Dataset, arms: Mapping[str, Robot]) -> Iterator[st
         y = block.y[:, :3]
         same = (y == y[:, :1]).all(axis=1)
         for value in np.unique(y[same, 0]):
-            labels = [data.label[i] for i in block.row[same & (y[:, 0] == value)]]
             unit, si = display("length")
             number = f"{value / si:g} {unit}" if value else "0"
-            what = f"{_rows(labels, 'has', 'have')} {number} for every measured coordinate"
-            yield f"{what}: missing measurements? Exclude such rows ([exclude])."
+            which = _rows(data, block.row[same & (y[:, 0] == value)], "has", "have")
+            yield (
+                f"{which} {number} for every measured coordinate: missing measurements? Exclude such rows ([exclude])."
+            )
         reach = arm_length(arms[block.robot], [block])
         away = np.linalg.norm(y - np.median(y, axis=0), axis=1)
-        labels = [data.label[i] for i in block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]]
-        if 0 < len(labels) < MOST_LOST * len(y):
+        lost = block.row[away > BEYOND_REACH * max(reach, float(np.median(away)))]
+        if 0 < len(lost) < MOST_LOST * len(y):
             yield (
-                f"{_rows(labels, 'is', 'are')} farther from the others than the arm is long: was a decimal point lost, "
-                "or is it another unit?"
+                f"{_rows(data, lost, 'is', 'are')} farther from the others than the arm is long: was a decimal point "
+                "lost, or is it another unit?"
             )
 
 
@@ -208,7 +210,7 @@ def filled_rows(data: Dataset) -> Iterator[str]:
     for blocks in of.values():
         row = np.concatenate([block.row for block in blocks])
         order = np.argsort(row)
-        labels = np.array(data.label)[row[order]]
+        row = row[order]
         q = np.concatenate([block.q[:, 0] for block in blocks])[order]
         y = np.concatenate([block.y[:, :3] for block in blocks])[order]
         moves = np.linalg.norm(np.diff(y, axis=0), axis=1)
@@ -217,11 +219,12 @@ def filled_rows(data: Dataset) -> Iterator[str]:
         last_digit = 10.0 ** -(MOST_DECIMALS if decimals is None else decimals)  # [mm]
         # rounding alone: measured points of a grid are nearly half way, the nearer the smaller their unit
         middle = off < min(EXACT, np.sqrt(3) * 1e-3 * last_digit)
-        between = labels[1:-1][middle & (np.minimum(moves[:-1], moves[1:]) > FILLED)].tolist()
-        if between:
+        between = row[1:-1][middle & (np.minimum(moves[:-1], moves[1:]) > FILLED)]
+        if len(between):
+            which = _rows(data, between, "is", "are")
             yield (
-                f"{_rows(between, 'is', 'are')} exactly half way between the points before and after: interpolated, "
-                "not measured; leave out what was filled in ([exclude])."
+                f"{which} exactly half way between the points before and after: interpolated, not measured; leave out "
+                "what was filled in ([exclude])."
             )
         again = (q[1:] == q[:-1]).all(axis=1) & (moves > FILLED)
         if again.any():
@@ -229,11 +232,11 @@ def filled_rows(data: Dataset) -> Iterator[str]:
             cause = "the log was not updated; leave such rows out ([exclude])."
             if 2 * repeated > len(q) - np.count_nonzero(again):  # most configurations: no accident
                 cause = "are they of several reflectors? Name each row's reflector in a column `marker`."
-            which = _rows(labels[1:][again].tolist(), "has", "have")
+            which = _rows(data, row[1:][again], "has", "have")
             yield f"{which} the joint values of the row before at another point: {cause}"
         frozen = (moves == 0) & (np.abs(np.diff(q, axis=0)).max(axis=1) > ANOTHER) & (np.ptp(y[1:], axis=1) > 0)
         if np.count_nonzero(frozen) >= FEW:
-            which = _rows(labels[1:][frozen].tolist(), "has", "have")
+            which = _rows(data, row[1:][frozen], "has", "have")
             yield (
                 f"{which} the measured point of the row before at other joint values: the reading was not updated; "
                 "leave such rows out ([exclude])."
@@ -418,12 +421,10 @@ def exchanged_rows(problem: CalibrationProblem) -> Iterator[str]:
     model = transformed((fit.base @ forward_kinematics(points.robot, points.q[far]))[:, None], fit.tools)
     error = np.linalg.norm(points.y[far, None] - model, axis=2)  # of every reflector, which the other rows place
     error[np.arange(len(far)), points.marker[far]] = np.inf
-    markers = [label[i] for i in far[error.min(axis=1) < np.minimum(BETTER * fit.error[far], limit)]]
-    if markers:
-        yield (
-            f"{_rows(markers, 'fits', 'fit')} another reflector than the stated one (column marker): reflectors "
-            "swapped?"
-        )
+    swapped = points.row[far[error.min(axis=1) < np.minimum(BETTER * fit.error[far], limit)]]
+    if len(swapped):
+        which = _rows(problem.data, swapped, "fits", "fit")
+        yield f"{which} another reflector than the stated one (column marker): reflectors swapped?"
 
 
 def unrelated_rows(problem: CalibrationProblem, error: float) -> Iterator[str]:
@@ -473,9 +474,8 @@ def _odd_values(problem: CalibrationProblem, points: Points) -> Iterator[str]:
     best = fitted[column]
     apart = np.abs(np.angle(np.exp(1j * (best.q - points.q)))).max(axis=1) > LEAST_TRAVEL["revolute"] / 2
     apart |= np.abs(best.y - points.y).max(axis=1) > WRONG * points.extent
-    odd = [problem.data.label[row] for row in points.row[apart]]
-    what = f"{_rows(odd, 'has', 'have')} wrong values of {column}"
-    if len(odd) > len(apart) / 2:
+    what = f"{_rows(problem.data, points.row[apart], 'has', 'have')} wrong values of {column}"
+    if apart.sum() > len(apart) / 2:
         what = f"the values of {column} explain nothing (sorted, copied, shuffled, without signs, another quantity?)"
     yield (
         f"{what}: with fitted ones the points agree to {three_digits(1e3 * left[column] * points.extent)} mm instead "
@@ -532,8 +532,8 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
         return
     parts, rest, exact = _stations(points)
     if exact:
-        labels = [problem.data.label[i] for i in points.row[parts[-1][0]]]
-        yield f"{_rows(labels, 'agrees', 'agree')} with the nominal robot: {COMPUTED}"
+        which = _rows(problem.data, points.row[parts[-1][0]], "agrees", "agree")
+        yield f"{which} with the nominal robot: {COMPUTED}"
         return
     if len(parts) < 2 or len(rest) > len(points.row) / OUTLYING:
         return
@@ -542,8 +542,9 @@ def other_places(problem: CalibrationProblem) -> Iterator[str]:
         return
     (_, first), *others = sorted(parts, key=lambda each: each[0][0])
     for part, fit in others:
-        labels = [problem.data.label[i] for i in points.row[part]]
-        where = f"from about row {labels[0]} on the points fit" if in_turn else _rows(labels, "fits", "fit")
+        where = _rows(problem.data, points.row[part], "fits", "fit")
+        if in_turn:
+            where = f"from about row {problem.data.label[points.row[part[0]]]} on the points fit"
         other, joint = _other_place(points, first, fit)
         if in_turn or joint != 1:  # no base moves to and fro about the first axis
             yield f"{where} another {other}."
@@ -617,8 +618,8 @@ def other_rows(problem: CalibrationProblem) -> Iterator[str]:
                 return
         better = better_reading(problem.on(problem.data.take(some.row)), whole=False)
         if better is not None:
-            labels = [problem.data.label[i] for i in some.row]
-            yield f"{where or _rows(labels, 'fits otherwise:', 'fit otherwise:')} {better.sentence}"
+            where = where or _rows(problem.data, some.row, "fits otherwise:", "fit otherwise:")
+            yield f"{where} {better.sentence}"
             return
     if not together and not points.lengths and points.turns is None:
         yield from _turned_joint(problem, points.take(out), fit, FAR * float(np.median(fit.error[own])))
@@ -639,7 +640,7 @@ def _turned_joint(problem: CalibrationProblem, out: Points, fit: Fit, limit: flo
         chance = bdtrc(explained.sum() - 1, len(explained), reached) * out.robot.dof
         if explained.sum() > best and chance < UNLIKELY:
             best = explained.sum()
-            named = _rows([problem.data.label[row] for row in out.row[explained]], "has", "have")
+            named = _rows(problem.data, out.row[explained], "has", "have")
             off = np.abs(np.degrees(np.angle(np.exp(1j * (q - out.q)[explained, i]))))
             by = f"{off.min():.1f} to {off.max():.1f} deg"
             said = f"{named} wrong values of joint {i + 1}, by {by}, which explain the errors: correct column q{i + 1}"
@@ -751,17 +752,16 @@ def shown_by_residuals(problem: CalibrationProblem, x: Array, *, most: float | N
     left = np.inf if best is None else best[0]
     if several is not None and several[0] < SEVERAL * left:
         best, left = several, several[0]
-    kinds = _two_kinds(problem, x, min(TWO_KINDS, acceptable))
+    rows, part = _two_kinds(problem, x)
+    limit = min(TWO_KINDS, acceptable)
     # what changed at a row is named by itself where that is enough
-    if kinds is not None and left <= (MOVED if kinds.consecutive else kinds.left / MOVED):
-        kinds = None
-    if kinds is None and best is not None:
+    kinds = part < limit and left > (MOVED if np.ptp(rows) == len(rows) - 1 else part / MOVED)
+    if best is not None and not kinds:
         yield from _said_of_addition(best)
     else:
-        part = min(TWO_KINDS, acceptable, np.inf if kinds is None else kinds.left / MOVED)
-        said = [] if kinds is None else [_said_of_kinds(problem, kinds)]
+        said = [_said_of_kinds(problem, rows, part)] if kinds else ()
         noise = _uneven_noise(problem, x) if acceptable == 1 else ()  # else errors are too large for noise
-        yield from first(two_positions(problem, x, part), said, noise)
+        yield from first(two_positions(problem, x, min(limit, part / MOVED) if kinds else limit), said, noise)
 
 
 def _acceptable_part(problem: CalibrationProblem, x: Array) -> float:
@@ -901,16 +901,8 @@ def _shares(problem: CalibrationProblem, joint: int | None = None) -> Shares:
     return shares
 
 
-class Kinds(NamedTuple):
-    """The rows (K,) of the smaller kind, whether they are consecutive, and which part two calibrations leave."""
-
-    rows: np.ndarray
-    consecutive: bool
-    left: float
-
-
-def _two_kinds(problem: CalibrationProblem, x: Array, most: float) -> Kinds | None:
-    """Return the rows that have other parameters than the rest, where that leaves less than a part ``most``; or None.
+def _two_kinds(problem: CalibrationProblem, x: Array) -> tuple[np.ndarray, float]:
+    """Return the rows (K,) that have other parameters than the rest, none if too few, and which part that leaves.
 
     Two linear fits with the prior and the rows of each are found in turn, from random halves. Each kind of rows has
     its own parameters, and each row a degree of freedom for its choice.
@@ -920,7 +912,7 @@ def _two_kinds(problem: CalibrationProblem, x: Array, most: float) -> Kinds | No
     rank = _freedom(model)
     spare = len(b) - 2 * rank - N
     if spare < rank:
-        return None
+        return np.zeros(0, dtype=int), np.inf
 
     def errors(of: np.ndarray) -> Array:
         z = np.linalg.solve(A[of].T @ A[of] + np.eye(A.shape[1]), A[of].T @ b[of])
@@ -944,9 +936,7 @@ def _two_kinds(problem: CalibrationProblem, x: Array, most: float) -> Kinds | No
         kept = one <= np.sort(one)[N - N // OUTLYING - 1]
     left = float(np.sqrt(best / spare / (errors(kept[owners])[kept].sum() / (kept[owners].sum() - rank))))
     rows = np.flatnonzero(second == (second.sum() <= N / 2))
-    if left >= most or len(rows) < FEWEST:
-        return None
-    return Kinds(rows, bool(np.ptp(rows) == len(rows) - 1), left)
+    return rows, left if len(rows) >= FEWEST else np.inf
 
 
 def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
@@ -976,13 +966,12 @@ def _uneven_noise(problem: CalibrationProblem, x: Array) -> Iterator[str]:
         )
 
 
-def _said_of_kinds(problem: CalibrationProblem, kinds: Kinds) -> str:
+def _said_of_kinds(problem: CalibrationProblem, rows: np.ndarray, left: float) -> str:
     """Return the sentence on rows of two kinds; whether the smaller one agrees with the nominal robot."""
-    rows, label = kinds.rows, problem.data.label
-    named = _rows([label[i] for i in rows], "fits", "fit")
-    if kinds.consecutive:
+    named, label = _rows(problem.data, rows, "fits", "fit"), problem.data.label
+    if np.ptp(rows) == len(rows) - 1:
         named = f"rows {label[rows[0]]} to {label[rows[-1]]} fit"
-    what = f"{named} other parameters than the rest (two calibrations leave {100 * kinds.left:.0f} % of the residuals)"
+    what = f"{named} other parameters than the rest (two calibrations leave {100 * left:.0f} % of the residuals)"
     points = points_of(problem)
     part = None if points is None else points.take(np.isin(points.row, rows))
     if part is not None and len(part.row) >= FEWEST and misfit(part) * part.extent < EXACT:

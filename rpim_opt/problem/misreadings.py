@@ -453,8 +453,10 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
     if not np.isfinite(present):
         return None
     chain, left = _mistakes(points, present)
-    if present > WRONG and not points.seen and whole:
-        chain, left = _orders_and_robots(points, present, chain, left)
+    for further in ((_factors, _other_robots), (_orders,)):
+        if left >= BETTER * present and present > WRONG and not points.seen and whole:
+            first = [each for readings in further for each in readings(points)]
+            chain, left = _chain(points, present, first, BETTER * present, 2)
     fits = left < BETTER * present and (left <= LEFT or points.seen)
     fits = fits and _is_no_chance(points, len(chain), left / present)
     if mapping is not None and not (fits and left * points.extent < mapping.left):
@@ -467,19 +469,20 @@ def better_reading(problem: CalibrationProblem, whole: bool = True) -> Better | 
     return behind or sibling(problem)
 
 
-def _orders_and_robots(
-    points: Points, present: float, chain: list[Misreading], left: float
+def _chain(
+    points: Points, stated: float, readings: list[Misreading], enough: float, most: int
 ) -> tuple[list[Misreading], float]:
-    """Return the best of factors and other robots, then of orders of the joints, where a chain leaves too much."""
-    for further in ((_factors, _other_robots), (_orders,)):
-        if left < BETTER * present:
+    """Return the best reading, and behind it so many others at most, the best each time, until ``enough`` is left."""
+    chain: list[Misreading] = []
+    left = stated
+    while len(chain) < most and left >= enough:
+        each, size = _best(points, readings)
+        if not size < FURTHER * left:
             break
-        chain, left = _best(points, [each for readings in further for each in readings(points)])
-        if chain and BETTER * present <= left < FURTHER * present:  # a second mistake behind it
-            changed = chain[0].change(points)
-            second, size = _best(changed, _readings(changed))
-            if size < BETTER * present:
-                chain, left = [*chain, *second], size
+        chain += each
+        left = size
+        points = each[0].change(points)
+        readings = _readings(points)
     return chain, left
 
 
@@ -558,19 +561,10 @@ def _told(points: Points, chain: Sequence[Misreading], stated: float, left: floa
 
 def _mistakes(points: Points, stated: float) -> tuple[list[Misreading], float]:
     """Return the best of up to three mistakes together: each time the best one, else two of which none is the best."""
-    chain: list[Misreading] = []
-    best = stated
+    readings = _readings(points)
     enough = min(BETTER * stated, WRONG)
-    changed = points
-    while len(chain) < MISTAKES[points.seen] and best >= enough:
-        each, size = _best(changed, _readings(changed))
-        if not size < FURTHER * best:
-            break
-        chain += each
-        changed = each[0].change(changed)
-        best = size
+    chain, best = _chain(points, stated, readings, enough, MISTAKES[points.seen])
     if stated > WRONG and not points.seen and best >= enough:
-        readings = _readings(points)
         for i in np.argsort(_tried(points, readings))[:12]:
             changed = readings[i].change(points)
             others = [each for each in _readings(changed) if each.what != readings[i].what]
