@@ -156,9 +156,8 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
         if block.point is not None and block.measurement.touching:
             for name, i in zip(*np.unique(block.point[:, 0].astype(str), return_index=True), strict=True):
                 touched.setdefault(str(name), block.take(np.array([i]), np.array([0])))
-    blocks = []
-    labels: list[str] = []
-    for i, each in enumerate(known):
+    parts = [data]
+    for each in known:
         where = each.measurement.name.replace("_", " ")
         first, second = (pick(touched, name, where) for name in each.between)
         planar = {first.measurement.planar, second.measurement.planar}
@@ -174,17 +173,14 @@ def with_known(data: Dataset, known: Sequence[Known]) -> Dataset:
             if all(values is not None for values in both):
                 stated[what] = np.concatenate(both, axis=1)
         q = np.concatenate([first.q, second.q], axis=1)
-        (relation,) = Dataset.of(q, np.array([[each.value]]), each.sigma, (), each.measurement, **stated).blocks
-        row, markers = np.array([len(data) + i]), (*first.markers, *second.markers)
-        point = np.array([each.between], dtype=object)
-        blocks.append(replace(relation, row=row, markers=markers, robot=first.robot, point=point))
         label = " to ".join(each.between)
-        if label in labels:  # planes may have both an angle and a distance
+        if any(label in part.label for part in parts[1:]):  # planes may have both an angle and a distance
             label = f"{label}, {each.measurement.name.removeprefix('known_')}"
-        labels.append(label)
-    alone = np.arange(len(known)) + data.configuration.max(initial=-1) + 1
-    configuration = np.concatenate([data.configuration, alone])
-    return Dataset((*data.blocks, *blocks), (*data.label, *labels), configuration).grouped_by_points()
+        row = Dataset.of(q, np.array([[each.value]]), each.sigma, (label,), each.measurement, **stated)
+        place = {"markers": (*first.markers, *second.markers), "robot": first.robot}
+        block = replace(row.blocks[0], point=np.array([each.between], dtype=object), **place)
+        parts.append(replace(row, blocks=(block,)))
+    return Dataset.concatenated(parts, ["rows", *(" to ".join(each.between) for each in known)]).grouped_by_points()
 
 
 def touches(q: Array, point: Sequence[str], sigma: float | Array, planes: bool = False) -> Dataset:

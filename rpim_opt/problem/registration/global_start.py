@@ -279,7 +279,11 @@ def search(points: Points, problem: CalibrationProblem | None = None) -> JointMa
         return None
     signs = np.array(list(product([1.0, -1.0], repeat=n)))
     count = max(600, 6 * len(signs))
-    sign, pool = _round(few, *_plain_starts(n, signs, turning))
+    # what happens most: any joints reversed, or at most one, and one that is a quarter or half a turn off
+    off = np.kron(np.eye(n)[turning], [[QUARTER], [-QUARTER], [2 * QUARTER]])
+    one = _one_reversed(n)
+    usual = np.vstack([signs, np.repeat(one, len(off), axis=0)])
+    sign, pool = _round(few, usual, np.vstack([np.zeros_like(signs), np.tile(off, (len(one), 1))]))
     starts = 0
     for _ in range(ROUNDS):
         drawn = signs[np.resize(rng.permutation(len(signs)), count)]
@@ -294,16 +298,6 @@ def search(points: Points, problem: CalibrationProblem | None = None) -> JointMa
     candidates = _signed(points, sign)._replace(zero=zero, tools=tools)
     fits = fit_arms(candidates, LONG, zeros=True, robust=True, noise=LEAST_NOISE)
     return _judged(points, problem, sign, fits, starts, small, rng)
-
-
-def _plain_starts(n: int, signs: Array, turning: np.ndarray) -> tuple[Array, Array]:
-    """Return what happens most: any joints reversed, or at most one, and one that is a quarter or half a turn off."""
-    zero = [np.zeros(n)]
-    for i in np.flatnonzero(turning):
-        zero += [angle * np.eye(n)[i] for angle in (QUARTER, -QUARTER, 2 * QUARTER)]
-    one = _one_reversed(n)
-    sign = np.vstack([signs, np.repeat(one, len(zero) - 1, axis=0)])
-    return sign, np.vstack([np.zeros_like(signs), np.tile(zero[1:], (len(one), 1))])
 
 
 def _signed(points: Points, sign: Array) -> Candidates:
