@@ -12,7 +12,7 @@ from rpim_opt.basics.arrays import Array
 from rpim_opt.basics.exceptions import InputError
 from rpim_opt.data.measurements.camera import INTRINSICS, eye_in_hand, pixels
 from rpim_opt.data.measurements.contact import revisit
-from rpim_opt.data.measurements.measurement import Measurement, of_fixture
+from rpim_opt.data.measurements.measurement import of_fixture
 from rpim_opt.data.measurements.position import position
 from rpim_opt.problem.design import random_candidates
 from rpim_opt.problem.problem import CalibrationProblem
@@ -39,30 +39,19 @@ def predicted(
     problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, at: Array | None = None
 ) -> Predicted:
     """Return where a reflector is at q (N, dof) [rad or m] to first order about ``at`` (n,) [SI]; torques [Nm]."""
-    here = _there(problem, q, marker, torque)
+    here = problem.measuring(q, position, marker, torque)
     x = np.zeros(len(problem.parameters.free)) if at is None else at
-    position = here.modelled(x)[0]
-    slope = here.jacobian(x).reshape(len(position), 3, -1)
-    return Predicted(position - slope @ x, slope)
+    places = here.modelled(x)[0]
+    slope = here.jacobian(x).reshape(len(places), 3, -1)
+    return Predicted(places - slope @ x, slope)
 
 
 def moved(problem: CalibrationProblem, q: Array, marker: str | None, at: Array | None = None) -> Predicted:
     """Return the displacement of a reflector by the robot's parameters with frames fixed; arguments as before."""
     own = ~problem.parameters.free.of_frames
     prediction = predicted(problem, q, marker, at=None if at is None else at * own)
-    nominal = _there(problem, q, marker).modelled(np.zeros(len(own)))[0]
+    nominal = problem.measuring(q, position, marker).modelled(np.zeros(len(own)))[0]
     return Predicted(prediction.position - nominal, prediction.slope * own)
-
-
-def _there(
-    problem: CalibrationProblem, q: Array, marker: str | None, torque: Array | None = None, kind: Measurement = position
-) -> CalibrationProblem:
-    """Return the problem whose measurements are the positions of a reflector, or another type of its measurements."""
-    q = np.atleast_2d(np.asarray(q, dtype=float))
-    if not np.isfinite(q).all() or q.shape[1] != problem.robot.dof:
-        found = f"joint values of shape {q.shape}"
-        raise InputError("positions", found, f"finite numbers (N, {problem.robot.dof}) [rad or m]")
-    return problem.measuring(q, kind, marker, torque)
 
 
 def markers(problem: CalibrationProblem) -> list[str]:
@@ -103,7 +92,7 @@ def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | N
     if farthest is None or len(q) <= 2 * SOME:
         return q[: 2 * SOME]
     own = ~problem.parameters.free.of_frames
-    here = _there(problem, q[SOME:], None)
+    here = problem.measuring(q[SOME:])
     movement = here.modelled(farthest * own)[0] - here.modelled(np.zeros(len(own)))[0]
     order = np.argsort(-np.linalg.norm(movement, axis=1), kind="stable")[:SOME]
     return np.concatenate([q[:SOME], q[SOME:][order]])
@@ -111,7 +100,7 @@ def bounding(problem: CalibrationProblem, box: Array | None, farthest: Array | N
 
 def in_base(problem: CalibrationProblem, q: Array, marker: str | None = None) -> Array:
     """Return where the nominal reflector is in the robot's base frame, (N, 3) [m]; arguments as for `predicted`."""
-    return _there(problem, q, marker, kind=revisit).modelled(np.zeros(len(problem.parameters.free)))[0]
+    return problem.measuring(q, revisit, marker).modelled(np.zeros(len(problem.parameters.free)))[0]
 
 
 DRAWS = 200  # random configurations that are tried for each row
