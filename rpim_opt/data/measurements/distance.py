@@ -57,7 +57,7 @@ def plane_start(points: Array, y: Array) -> Mapping[str, float]:
 distance = Measurement("distance", lambda T1, T2: ca.norm_2(origin(T2) - origin(T1)), columns=DISTANCE, points=2)
 """Distance between two points, of two configurations or two reflectors (paper, Eq. 21; ballbar): r = y - |p2 - p1|."""
 
-ANCHOR = dict.fromkeys(("anchor_x", "anchor_y", "anchor_z", "length_0"), "length")
+ANCHOR: dict[str, str] = dict.fromkeys(("anchor_x", "anchor_y", "anchor_z", "length_0"), "length")
 cable = Measurement(
     "cable",
     model=lambda T, anchor_x, anchor_y, anchor_z, length_0: (
@@ -81,7 +81,7 @@ plane = Measurement(
 )
 """A point on a plane, stated as a frame whose x and y axes span it: r = -n'(p - o) with its z axis n and origin o."""
 
-SPHERE = dict.fromkeys(("sphere_x", "sphere_y", "sphere_z", "sphere_r"), "length")
+SPHERE: dict[str, str] = dict.fromkeys(("sphere_x", "sphere_y", "sphere_z", "sphere_r"), "length")
 sphere = Measurement(
     "sphere",
     model=lambda T, sphere_x, sphere_y, sphere_z, sphere_r: (

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -280,7 +280,7 @@ def search(points: Points, problem: CalibrationProblem | None = None) -> JointMa
     signs = np.array(list(product([1.0, -1.0], repeat=n)))
     count = max(600, 6 * len(signs))
     # what happens most: any joints reversed, or at most one, and one that is a quarter or half a turn off
-    off = np.kron(np.eye(n)[turning], [[QUARTER], [-QUARTER], [2 * QUARTER]])
+    off: Any = np.kron(np.eye(n)[turning], [[QUARTER], [-QUARTER], [2 * QUARTER]])
     one = _one_reversed(n)
     usual = np.vstack([signs, np.repeat(one, len(off), axis=0)])
     sign, pool = _round(few, usual, np.vstack([np.zeros_like(signs), np.tile(off, (len(one), 1))]))
